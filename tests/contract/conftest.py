@@ -1,4 +1,4 @@
-"""The contracts report what was compared, as tests in a test file do."""
+"""Assertion rewriting for the contracts, so that their failures show the compared values."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The plugins that the reference shows as a whole keep their contracts."""
+"""Contracts of the complete plugins shown in docs/reference/plugins.md."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TestLauncherThatIsShown(LauncherContract):
 
 
 def test_all_are_found_by_their_hooks():
-    """With the mark and the name that a hook needs."""
+    """The plugins carry the hook marker and the function names that discovery needs."""
     registry = Registry.of(probe=PROBE, launcher=LAUNCHER, policy=POLICY)
     assert not registry.broken
     assert registry.names("probe") == ("open_files",)

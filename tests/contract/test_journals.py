@@ -1,4 +1,4 @@
-"""Every journal holds one contract."""
+"""The journal contract, for every journal implementation."""
 
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.testing import JournalContract, MemoryJournal

@@ -1,4 +1,4 @@
-"""A contract that fails says in a sentence what is wrong, and no plugin can hang its tests."""
+"""Failure messages of the contracts; a hanging plugin cannot block its tests."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _Options:
 
 
 def contract_of(kind, thing, **fields):
-    """The contract of an offer that makes one thing."""
+    """Return the contract of an offer that creates one plugin object."""
     contract = kind()
     offer, _ = KINDS[kind]
     if offer is ProbeOffer:
@@ -55,7 +55,7 @@ def contract_of(kind, thing, **fields):
 
 
 def thing_of(kind, answer):
-    """A plugin whose main method is a function without arguments."""
+    """Return a plugin whose main method is a function without arguments."""
     thing = FakeProbe(a=0.5) if kind is ProbeContract else SimpleNamespace()
     setattr(thing, KINDS[kind][1], lambda *_: answer())
     return thing
@@ -71,7 +71,7 @@ FIRST = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_answer_of_another_type_is_named(kind):
-    """Not by an attribute that it lacks."""
+    """The message names the type of the answer, not an attribute that the answer lacks."""
     contract = contract_of(kind, thing_of(kind, lambda: 5))
     with pytest.raises(AssertionError, match=r"answered a int; [\w ]+ is required"):
         getattr(contract, FIRST[kind])()
@@ -79,7 +79,7 @@ def test_an_answer_of_another_type_is_named(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_object_without_its_method_is_named(kind):
-    """As by `rosrm config check`."""
+    """The message names the missing method, as `rosrm config check` does."""
     with pytest.raises(AssertionError, match=r"made None; an object with .* is required"):
         getattr(contract_of(kind, None), FIRST[kind])()
 
@@ -87,7 +87,7 @@ def test_an_object_without_its_method_is_named(kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("stubborn", [False, True])
 def test_a_call_that_takes_too_long_is_ended_and_named(kind, stubborn, monkeypatch):
-    """Also where the plugin catches the exception that ends the call."""
+    """The contract ends the call even where the plugin catches the exception that ends it."""
     monkeypatch.setattr(f"{kind.__module__}.CALL_LIMIT", 0.05, raising=False)
 
     def hang():
@@ -104,7 +104,7 @@ def test_a_call_that_takes_too_long_is_ended_and_named(kind, stubborn, monkeypat
 
 
 def test_an_executor_that_hangs_is_ended_after_the_timeout_of_its_step(tmp_path):
-    """The tests go on, and the message names the executor."""
+    """The remaining tests run, and the message names the executor."""
     plan = Plan((Execute("a.wait", "a", {}, 0.05),))
     contract = contract_of(
         MigrationContract, SimpleNamespace(propose=lambda move: plan),
@@ -115,7 +115,7 @@ def test_an_executor_that_hangs_is_ended_after_the_timeout_of_its_step(tmp_path)
 
 
 def test_a_plan_without_a_commit_is_named():
-    """By the test of sound plans; the others look at all its steps."""
+    """`test_plan_is_sound` reports the missing commit; the other tests look at all steps."""
 
     def propose(move):
         return Plan((Start(move.destination, move.destination_host, 5.0),))
@@ -128,7 +128,7 @@ def test_a_plan_without_a_commit_is_named():
 
 
 def test_a_score_of_nan_is_named_with_its_host():
-    """By each test of the contract."""
+    """Each test of the contract names the host whose score is NaN."""
     policy = SimpleNamespace(score=lambda hosts, process: Scores(hosts.usage[:, -1] * 1.0))
     with pytest.raises(AssertionError, match=r"score: the score of host h\d+ is nan"):
         contract_of(ScoringContract, policy).test_is_pure()
@@ -136,7 +136,7 @@ def test_a_score_of_nan_is_named_with_its_host():
 
 @pytest.mark.parametrize("usage", [64.5, 914.0, -0.1])
 def test_a_usage_that_the_slave_refuses_fails_the_contract(usage):
-    """By the same check."""
+    """The contract and the slave use the same check for usage values."""
     contract = contract_of(ProbeContract, FakeProbe(a=usage))
     with pytest.raises(AssertionError, match=r"read: usage .* of 'a'; a fraction of"):
         contract.test_reads_each_resource_once()
@@ -144,7 +144,7 @@ def test_a_usage_that_the_slave_refuses_fails_the_contract(usage):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_options_of_a_contract_are_written_as_in_a_file(kind):
-    """With units; and a wrong one is named."""
+    """The contract parses values with units, and an unknown option fails with its name."""
     seen = []
     contract = contract_of(kind, None, options=_Options)
     made = thing_of(kind, CheckpointChoice)
@@ -161,7 +161,7 @@ def test_options_of_a_contract_are_written_as_in_a_file(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_contract_is_skipped_where_the_plugin_is_absent(kind):
-    """With its reason."""
+    """The skip message contains the plugin's reason."""
 
     def absent(options, *context):
         raise SkipPlugin("no sensor")
@@ -173,7 +173,7 @@ def test_a_contract_is_skipped_where_the_plugin_is_absent(kind):
 
 
 def test_the_alarm_of_a_test_runner_stays_set():
-    """A process has one timer; the limits of the calls give it back."""
+    """The limits of the calls restore the process's only interval timer."""
     heard = []
     before = signal.signal(signal.SIGALRM, lambda *_: heard.append(True))
     left, _ = signal.setitimer(signal.ITIMER_REAL, 0.2)

@@ -1,4 +1,4 @@
-"""Every shipped migration strategy holds the contract that a third party's holds."""
+"""The migration contract, for every shipped strategy, as for a third party's."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -46,7 +46,7 @@ class TestHandoffAsInThePaper(MigrationContract):
     not_called: ClassVar = {"handoff_watch": "needs a ROS graph: tests/ros/test_watching.py"}
 
     def moves(self):
-        """Only of one that may overlap: for a moment both are active."""
+        """Return moves of processes that may overlap: both instances are briefly active."""
         return [move for move in super().moves() if move.spec.migration.overlap]
 
 
@@ -56,7 +56,7 @@ class TestCriu(MigrationContract):
     spec = ProcessSpec("p", command=("true",), ros=True, restart=RestartPolicy("on-failure"))
 
     def test_nothing_joins_before_the_commit(self):
-        """And the source is ended after that; until then it is called back where a step fails."""
+        """The source ends after the commit; if an earlier step fails, the source resumes."""
         plan = self.offer.create(self.offer.options()).propose(self.moves()[0])
         at = {one.executor: n for n, one in enumerate(plan.steps) if isinstance(one, Execute)}
         commit = next(n for n, one in enumerate(plan.steps) if isinstance(one, Commit))
@@ -67,13 +67,13 @@ class TestCriu(MigrationContract):
 
 
 def test_each_shipped_strategy_is_here():
-    """A strategy that is added to the plugin must be added here."""
+    """Each strategy in the plugin must have a contract class in this file."""
     held = {contract.offer.name for contract in MigrationContract.__subclasses__()}
     assert set(OFFERS) <= held
 
 
 def _sound(move):
-    """Start there, wait, stop here: each with its way back."""
+    """Return a sound plan: start on the destination, wait, stop the source, each with its undo."""
     source = Stop(move.source, move.source_host, 10.0)
     return Plan(
         (
@@ -92,7 +92,7 @@ def _sound(move):
 
 
 def _changed(**change):
-    """The sound plan with one of its steps changed."""
+    """Return a strategy that proposes the sound plan with one step changed."""
 
     def propose(move):
         plan = _sound(move)
@@ -110,7 +110,7 @@ def _handing_over(
     alias="p_1",
     phase=HandoffPhase.SWITCH,
 ):
-    """A handoff with one thing that is wrong."""
+    """Return a strategy that proposes a handoff with one fault."""
 
     def propose(move):
         give_back = SetRestart(move.source, move.source_host, move.spec.restart, 5.0)
@@ -149,7 +149,7 @@ def _handing_over(
         (_handing_over(releases=False), "test_a_shadow_is_released_after"),
         (_handing_over(gives_back=False), "test_a_source_that_is_not_restarted"),
         (_changed(timeout=object()), "test_survives_the_journal"),
-        (_sound, "test_an_overlap_is_declared"),  # it overlaps though the process may not
+        (_sound, "test_an_overlap_is_declared"),  # the plan overlaps although the process may not
         (
             lambda move: Plan((Execute("unknown", "a", {}, 1.0), Commit())),
             "test_executors_are_its_own",
@@ -172,7 +172,11 @@ class _Options:
 
 
 class _Sleepy:
-    """Executes on the source, then moves; `raw`: reads the options of the process as text."""
+    """A strategy that executes a step on the source, then moves.
+
+    Args:
+        raw: read the options of the process as text.
+    """
 
     def __init__(self, *, raw=False):
         self._raw = raw
@@ -203,13 +207,13 @@ def _sleepy(answer, **how):
 
 @pytest.mark.parametrize("answer", [None, 5, ["a"], {1: 2}, {"a": object()}, {"a": float("nan")}])
 def test_an_executor_that_answers_no_json_object_is_caught(answer, tmp_path):
-    """Also one that forgets to return anything."""
+    """An executor that returns None fails the contract, too."""
     with pytest.raises((AssertionError, TypeError, ValueError)):
         _sleepy(lambda _: answer).test_executors_answer_with_json_objects(tmp_path)
 
 
 def test_an_executor_gets_what_a_slave_gives_it(tmp_path):
-    """Its arguments, the results of earlier ones, and its host."""
+    """The executor gets its arguments, the results of earlier executors, and its host."""
     seen = []
     contract = _sleepy(lambda told: seen.append(told) or {})
     contract.test_executors_answer_with_json_objects(tmp_path)
@@ -220,7 +224,7 @@ def test_an_executor_gets_what_a_slave_gives_it(tmp_path):
 
 
 def test_a_strategy_that_reads_a_processs_options_as_text_is_caught():
-    """The work file has "2s" where the options have 2.0."""
+    """The work file contains "2s"; the checked options contain 2.0."""
     _sleepy(dict).test_options_of_a_process_are_read_from_the_move()
     with pytest.raises(ValueError, match=r"'2\.0s'"):
         _sleepy(dict, raw=True).test_options_of_a_process_are_read_from_the_move()

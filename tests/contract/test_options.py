@@ -1,4 +1,4 @@
-"""The options of every shipped plugin can be checked, carried as JSON and read back."""
+"""Options of every shipped plugin: checked, converted to JSON and read back."""
 
 import json
 from types import MappingProxyType
@@ -27,7 +27,7 @@ OFFERS = {
 
 @pytest.mark.parametrize("name", OFFERS)
 def test_defaults_survive_the_way_to_the_slave(name):
-    """What is checked at the edge arrives as it was."""
+    """Options checked by the client reach the slave unchanged."""
     options = OFFERS[name].options
     plain = json.loads(json.dumps(to_plain(options())))
     checked = TypeAdapter(options).validate_python(plain)
@@ -59,11 +59,11 @@ def test_defaults_survive_the_way_to_the_slave(name):
     ],
 )
 def test_nonsense_is_refused(name, given, what):
-    """With what is allowed instead."""
+    """The error lists the allowed values."""
     with pytest.raises(ValidationError, match=what):
         TypeAdapter(OFFERS[name].options).validate_python(given)
 
 
 def test_default_weights_cannot_be_changed():
-    """One policy's options are no other's."""
+    """All policies share the default weights, so the mapping is read-only."""
     assert isinstance(OFFERS["weighted"].options().weights, MappingProxyType)

@@ -1,4 +1,4 @@
-"""Every shipped probe holds the contract that a third party's holds, in every scope."""
+"""The probe contract, for every shipped probe in every scope, as for a third party's."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -63,13 +63,13 @@ class TestNetwork(ProbeContract):
 
 
 def test_each_shipped_probe_is_here():
-    """A probe that is added to the plugin must be added here."""
+    """Each probe in the plugin must have a contract class in this file."""
     held = {contract.offer.name for contract in ProbeContract.__subclasses__()}
     assert set(OFFERS) <= held
 
 
 class TestFake(ProbeContract):
-    """The fake of `rosrm.testing` is a probe as well."""
+    """The probe contract of `rosrm.testing.FakeProbe`."""
 
     offer = ProbeOffer(
         "fake",

@@ -1,4 +1,4 @@
-"""Every shipped scoring policy holds the contract that a third party's holds."""
+"""The scoring contract, for every shipped policy, as for a third party's."""
 
 from typing import ClassVar
 
@@ -29,7 +29,7 @@ class TestNarrowThreshold(TestThreshold):
 
 
 def test_each_shipped_policy_is_here():
-    """A policy that is added to the plugin must be added here."""
+    """Each policy in the plugin must have a contract class in this file."""
     held = {contract.offer.name for contract in ScoringContract.__subclasses__()}
     assert set(OFFERS) <= held
 
@@ -73,14 +73,14 @@ class _Words:
 
 
 def test_a_declared_field_can_be_read():
-    """The contract gives what the offer declares, as the master does."""
+    """The contract provides the fields that the offer declares, as the master does."""
     contract = ScoringContract()
     contract.offer = ScoringOffer("named", lambda options: _ByName(), reads=("name",))
     contract.test_scores_every_host()
 
 
 def test_an_undeclared_field_fails_the_contract_with_its_name():
-    """And with how to declare it."""
+    """The error shows the declaration that is missing from the offer."""
     contract = ScoringContract()
     contract.offer = ScoringOffer("named", lambda options: _ByName())
     with pytest.raises(LookupError, match=r"'name'.*ScoringOffer\(\.\.\., reads=\('name',\)\)"):

@@ -1,4 +1,4 @@
-"""Clusters that things are done to."""
+"""Fixtures for clusters under fault injection."""
 
 from tests.ros.conftest import make_cluster, make_shared, private_network
 

@@ -1,4 +1,4 @@
-"""A small file system of a test's own, which can be filled to its last byte."""
+"""Small file systems, one per test, which a test can fill to the last byte."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Disk:
     """A file system of 1 MiB.
 
     Attributes:
-        place: where it is mounted.
+        place: its mount point.
     """
 
     def __init__(self, place: Path) -> None:
@@ -27,7 +27,7 @@ class Disk:
         self._filler = place / "filler"
 
     def fill(self) -> None:
-        """Until not a byte fits."""
+        """Fill the file system until not one more byte fits."""
         with self._filler.open("ab", buffering=0) as filler:
             for size in (65536, 4096, 1):
                 while self._fits(filler, size):
@@ -48,7 +48,7 @@ class Disk:
 
 @contextlib.contextmanager
 def small_disk(place: Path) -> Iterator[Disk]:
-    """Seen by this test and what it starts alone; gone with them in any case."""
+    """Mount a tmpfs of 1 MiB that only this test and its children see; unmount it at the end."""
     place.mkdir(parents=True)
     if os.geteuid() != 0 or ctypes.CDLL(None).unshare(_CLONE_NEWNS) != 0:
         pytest.skip("only root may mount a small file system")

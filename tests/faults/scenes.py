@@ -1,4 +1,4 @@
-"""A process on two hosts that is moved to and fro while somebody is struck."""
+"""Migrations of one process between two hosts while a participant is killed or paused."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ ROOT = Path(__file__).resolve().parents[2]
 NAME = "moving"
 PROGRAMS = "benchmarks.handoff_nodes"
 RATE = 50.0
-#: Outputs of one instance alone after which it is taken for the active one.
+#: Consecutive outputs of one instance after which that instance counts as the active one.
 _ALONE = 10
 _OTHER = {"h0": "h1", "h1": "h0"}
 
 
 def all_of(*blows: Blow) -> Blow:
-    """One after the other."""
+    """Return a blow that strikes all `blows`, one after the other."""
 
     def fall() -> None:
         for blow in blows:
@@ -32,17 +32,17 @@ def all_of(*blows: Blow) -> Blow:
 
 
 class Scene:
-    """The process, its cluster, and who listens.
+    """A cluster with one process, and a watcher of its handoffs.
 
-    Whom a blow may fall on: "master", "source", "destination", "source's slave", "destination's
+    Possible victims of a blow: "master", "source", "destination", "source's slave", "destination's
     slave".
 
     Args:
-        make: makes a cluster.
-        program: of `benchmarks.handoff_nodes`.
-        inputs: how many it is given a second.
-        module: that runs the program.
-        options: of the strategy.
+        make: function that creates a cluster.
+        program: program of `benchmarks.handoff_nodes`.
+        inputs: inputs per second that the watcher publishes to the process.
+        module: Python module that runs the program.
+        options: options of the migration strategy.
     """
 
     def __init__(
@@ -66,10 +66,10 @@ class Scene:
     def close(self) -> None:
         self.watcher.close()
 
-    # --- the move --------------------------------------------------------------------------
+    # --- the migration ---------------------------------------------------------------------
 
     def move(self, *blows: tuple[str, Blow]) -> None:
-        """Begin to move the process once it is in order, and strike at these words."""
+        """Wait for one active instance, start its migration and strike at the given phases."""
         row = self.settle()
         self.cluster.wait_for_hosts()
         self._source, self._host = row.number, row.host
@@ -80,7 +80,7 @@ class Scene:
         assert self.watcher.struck.wait(PATIENCE), self._why_not_struck(blows)
 
     def _why_not_struck(self, blows: tuple[tuple[str, Blow], ...]) -> str:
-        """What nobody said, what was said instead, and what the instances wrote."""
+        """Describe the missing reports, the received ones, and the newest logs of the instances."""
         logs = sorted(self.cluster.directory.glob(f"hosts/*/supervisor/logs/{NAME}.*.log"))
         newest = sorted(logs, key=lambda path: int(path.suffixes[-2][1:]))[-2:]
         wrote = [f"{path.name}: {path.read_text(errors='replace')[-2000:]!r}" for path in newest]
@@ -90,13 +90,14 @@ class Scene:
         )
 
     def _record(self) -> str:
-        """What the master wrote of it."""
+        """Return the end of the master's log."""
         return self.cluster.log_of("master")[-3000:]
 
     def settle(self) -> ProcessRow:
-        """Wait until one instance owns the name, alone is heard and alone is there."""
+        """Wait until exactly one instance runs, owns the name and publishes."""
         self.cluster.wait(NAME, "running")
-        before = len(self.watcher.outputs)  # what was heard until now may be of who is silent now
+        # An older output may be from an instance that is silent by now.
+        before = len(self.watcher.outputs)
 
         def settled(view) -> bool:
             row = next(row for row in view.processes if row.name == NAME)
@@ -109,9 +110,10 @@ class Scene:
         return next(row for row in view.processes if row.name == NAME)
 
     def end(self, *victims: str) -> str:
-        """Start again what a service manager would; how the move has ended: "moved", "stayed".
+        """Restart each victim as a service manager would, and return "moved" or "stayed".
 
-        It has ended, once; one instance is active, and no two were at any time.
+        The migration must end exactly once. One instance is active afterwards, and at no time were
+        two.
         """
         for victim in victims:
             self._start_again(victim)
@@ -137,22 +139,22 @@ class Scene:
     # --- blows -----------------------------------------------------------------------------
 
     def kill(self, victim: str) -> Blow:
-        """It ends at once."""
+        """Return a blow that kills the victim with SIGKILL."""
         return lambda: self._send(victim, signal.SIGKILL)
 
     def hold(self, victim: str) -> Blow:
-        """It does nothing more until it goes on."""
+        """Return a blow that pauses the victim with SIGSTOP."""
         return lambda: self._send(victim, signal.SIGSTOP)
 
     def let_go(self, victim: str) -> Blow:
-        """It goes on."""
+        """Return a blow that resumes the victim with SIGCONT."""
         return lambda: self._send(victim, signal.SIGCONT)
 
     def leave_alone(self) -> None:
-        """No blow falls."""
+        """Strike nothing."""
 
     def source_held(self) -> list[tuple[str, Blow]]:
-        """Blows that hold the source when the destination is READY, before the master knows it."""
+        """Return blows that pause the source at the destination's READY, unseen by the master."""
         ready = all_of(self.hold("source"), self.let_go("master"))
         return [("SHADOWING", self.hold("master")), ("READY", ready)]
 
@@ -169,16 +171,16 @@ class Scene:
             return self.cluster.master.process.pid
         if victim.endswith("slave"):
             return self.cluster.slaves[self._host_of(victim)].process.pid
-        # Not looked for among all processes: that takes so long that the moment is over.
+        # The pid is recorded beforehand: a scan of all processes would miss the moment.
         return self._pid if victim == "source" else self.watcher.destination_pid
 
-    # --- what was heard --------------------------------------------------------------------
+    # --- received outputs ------------------------------------------------------------------
 
     @property
     def outputs(self):
-        """Since the move began."""
+        """Outputs since the start of the migration."""
         return self.watcher.outputs
 
     def is_gapless(self) -> bool:
-        """Nothing was lost or repeated, and nobody spoke in between."""
+        """Return True if no output is lost or repeated, and the instances did not alternate."""
         return is_gapless(self.outputs) and len(blocks(self.outputs)) <= 2

@@ -1,4 +1,4 @@
-"""A client whose master is killed while it asks."""
+"""A client whose master is killed during a request."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.ros.clusters import PATIENCE, host, service
 
 
 def test_what_a_killed_master_may_have_taken_is_not_called_undone(make_cluster) -> None:
-    """The next run of the master does it, or takes it for too old: then nobody can tell."""
+    """The next run of the master executes the request, or rejects it as too old: then "unsure"."""
     cluster = make_cluster(host("h0"))
     cluster.client.list()
     client = MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE)
@@ -29,10 +29,11 @@ def test_what_a_killed_master_may_have_taken_is_not_called_undone(make_cluster) 
             said.append("done")
 
     try:
-        client.submit([service("first")])  # the service is known from here on
-        client._heard += 1000.0  # however long that took: it greets nobody before it asks
+        client.submit([service("first")])  # the client has discovered the service from here on
+        # However long that took, the client sends no greeting before the request.
+        client._heard += 1000.0
         master = cluster.master.process
-        master.send_signal(signal.SIGSTOP)  # the request reaches it, and nobody answers
+        master.send_signal(signal.SIGSTOP)  # the request arrives, and the master does not answer
         asking = threading.Thread(target=submit)
         asking.start()
         asking.join(1.0)
@@ -47,7 +48,7 @@ def test_what_a_killed_master_may_have_taken_is_not_called_undone(make_cluster) 
 
 
 def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> None:
-    """It was not sent to the former one: a client that greeted that goes on by itself."""
+    """The former run never got the request, so the client that greeted that run repeats it."""
     cluster = make_cluster(host("h0"))
     with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
         client.list()
@@ -56,7 +57,7 @@ def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> No
         cluster.reconnect()
         cluster.start_master()
         cluster.wait_for_hosts()
-        client._heard += 1000.0  # it greeted the former one just now
+        client._heard += 1000.0  # the client greeted the former run just now
         client.submit([service("p")])
         cluster.wait("p", "running")
 
@@ -64,15 +65,15 @@ def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> No
 @pytest.mark.parametrize(
     ("answer", "unsure"),
     [
-        (accepted(epoch=2), False),  # done, whoever did it
+        (accepted(epoch=2), False),  # done, by either run
         (refused("exists", "p is in use already", 1), False),  # by the run that was asked first
-        (refused("exists", "p is in use already", 2), True),  # perhaps by its own first asking
+        (refused("exists", "p is in use already", 2), True),  # perhaps by its own first try
         (refused("stale", "too old"), True),
-        (refused("invalid", "no such field"), False),  # says nothing of a run: of the request alone
+        (refused("invalid", "no such field"), False),  # independent of the run
     ],
 )
 def test_a_refusal_by_another_run_of_the_master_leaves_it_open_what_was_done(
     answer, unsure
 ) -> None:
-    """A repeated request may be turned down for what the former run has done of it."""
+    """A repeated request may be refused because the former run has executed it."""
     assert is_unsure(answer, 1) is unsure

@@ -1,4 +1,4 @@
-"""A host that is cut off ends its singletons by itself; what is to go on there goes on."""
+"""Fences: an isolated host stops its singletons; processes without a fence keep running."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ SOON = {
 
 
 def both(cluster, after: float = 2.0):
-    """A singleton that stops when its host is cut off, and a driver that does not; they run."""
+    """Start a singleton that stops when its host is isolated, and a driver that does not."""
     stop = IsolationPolicy("stop", after)
     cluster.submit(service("singleton", isolation=stop), service("driver"))
     return cluster.wait("singleton", "running"), cluster.wait("driver", "running")
 
 
 def test_the_supervisor_of_a_stopped_slave_fences(make_cluster) -> None:
-    """And when the slave goes on, the singleton runs again, while the driver never stopped."""
+    """The singleton runs again when the slave resumes; the driver never stops."""
     cluster = make_cluster(host("h0"), **SOON)
     singleton, driver = both(cluster)
     with held(cluster, "h0"):
@@ -43,7 +43,7 @@ def test_the_supervisor_of_a_stopped_slave_fences(make_cluster) -> None:
 
 
 def test_it_has_ended_when_its_successor_starts(make_cluster) -> None:
-    """With the time that the master chooses, from its lease."""
+    """The old singleton ends before its successor starts, in a time derived from the lease."""
     liveness = LivenessSettings(suspect=2.0, lease=6.0)
     cluster = make_cluster(host("h0"), host("h1"), **{**SOON, "liveness": liveness})
     policies = {"isolation": IsolationPolicy("stop"), "host_loss": HostLossPolicy("elsewhere")}
@@ -58,7 +58,7 @@ def test_it_has_ended_when_its_successor_starts(make_cluster) -> None:
 
 
 def test_without_a_master_nobody_hears_the_host(make_cluster) -> None:
-    """A slave that is alone stops its singletons; the next master has them started again."""
+    """An isolated slave stops its singletons; the next master has them started again."""
     cluster = make_cluster(host("h0"), **SOON)
     singleton, driver = both(cluster)
     cluster.master.process.kill()
@@ -72,9 +72,9 @@ def test_without_a_master_nobody_hears_the_host(make_cluster) -> None:
 
 
 def test_a_singleton_that_is_heard_goes_on_whoever_is_killed(make_cluster) -> None:
-    """Supervisor, then slave: those that follow them know when the host was heard last."""
+    """The next supervisor and the next slave know the time of the host's last contact."""
     cluster = make_cluster(host("h0"), **SOON)
-    after = 8.0  # a slave that was killed is back before
+    after = 8.0  # seconds; a killed slave is back before
     singleton, driver = both(cluster, after)
     lock = cluster.directory / "hosts" / "h0" / "supervisor" / "supervisor.lock"
     first = int(lock.read_text())

@@ -1,4 +1,4 @@
-"""The disk on which a slave and its supervisor keep their state is full."""
+"""A full disk under the state directory of a slave and its supervisor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LIVENESS = LivenessSettings(suspect=3.0, lease=60.0)
 
 @pytest.fixture
 def disk(tmp_path):
-    """Where h0 keeps its state."""
+    """Mount a small disk at the state directory of h0."""
     with small_disk(tmp_path / "c" / "hosts" / "h0") as disk:
         yield disk
 
@@ -28,15 +28,15 @@ def cluster(disk, tmp_path):
 
 
 def test_what_runs_goes_on_and_what_cannot_start_says_why(cluster, disk) -> None:
-    """It is told with the process, by the file's name, in listings and events.
+    """Listings and events of the process name the file that cannot be written.
 
-    By its policy it is tried again, and starts when there is room.
+    The restart policy retries the start, which succeeds when there is room.
     """
     cluster.submit(service("runs"))
     pid = cluster.wait("runs", "running").pid
     disk.fill()
     again = RestartPolicy("on-failure", delay=0.5, attempts=1000)
-    large = "x" * 20_000  # more than is left in the last page of the supervisor's record
+    large = "x" * 20_000  # larger than the free part of the last page of the supervisor's record
     cluster.submit(job("once", "true", large), job("new", "true", large, restart=again))
 
     row = cluster.ended("once")
@@ -52,7 +52,7 @@ def test_what_runs_goes_on_and_what_cannot_start_says_why(cluster, disk) -> None
 
 
 def test_a_slave_starts_again_on_a_full_disk(cluster, disk) -> None:
-    """It finds what its supervisor has kept."""
+    """A slave restarted on a full disk finds the processes in its supervisor's record."""
     cluster.submit(service("runs"))
     pid = cluster.wait("runs", "running").pid
     disk.fill()

@@ -1,6 +1,6 @@
-"""As test_handoff.py, with a node that is driven by inputs: none is lost, none is answered twice.
+"""Handoffs like those of test_handoff.py, of a node that answers inputs: none lost, none twice.
 
-It is struck where its inputs are in a buffer: of the destination, or of a source that is silent.
+The victim is killed while inputs are in a buffer: of the destination, or of a silent source.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.timeout(180)
 
 @pytest.fixture(scope="module")
 def scene(make_shared):
-    """A node that answers each input once."""
+    """A scene whose node answers each input once."""
     one = Scene(make_shared, "echo", inputs=RATE)
     yield one
     one.close()
@@ -23,7 +23,7 @@ def scene(make_shared):
 
 @pytest.mark.parametrize("moment", ["says SWITCH", "SILENT", "ACTIVE", "source stopping"])
 def test_the_master_is_killed(scene, moment):
-    """Each input is answered once and in order."""
+    """The node answers each input once and in order."""
     scene.move((moment, scene.kill("master")))
     scene.end("master")
     assert scene.is_gapless(), scene.outputs
@@ -33,7 +33,7 @@ def test_the_master_is_killed(scene, moment):
     ("whose", "moment"), [("source", "SILENT"), ("destination", "SILENT"), ("source", "ACTIVE")]
 )
 def test_a_slave_is_killed(scene, whose, moment):
-    """Each input is answered once and in order."""
+    """The node answers each input once and in order."""
     victim = f"{whose}'s slave"
     scene.move((moment, scene.kill(victim)))
     scene.end(victim)
@@ -42,14 +42,14 @@ def test_a_slave_is_killed(scene, whose, moment):
 
 @pytest.mark.parametrize("moment", ["SHADOWING", "ATTACHED"])
 def test_the_destination_is_killed_before_the_switch(scene, moment):
-    """The source goes on: each input is answered once and in order."""
+    """The source stays active and answers each input once and in order."""
     scene.move((moment, scene.kill("destination")))
     assert scene.end() == "stayed"
     assert scene.is_gapless(), scene.outputs
 
 
 def test_the_destination_is_killed_in_the_switch(scene):
-    """The source, silent already, answers what it has kept: each input once and in order."""
+    """The source, already silent, answers its buffered inputs: each once and in order."""
     blow = all_of(scene.kill("destination"), scene.let_go("source"))
     scene.move(*scene.source_held(), ("SWITCHING", blow))
     assert scene.end() == "stayed"
@@ -58,7 +58,7 @@ def test_the_destination_is_killed_in_the_switch(scene):
 
 @pytest.mark.parametrize("moment", ["says SWITCH", "SILENT", "RELEASED", "ACTIVE"])
 def test_the_source_is_killed(scene, moment):
-    """Its successor answers what it has not: only its last output may be said again."""
+    """The successor answers all inputs that the source did not; only the last output may repeat."""
     scene.move((moment, scene.kill("source")))
     assert scene.end() == "moved"
     first, second = blocks(scene.outputs)

@@ -1,7 +1,7 @@
-"""A handoff does not go its way, and then somebody is killed as well.
+"""Handoffs that fail, with a participant killed on top.
 
-The source is held before the master says SWITCH: so it cannot fall silent, and the step lasts until
-its time is over, or until the source is killed.
+The source is paused before the master says SWITCH. The source cannot fall silent, so the step lasts
+until its timeout, or until the source is killed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.timeout(180)
 
 @pytest.fixture(scope="module")
 def scene(make_shared):
-    """A counter with a timer of its own; SWITCH is given up soon."""
+    """A scene whose process counts by a timer; SWITCH times out after 1.5 s."""
     one = Scene(make_shared, "count", switch_timeout=1.5)
     yield one
     one.close()
@@ -24,7 +24,7 @@ def scene(make_shared):
 
 @pytest.mark.parametrize("victim", ["master", "source's slave", "destination's slave"])
 def test_killed_at_take_over(scene, victim):
-    """The source has ended by then: its successor goes on where it was, and its host is told so."""
+    """The source is dead: its successor continues the count, and its slave is informed."""
     scene.move(
         *scene.source_held(),
         ("SWITCHING", scene.kill("source")),
@@ -36,7 +36,7 @@ def test_killed_at_take_over(scene, victim):
 
 
 def test_the_destination_is_killed_at_take_over(scene):
-    """None is left: the process starts anew, by its policy."""
+    """No instance is left: the restart policy starts the process from its initial state."""
     scene.move(
         *scene.source_held(),
         ("SWITCHING", scene.kill("source")),
@@ -49,24 +49,24 @@ def test_the_destination_is_killed_at_take_over(scene):
     "victim", ["master", "source's slave", "destination's slave", "destination"]
 )
 def test_killed_at_abort(scene, victim):
-    """The source has counted on by then, or falls silent late; nothing is lost or repeated."""
+    """The source has resumed by then, or falls silent late; no output is lost or repeated."""
     scene.move(
         *scene.source_held(),
         ("says ABORT", all_of(scene.kill(victim), scene.let_go("source"))),
     )
-    scene.end(victim)  # the destination may be active before it hears of ABORT: then it has moved
+    scene.end(victim)  # a destination that is active before ABORT arrives has moved
     assert scene.is_gapless(), scene.outputs
 
 
 def test_the_source_is_killed_at_abort(scene):
-    """The destination is asked to give up and may do so: then the policy starts the process."""
+    """The destination may give up on ABORT: then the restart policy starts the process."""
     scene.move(*scene.source_held(), ("says ABORT", scene.kill("source")))
     scene.end()
 
 
 @pytest.mark.parametrize("victim", ["master", "source's slave", "destination's slave"])
 def test_killed_at_resume(scene, victim):
-    """The destination has given up for good: the source goes on; nothing is lost or repeated."""
+    """The destination has given up for good: the source resumes; no output is lost or repeated."""
     scene.move(
         *scene.source_held(),
         ("says RESUME", all_of(scene.kill(victim), scene.let_go("source"))),
@@ -76,14 +76,14 @@ def test_killed_at_resume(scene, victim):
 
 
 def test_the_source_is_killed_at_resume(scene):
-    """None is left: the process starts anew, by its policy."""
+    """No instance is left: the restart policy starts the process from its initial state."""
     scene.move(*scene.source_held(), ("says RESUME", scene.kill("source")))
     assert scene.end() == "stayed"
 
 
 @pytest.mark.parametrize("victim", ["master", "source's slave"])
 def test_killed_while_the_source_is_silent_and_alone(scene, victim):
-    """The destination was killed as the source fell silent for it: that waits for RESUME."""
+    """A source that fell silent for a destination killed just then waits for RESUME."""
     scene.move(
         *scene.source_held(),
         ("SWITCHING", all_of(scene.kill("destination"), scene.let_go("source"))),

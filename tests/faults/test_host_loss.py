@@ -1,4 +1,4 @@
-"""Hosts that are lost with all that runs there, or only not heard; processes with a standby."""
+"""Hosts lost with all their processes or merely out of contact; processes with a standby."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ELSEWHERE = HostLossPolicy("elsewhere")
 
 
 def counter(name: str, **options) -> ProcessSpec:
-    """Stateful: counts by its timer, and says so."""
+    """Return a stateful process that counts by its timer and publishes the count."""
     return ProcessSpec(
         name, module="benchmarks.handoff_nodes", arguments=("count", "--rate", "50"),
         environment={"PYTHONPATH": str(ROOT)}, ros=True, stop=QUICK,
@@ -41,7 +41,7 @@ def counter(name: str, **options) -> ProcessSpec:
 
 @contextlib.contextmanager
 def held(cluster: Cluster, name: str) -> Iterator[None]:
-    """The slave of a host does and hears nothing; its processes run on."""
+    """Pause the slave of a host; its processes keep running."""
     slave = cluster.slaves[name].process
     slave.send_signal(signal.SIGSTOP)
     try:
@@ -51,7 +51,7 @@ def held(cluster: Cluster, name: str) -> Iterator[None]:
 
 
 def test_a_process_goes_elsewhere_when_its_slave_hangs(make_cluster) -> None:
-    """Its supervisor has ended it before: others would hear both."""
+    """The supervisor ends the old instance before the successor starts: never two at once."""
     cluster = make_cluster(host("h0"), host("h1"), **SOON)
     deaf = """
 import signal, time
@@ -72,7 +72,7 @@ time.sleep(999)
 
 
 def test_a_process_that_waits_for_its_host_is_kept_by_it(make_cluster) -> None:
-    """Nothing can follow it: nobody has touched it."""
+    """A process that waits for its host has no successor: the host still runs the same instance."""
     cluster = make_cluster(host("h0"), host("h1"), **SOON)
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")
@@ -83,7 +83,7 @@ def test_a_process_that_waits_for_its_host_is_kept_by_it(make_cluster) -> None:
 
 
 def test_a_lost_host_comes_back_with_nothing(make_cluster) -> None:
-    """Its power was gone: what waits for it starts anew there, what does not runs elsewhere."""
+    """After a power cut, waiting processes restart on their host; the others run elsewhere."""
     cluster = make_cluster(host("h0"), **SOON)
     again = RestartPolicy("on-failure", delay=0.1)
     cluster.submit(service("waits", restart=again), service("goes", host_loss=ELSEWHERE))
@@ -102,7 +102,7 @@ def test_a_lost_host_comes_back_with_nothing(make_cluster) -> None:
 
 @pytest.mark.parametrize("how", ["process", "host"])
 def test_a_standby_goes_on_from_the_last_state(make_cluster, how: str) -> None:
-    """The primary is killed, or its host: the count goes on where it was; a new standby follows."""
+    """The standby continues the count when the primary or its host dies; a new standby follows."""
     hosts = ("h0", "h1", "h2")
     cluster = make_cluster(*map(host, hosts), **SOON)
     watcher = Watcher(cluster.domain)
@@ -124,7 +124,7 @@ def test_a_standby_goes_on_from_the_last_state(make_cluster, how: str) -> None:
         )
         said = [one.sequence for one in watcher.outputs if one.instance == primary.number]
         goes_on = [one.sequence for one in watcher.outputs if one.instance == row.number]
-        # A state goes out after its output: of one that was killed in between nobody has it.
+        # The node publishes its state after its output: a kill in between loses that state.
         assert goes_on[0] - said[-1] in (0, 1), (said[-3:], goes_on[:3])
         ready = [event.message for event in cluster.events("standby_ready", process="moving")]
         cluster.wait_for_event("standby_begun", after=cluster.events("failed_over")[0].sequence)

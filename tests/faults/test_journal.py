@@ -1,4 +1,4 @@
-"""A journal that fails a real master: its tail is lost, it is damaged, its disk is full."""
+"""Journal faults of a real master: lost newest records, a damaged file, a full disk."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rosrm.journal.sqlite import SqliteJournal
 from tests.faults.disks import small_disk
 from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service, wait_gone, wait_until
 
-#: Short, so that a test may wait for it to pass; a busy machine needs some room for suspect.
+#: Seconds. Short, because tests wait for the lease; a busy machine needs some room for suspect.
 LIVENESS = LivenessSettings(suspect=2.0, lease=5.0)
 
 
@@ -33,20 +33,21 @@ def files_of(cluster) -> list[Path]:
 
 
 def boot_of(cluster) -> str:
-    """The boot of the machine in which the master that wrote the journal ran."""
+    """Return the boot ID of the machine at the time when the journal's master ran."""
     with contextlib.closing(sqlite3.connect(files_of(cluster)[0])) as database:
         (value,) = database.execute("SELECT value FROM intent WHERE key = 'epoch'").fetchone()
     return str(value)
 
 
-# --- a lost tail -------------------------------------------------------------------------------
+# --- a journal gap -----------------------------------------------------------------------------
 
 
 def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
-    """As after a power failure: what was decided last is gone, and hosts have heard of it.
+    """A journal gap is reported, and no process runs twice.
 
-    One of them was started again since. What was started in the lost part is stopped, what was
-    queued before it is started anew, once that has ended; all else goes on untouched.
+    The state is that after a power failure: the newest records are gone, and hosts know them. Both
+    slaves were restarted since. Processes started in the lost part are stopped. A process queued
+    before is started again once its lost instance has ended; all others keep running.
     """
     cluster = make_cluster(host("h0"), host("h1"), liveness=LIVENESS)
     cluster.submit(service("before"))
@@ -67,7 +68,7 @@ def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
     cluster.submit(service("after"))
     stranger = cluster.wait("after", "running").pid
     for _ in range(20):
-        cluster.client.list()  # beats tell every host of the newest record meanwhile
+        cluster.client.list()  # each beat carries the newest sequence to every host
         time.sleep(0.02)
 
     kill(cluster.master)
@@ -97,9 +98,10 @@ def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
 
 @pytest.mark.parametrize("killed", [False, True])
 def test_after_a_fall_of_its_machine_the_master_hears_all_hosts_first(make_cluster, killed) -> None:
-    """Its journal may have lost what nobody else has heard of: a host that is away may run it.
+    """After a reboot of its machine the master waits for all hosts to report.
 
-    So it is when the first master after the fall was killed before it had heard them.
+    Its journal may have lost records that a disconnected host acts on. The master also waits when
+    the first master after the reboot was killed before all hosts reported.
     """
     cluster = make_cluster(host("h0"), host("h1"), liveness=LIVENESS)
     kill(cluster.master)
@@ -124,7 +126,7 @@ def test_after_a_fall_of_its_machine_the_master_hears_all_hosts_first(make_clust
 
 
 def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
-    """The master says what to do and stops nothing; recovered, it knows what it can still read."""
+    """The master explains the repair and stops nothing; recovery keeps all readable rows."""
     cluster = make_cluster(host("h0"), liveness=LIVENESS)
     cluster.submit(service("p"))
     pid = cluster.wait("p", "running").pid
@@ -156,7 +158,7 @@ def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
 
 
 def test_a_damaged_journal_on_a_full_disk_is_left_as_it_is(tmp_path) -> None:
-    """What it takes is said, without a traceback; with room it is recovered."""
+    """The error names the space that recovery needs, without a traceback; with room it succeeds."""
     with small_disk(tmp_path / "disk") as disk:
         path = disk.place / "journal.sqlite"
         journal = SqliteJournal(path)
@@ -178,11 +180,11 @@ def test_a_damaged_journal_on_a_full_disk_is_left_as_it_is(tmp_path) -> None:
         assert "was recovered" in recover(path)
 
 
-# --- one that cannot be written ---------------------------------------------------------------
+# --- a journal stall --------------------------------------------------------------------------
 
 
 def test_a_journal_that_somebody_else_holds_holds_new_work_up(make_cluster) -> None:
-    """A person looks at it with another program, and forgets it: the master goes on afterwards."""
+    """The master resumes after another program releases its lock on the journal."""
     cluster = make_cluster(host("h0"), liveness=LIVENESS)
     cluster.submit(service("stays"), service("ends"))
     pids = {name: cluster.wait(name, "running").pid for name in ("stays", "ends")}
@@ -205,7 +207,7 @@ def test_a_journal_that_somebody_else_holds_holds_new_work_up(make_cluster) -> N
 
 @pytest.fixture
 def disk(tmp_path):
-    """Where the master keeps its state."""
+    """Mount a small disk at the state directory of the master."""
     with small_disk(tmp_path / "c" / "master") as disk:
         yield disk
 
@@ -217,7 +219,7 @@ def cluster(disk, tmp_path):
 
 
 def blocked(cluster) -> str:
-    """Why the master takes no new work, once it does not."""
+    """Wait until the master takes no new work; return the reason."""
     wait_until(lambda: cluster.client.list().trouble, "the master noticing its full disk")
     return cluster.client.list().trouble
 
@@ -225,9 +227,9 @@ def blocked(cluster) -> str:
 def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
     """Requests are refused with the file system's name; nothing is lost, nothing runs twice.
 
-    It lasts for longer than the lease: no host is lost by it. What had been decided, and could not
-    be written, is carried out when there is room, in order; a slave that was started again
-    meanwhile is taken in with its process.
+    The journal stall lasts longer than the lease, and no host is lost by it. Decisions that could
+    not be written are carried out in order when there is room. A slave restarted during the stall
+    rejoins with its process.
     """
     ran = cluster.directory / "ran"
     cluster.submit(service("s0"), service("ends"), service("s1"), service("s2"))
@@ -235,7 +237,7 @@ def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
     cluster.submit(*(job(f"q{n}", "sh", "-c", f"echo q{n} >> {ran}") for n in range(5)))
     where = {row.name: row.host for row in cluster.client.list(processes=True).processes}
     disk.fill()
-    os.kill(pids["ends"], signal.SIGKILL)  # the master must decide something: its place is free
+    os.kill(pids["ends"], signal.SIGKILL)  # frees a place, so the master must decide
     reason = blocked(cluster)
     for part in (str(disk.place), "free of 1.0 MiB", "make room", "Running processes continue"):
         assert part in reason
@@ -272,7 +274,7 @@ def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
 
 
 def test_a_master_is_killed_while_its_disk_is_full(cluster, disk) -> None:
-    """What it had decided and not written was never done; it comes up when there is room."""
+    """Decisions that were not written are not carried out; the master starts when there is room."""
     cluster.submit(service("s0"), service("ends"))
     pids = {name: cluster.wait(name, "running").pid for name in ("s0", "ends")}
     disk.fill()
@@ -292,7 +294,7 @@ def test_a_master_is_killed_while_its_disk_is_full(cluster, disk) -> None:
 
 
 def test_a_master_is_stopped_while_its_disk_is_full(cluster, disk) -> None:
-    """It ends in good order."""
+    """A master stopped on a full disk exits with 0."""
     cluster.submit(service("ends"))
     pid = cluster.wait("ends", "running").pid
     disk.fill()
@@ -308,7 +310,7 @@ def test_a_master_is_stopped_while_its_disk_is_full(cluster, disk) -> None:
 
 
 def test_whoever_asked_as_the_disk_became_full_is_told(cluster, disk) -> None:
-    """The answer waits for the journal; without one in time, the reason is said."""
+    """The answer waits for the journal; if the journal is late, the error gives the reason."""
     disk.fill()
     cluster.client._timeout = 1.0
     with pytest.raises(NoMaster, match=r"did not answer .*disk is full.* may still be executed"):

@@ -1,4 +1,4 @@
-"""A master that is killed at any instant, while it takes work in, gives it out and moves it.
+"""Kills of the master at random instants, during submissions, assignments and migrations.
 
 `ROSRM_KILLS` instants are drawn (default 6) from the seed `ROSRM_SEED` (default 1).
 """
@@ -24,10 +24,10 @@ KILLS = int(os.environ.get("ROSRM_KILLS", "6"))
 SEED = int(os.environ.get("ROSRM_SEED", "1"))
 SERVICES = ("s0", "s1", "s2")
 JOBS = 10
-#: Within so many seconds of the first request of a round its master is killed.
+#: Seconds after the first request of a round, within which the master is killed.
 SPAN = 0.5
 
-#: Says that it began; alone, or not: whoever holds the lock is active under the name.
+#: Logs its start: "alone", or "beside another" if another instance holds the lock of the name.
 HOLDER = """
 import fcntl, os, sys, time
 folder, name = sys.argv[1:]
@@ -44,11 +44,11 @@ time.sleep(1000)
 
 
 class Round:
-    """Requests, one after the other, until the master is killed in the middle of them.
+    """Consecutive requests, until the master is killed during one of them.
 
     Attributes:
         answered: jobs whose submission was answered.
-        sent: and those whose was not.
+        sent: all submitted jobs, answered or not.
     """
 
     def __init__(self, cluster: Cluster, number: int, ran: Path) -> None:
@@ -60,7 +60,7 @@ class Round:
         self.sent: list[str] = []
 
     def run(self, delay: float) -> None:
-        """The master is killed `delay` seconds after the first request."""
+        """Send requests, and kill the master `delay` seconds after the first one."""
         client = self._cluster.client
         timer = threading.Timer(delay, self._kill)
         timer.start()
@@ -75,7 +75,7 @@ class Round:
         timer.join()
 
     def _submit(self, client, name: str) -> None:
-        client._timeout = 1.0  # nobody answers for a dead master
+        client._timeout = 1.0  # seconds; a dead master does not answer
         self.sent.append(name)
         client.submit([job(name, "sh", "-c", f"echo {name} >> {self._ran}")])
         self.answered.append(name)
@@ -94,9 +94,9 @@ class Round:
 
 @pytest.mark.timeout(120 + 20 * KILLS)
 def test_whenever_it_is_killed(make_cluster) -> None:
-    """Nothing runs twice, nothing that was answered is forgotten, the queue keeps its order.
+    """Nothing runs twice, no answered request is forgotten, and the queue keeps its order.
 
-    Judged by the processes themselves: each job says that it ran, each service that it alone does.
+    The processes are the evidence: each job logs its run, each service logs that it runs alone.
     """
     print(f"ROSRM_SEED={SEED} ROSRM_KILLS={KILLS}")
     drawn = random.Random(SEED)
@@ -148,13 +148,13 @@ def test_whenever_it_is_killed(make_cluster) -> None:
 
 
 def assert_in_order(assigned: list[str], sent: list[str]) -> None:
-    """Each job was given out for the first time after those that were submitted before it."""
+    """Check that each job was first assigned after those submitted before it."""
     first = list(dict.fromkeys(name for name in assigned if name not in SERVICES))
     assert first == [name for name in sent if name in set(first)]
 
 
 def running(cluster: Cluster, name: str) -> set[int]:
-    """Pids of all that really runs under a name."""
+    """Return the pids of all running processes under a name."""
     deadline = time.monotonic() + PATIENCE
     while True:
         found = pids_of(cluster.directory)

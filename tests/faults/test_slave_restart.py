@@ -1,4 +1,4 @@
-"""A slave that was killed is started again: its processes are not its to end."""
+"""Restart of a killed slave, whose processes keep running."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.ros.clusters import PATIENCE, alive, host, service
 
 
 def test_a_master_that_is_slow_to_notice_costs_no_process(make_cluster) -> None:
-    """It takes the former run for alive for longer than a slave waits for a name in use."""
+    """The master believes the former slave alive for longer than the new one waits for the name."""
     cluster = make_cluster(host("h0"), liveness=LivenessSettings(suspect=8.0, lease=60.0))
     cluster.submit(service("p"))
     pid = cluster.wait("p", "running").pid

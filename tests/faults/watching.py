@@ -1,4 +1,4 @@
-"""Hears a whole handoff from outside, and strikes at the words that it is told."""
+"""An external watcher of a handoff, which strikes at chosen protocol messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rosrm.supervisor.procfs import read_environment
 from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
 from tests.ros.clusters import Cluster, pids_of, zombie
 
-#: The words of a handoff by the names that the tests use.
+#: Handoff phases by the names that the tests use.
 SAID = {
     getattr(StateConfig, name): name
     for name in ("SHADOW", "SWITCH", "TAKE_OVER", "ABORT", "RESUME", "DONE")
@@ -33,12 +33,12 @@ REPORTED = {
     )
 }  # fmt: skip
 
-#: What is done when a word is heard.
+#: Action at a protocol message.
 Blow = Callable[[], None]
 
 
 class Output(NamedTuple):
-    """Which instance said which number, in answer to which input."""
+    """The instance that published an output, its number, and the input that it answers."""
 
     instance: int
     sequence: int
@@ -46,20 +46,21 @@ class Output(NamedTuple):
 
 
 class Watcher:
-    """Hears outputs, `state_config`, the channels and the slaves, in a thread of its own.
+    """A thread that receives outputs, `state_config`, handoff channels and process status.
 
-    A word is "says SHADOW" of the master, "READY" of the source or the destination, "source
-    stopping" of a slave, and "source policy" when a slave has taken another restart policy for it
-    (it then tells the status anew, though nothing of it has changed).
+    A recorded event is "says SHADOW" for a message of the master, "READY" for a report of the
+    source or the destination, "source stopping" for a status from a slave. "source policy" means
+    that a slave has applied another restart policy: it then sends the status again, otherwise
+    unchanged.
 
     Attributes:
-        outputs, heard: since it was told to strike.
-        struck: the last blow has fallen.
-        destination_pid: as its slave said last; 0: none.
+        outputs, heard: outputs and events since `strike_at`.
+        struck: set after the last blow.
+        destination_pid: newest pid from the destination's slave; 0: none.
 
     Args:
         domain: ROS domain.
-        inputs: how many a second it publishes, numbered from 1; 0: none.
+        inputs: inputs per second to publish, numbered from 1; 0: none.
     """
 
     def __init__(self, domain: int, inputs: float = 0.0) -> None:
@@ -91,7 +92,7 @@ class Watcher:
         self._thread.start()
 
     def strike_at(self, source: int, *blows: tuple[str, Blow]) -> None:
-        """In the next handoff away from an instance, strike at these words, one after the other."""
+        """Strike at these events, in order, in the next handoff away from instance `source`."""
         self.struck.clear()
         self.outputs.clear()
         self.heard.clear()
@@ -146,12 +147,12 @@ class Watcher:
 
 
 def blocks(outputs: list[Output]) -> list[list[Output]]:
-    """The outputs, in the order in which they came, by who spoke."""
+    """Group the outputs, in order of arrival, by the instance that published them."""
     return [list(group) for _, group in itertools.groupby(outputs, lambda one: one.instance)]
 
 
 def is_gapless(outputs: list[Output]) -> bool:
-    """Each number once and in order, and each input answered once and in order."""
+    """Return True if each number and each answered input occurs once and in order."""
     first = outputs[0]
     return [one[1:] for one in outputs] == [
         (first.sequence + n, first.answers + n) for n in range(len(outputs))
@@ -159,7 +160,7 @@ def is_gapless(outputs: list[Output]) -> bool:
 
 
 def instances(cluster: Cluster, process: str) -> dict[int, int]:
-    """The pids of the instances of a process that run in a cluster, by number."""
+    """Return the pids of a process's running instances in a cluster, by instance number."""
     mark, found = f"ROSRM_INSTANCE={process}#".encode(), {}
     for pid in pids_of(cluster.directory):
         with contextlib.suppress(OSError):

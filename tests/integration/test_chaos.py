@@ -1,4 +1,4 @@
-"""A short, seeded run of the chaos benchmark: real faults on a lab, judged by the real oracle."""
+"""A short, seeded run of the chaos benchmark: real faults in a lab, judged by the real oracle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SEED, FAULTS = 741, 9
 
 @pytest.fixture
 def lab():
-    """The name of a lab that is not left."""
+    """Yield the name of a lab; check that the benchmark has removed the lab."""
     from rosrm_lab import all_labs
 
     reason = why_not()
@@ -54,7 +54,7 @@ def test_a_few_faults_break_no_promise(lab, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 def test_a_signal_leaves_nothing(lab, tmp_path):
-    """In the midst of it; the fixture looks for what is left."""
+    """A signal during the run removes the lab; the fixture checks this."""
     process = subprocess.Popen(
         [*COMMAND, "--lab", lab, "--out", str(tmp_path)], stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE, text=True, cwd=ROOT,

@@ -1,4 +1,4 @@
-"""`rosrm_msgs` is one package for pip and for colcon."""
+"""Builds of `rosrm_msgs` by pip and by colcon."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ else:
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "rosrm_msgs"
 
-#: Publishes a message to itself and prints where its interfaces come from.
+#: Publishes a message to itself and prints the path of its interfaces.
 ROUND_TRIP = """
 import time
 import rclpy
@@ -66,7 +66,7 @@ def test_pip_and_colcon_build_with_the_same_requirements() -> None:
 
 
 def test_pip_build_works() -> None:
-    """`make setup` built it with pip."""
+    """`make setup` built the package with pip."""
     printed = round_trip(clean_environment(), PACKAGE.parent)
 
     assert f"from {sys.prefix}" in printed
@@ -78,9 +78,9 @@ def test_colcon_build_works(tmp_path: Path) -> None:
     shutil.copytree(PACKAGE, tmp_path / "src" / PACKAGE.name)
     environment = clean_environment()
     environment["PATH"] = f"{Path(sys.prefix) / 'bin'}:{environment['PATH']}"
-    # What sourcing an installed ROS 2 does.
+    # As after sourcing an installed ROS 2.
     environment["AMENT_PREFIX_PATH"] = environment["CMAKE_PREFIX_PATH"] = sys.prefix
-    # Else colcon lets make wait while the machine is busy, and with that for itself.
+    # Otherwise make waits while the machine is busy, even if only by its own load.
     environment["MAKEFLAGS"] = f"-j{os.cpu_count()}"
     against_wheels = tmp_path / "src" / PACKAGE.name / "cmake" / "ros_wheels.cmake"
 
@@ -113,7 +113,7 @@ def test_colcon_build_works(tmp_path: Path) -> None:
 
 
 def clean_environment() -> dict[str, str]:
-    """This environment, less what the ROS wheels' bootstrapper put there."""
+    """Return this environment without the variables of the ROS wheels' bootstrapper."""
     environment = dict(os.environ)
     for name in ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH"):
         environment.pop(name, None)
@@ -124,7 +124,7 @@ def clean_environment() -> dict[str, str]:
 
 
 def round_trip(environment: dict[str, str], folder: Path) -> str:
-    """What ROUND_TRIP prints in a process of its own."""
+    """Return the output of ROUND_TRIP in a separate process."""
     run = subprocess.run(
         [sys.executable, "-c", ROUND_TRIP],
         cwd=folder,

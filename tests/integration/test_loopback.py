@@ -1,4 +1,4 @@
-"""A network of loopback alone, for clusters on one machine."""
+"""A private network with only a loopback device, for clusters on one machine."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ print(entered, said, out, os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"))
 
 
 def _run(code: str, *before: str) -> list[str]:
-    """The lines that a Python process printed."""
+    """Return the lines that a Python process printed."""
     command = [*before, sys.executable, "-c", code]
     return subprocess.run(
         command, check=True, capture_output=True, text=True, timeout=30.0
@@ -53,7 +53,7 @@ def _allowed():
 
 @pytest.mark.usefixtures("_allowed")
 def test_in_a_network_of_its_own_all_are_found_by_udp():
-    """There the range needs no limit, and the transports are those between hosts."""
+    """In a private network discovery needs no range limit, and uses UDP as between hosts."""
     entered, after = _run(_ENTER)
     assert entered.startswith("True")
     assert after == "7 subnet UDPv4"
@@ -61,14 +61,14 @@ def test_in_a_network_of_its_own_all_are_found_by_udp():
 
 @pytest.mark.usefixtures("_allowed")
 def test_nothing_leaves_it_and_loopback_works():
-    """What is started from it joins ROS in the same way."""
+    """Child processes join ROS in the same way, and no packet leaves the network."""
     assert _run(_REACH) == ["True heard no way out SUBNET"]
 
 
 @pytest.mark.usefixtures("_allowed")
 @pytest.mark.parametrize("missing", ["sys_admin", "net_admin"])
 def test_without_the_right_it_stays_where_it_is(missing):
-    """Half of the rights would strand it in a network that is down."""
+    """Without both rights nothing changes: one alone would leave a network that is down."""
     drop = ("setpriv", f"--bounding-set=-{missing}", f"--inh-caps=-{missing}")
     entered, after = _run(_ENTER, *drop)
     assert (entered.split()[0], after.split()[1:]) == ("False", entered.split()[1:])

@@ -1,4 +1,4 @@
-"""A figure of the paper on a small lab, as users measure it."""
+"""A figure of the paper on a small lab, measured as users do."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COMMAND = [sys.executable, "-m", "benchmarks.paper"]
 
 @pytest.fixture
 def lab():
-    """What the names of the labs begin with; none of them may be left."""
+    """Yield the prefix of the labs' names; check that no such lab is left."""
     from rosrm_lab import all_labs
 
     reason = why_not()
@@ -39,7 +39,7 @@ def lab():
 @pytest.mark.slow
 @pytest.mark.timeout(LONGEST + 60)
 def test_a_small_figure_is_measured_and_its_claim_holds(lab, tmp_path):
-    """Numbers, picture, the last line of output and the exit status say the same."""
+    """Numbers, picture, last line of output and exit status agree."""
     ended = subprocess.run(
         [*COMMAND, "fig6", "--small", "--lab", lab, "--out", str(tmp_path)],
         check=False,
@@ -60,7 +60,7 @@ def test_a_small_figure_is_measured_and_its_claim_holds(lab, tmp_path):
 
 @pytest.mark.timeout(180)
 def test_a_signal_leaves_nothing(lab, tmp_path):
-    """In the midst of a figure; the fixture looks for what is left."""
+    """A signal during a measurement removes the labs; the fixture checks this."""
     process = subprocess.Popen(
         [*COMMAND, "fig7", "--small", "--lab", lab, "--out", str(tmp_path)],
         stderr=subprocess.PIPE,
@@ -72,7 +72,7 @@ def test_a_signal_leaves_nothing(lab, tmp_path):
         said.append(line)
         if "slave 1 is up" in line:
             break
-    time.sleep(0.5)  # so that a process or two have come; it matters little how many
+    time.sleep(0.5)  # so that one or two processes exist; their number does not matter
     process.send_signal(signal.SIGTERM)
     rest = process.communicate(timeout=120)[1]
     assert process.returncode == 128 + signal.SIGTERM, "".join(said) + rest
@@ -82,7 +82,7 @@ def test_a_signal_leaves_nothing(lab, tmp_path):
 
 @pytest.mark.timeout(180)
 def test_a_signal_ends_the_simulated_slaves_and_their_master(tmp_path):
-    """Fig. 9 needs no lab: what it has started is in sessions of its own, and ends all the same."""
+    """A signal ends the processes of Fig. 9 (no lab), although they have their own sessions."""
     process = subprocess.Popen(
         [*COMMAND, "fig9", "--small", "--out", str(tmp_path / "out")],
         stderr=subprocess.PIPE, text=True, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)},
@@ -91,7 +91,7 @@ def test_a_signal_ends_the_simulated_slaves_and_their_master(tmp_path):
         deadline = time.monotonic() + 90.0
         while not any("registered" in log.read_text() for log in tmp_path.glob("*/scale.log")):
             assert time.monotonic() < deadline, "no simulated slave was registered within 90 s"
-            time.sleep(0.1)  # a look at the log
+            time.sleep(0.1)  # poll interval of the log
         started = {one.pid for one in psutil.Process(process.pid).children(recursive=True)}
         assert len(started) >= 3, "the measurement, its master, its simulated slaves"
     finally:
@@ -104,7 +104,7 @@ def test_a_signal_ends_the_simulated_slaves_and_their_master(tmp_path):
 
 
 def test_without_rights_one_message_says_what_is_missing(tmp_path):
-    """Nothing is begun, and nothing is written but the folder."""
+    """Without rights nothing starts, and only the output folder is written."""
     drop = []
     if os.geteuid() == 0:
         if not shutil.which("setpriv"):

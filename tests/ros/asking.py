@@ -1,4 +1,4 @@
-"""Single calls to a part, as the tests of the protocol make them."""
+"""Single service calls to a part, for the protocol tests."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from rosrm.ros.participant import Participant
 
 
 def wait_for(participant: Participant, future: Any, deadline: float) -> Any:
-    """The result of a call; None when `deadline` (monotonic seconds) has passed."""
+    """Return the result of a call; None when `deadline` (monotonic seconds) has passed."""
     return future.result() if wait_until(participant, future.done, deadline) else None

@@ -1,4 +1,4 @@
-"""Real clusters for the tests, and proof that nothing of them is left when they have ended."""
+"""Real clusters for the tests, with a check that nothing of them is left afterwards."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from rosrm.testing.local_cluster import LocalCluster, Part
 
 MIB = 2**20
 QUICK = StopPolicy(interrupt_grace=0.5, terminate_grace=0.5)
-#: For what ends by itself when it is told to, as soon as the machine lets it. A node that is killed
-#: leaves its shared memory behind.
+#: For processes that end on a signal, as soon as the machine permits. A killed node leaves its
+#: shared memory behind.
 CALM = StopPolicy(interrupt_grace=20.0, terminate_grace=5.0)
-#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
 PATIENCE = 30.0
-#: For what is not about liveness: a busy machine may stall a slave for longer than the usual
-#: second, and then the host gets no work, or its name is given away. (Not longer than a slave that
-#: was started again waits for its name.)
+#: For tests that are not about liveness. A busy machine may stall a slave for longer than the usual
+#: second, and then the host gets no work, or its name is given away. The time must not exceed a
+#: restarted slave's wait for its name.
 STEADY = LivenessSettings(suspect=3.0, lease=30.0)
 
 
 def host(name: str, memory: float = 2048 * MIB, cpu: float = 16.0, **options) -> HostConfig:
-    """A slice: it sees only its own processes, whatever else this machine is doing."""
+    """Return a slice: a host that measures only its own processes, not the machine."""
     options.setdefault("probes", {"memory": {}, "cpu": {}})
     return HostConfig(
         host=name, scope="slice", budget={"memory": memory, "cpu": cpu}, **options
@@ -41,25 +41,25 @@ def host(name: str, memory: float = 2048 * MIB, cpu: float = 16.0, **options) ->
 
 
 def job(name: str, *command: str, **options) -> ProcessSpec:
-    """A process that runs to completion."""
+    """Return a process that runs to completion."""
     options.setdefault("stop", QUICK)
     return ProcessSpec(name, command=command, kind=Kind.JOB, **options)
 
 
 def service(name: str, *command: str, **options) -> ProcessSpec:
-    """A process that runs until it is stopped."""
+    """Return a process that runs until it is stopped."""
     options.setdefault("stop", QUICK)
     return ProcessSpec(name, command=command or ("sleep", "1000"), **options)
 
 
 def python(name: str, code: str, **options) -> ProcessSpec:
-    """A process of a few lines."""
+    """Return a process that runs a few lines of Python."""
     kind = options.pop("kind", Kind.SERVICE)
     options.setdefault("stop", QUICK)
     return ProcessSpec(name, command=(sys.executable, "-ISc", code), kind=kind, **options)
 
 
-#: A ROS node of a few lines; it says what it is, and ends with its context.
+#: A ROS node of a few lines that prints its name, parameters and topic, and ends with its context.
 NODE = """
 import json, sys, rclpy
 from rclpy.node import Node
@@ -79,14 +79,14 @@ except BaseException:
 
 
 def node(name: str, code: str = NODE, **options) -> ProcessSpec:
-    """A real ROS node."""
+    """Return a process with a real ROS node."""
     options.setdefault("stop", CALM)
     options.setdefault("readiness", Readiness(timeout=PATIENCE))
     return ProcessSpec(name, command=(sys.executable, "-c", code), ros=True, **options)
 
 
 class Cluster(LocalCluster):
-    """With what the tests ask of it again and again.
+    """A local cluster with the operations that tests need.
 
     Attributes:
         started: every part that was ever started.
@@ -105,12 +105,12 @@ class Cluster(LocalCluster):
         return self.client.submit(list(specs))
 
     def run(self, *specs: ProcessSpec, timeout: float = PATIENCE) -> list[ProcessRow]:
-        """Submit, and wait until all have ended."""
+        """Submit processes, and wait until all have ended."""
         self.submit(*specs)
         return [self.ended(spec.name, timeout) for spec in specs]
 
     def wait(self, name: str, *states: str, timeout: float = PATIENCE) -> ProcessRow:
-        """The row of a process, once it is in one of these states."""
+        """Return the row of a process, once it is in one of these states."""
 
         def there(view: Snapshot) -> bool:
             return any(row.name == name and row.state in states for row in view.processes)
@@ -122,13 +122,13 @@ class Cluster(LocalCluster):
         return self.wait(name, "finished", "failed", "cancelled", timeout=timeout)
 
     def cancel(self, *names: str) -> None:
-        """Cancel, and wait until they have ended."""
+        """Cancel processes, and wait until they have ended."""
         self.client.cancel(names)
         for name in names:
             self.ended(name)
 
     def log(self, name: str) -> str:
-        """All that the newest instance of a process wrote."""
+        """Return the log of the newest instance of a process."""
         for event in reversed(self.client.list(events=True, process=name).events):
             if event.host:
                 part = self.client.read_log(event.host, name, 0, 0, 0)
@@ -148,10 +148,10 @@ class Cluster(LocalCluster):
         except Refused as refusal:
             if refusal.code != "unknown":
                 raise
-            return ""  # assigned, and its host has not begun it
+            return ""  # assigned, and not yet started by its host
 
     def kinds(self, name: str) -> list[str]:
-        """What happened to a process, oldest first."""
+        """Return the kinds of a process's events, oldest first."""
         return [event.kind for event in self.client.list(events=True, process=name).events]
 
     def events(self, kind: str = "", **narrow) -> list:
@@ -159,7 +159,7 @@ class Cluster(LocalCluster):
         return [event for event in found if kind in ("", event.kind)]
 
     def wait_for_event(self, kind: str, says: str = "", timeout: float = PATIENCE, **narrow):
-        """The first event of a kind whose message says something."""
+        """Return the first event of a kind whose message contains a text."""
         deadline = time.monotonic() + timeout
         while not (found := [e for e in self.events(kind, **narrow) if says in e.message]):
             assert time.monotonic() < deadline, f"no {kind} in {timeout} s: {self.log_of('master')}"
@@ -167,11 +167,11 @@ class Cluster(LocalCluster):
         return found[0]
 
     def log_of(self, part: str) -> str:
-        """What the master or a slave said."""
+        """Return the log of the master or of a slave."""
         return (self.directory / f"{part}.log").read_text(errors="replace")
 
     def reconnect(self) -> None:
-        """After the master was started again."""
+        """Drop the client's connection after a restart of the master."""
         if self._client is not None:
             self._client.close()
             self._client = None
@@ -186,9 +186,9 @@ class Cluster(LocalCluster):
         return part
 
     def start_slave_again(self, name: str) -> Part:
-        """Start the slave of a host again after a SIGKILL, and wait for its registration.
+        """Restart the slave of a host after a SIGKILL, and wait for its registration.
 
-        Until then the master may take the former run for alive, and the host for accepting.
+        Until then the master may consider the former run alive, and the host available.
         """
         before = self.client.list().last_sequence
         part = self.start_slave(next(one for one in self.hosts if one.host == name))
@@ -203,7 +203,7 @@ class Cluster(LocalCluster):
 
 
 def pids_of(directory: Path) -> dict[int, str]:
-    """Processes whose command line or environment names the cluster's directory."""
+    """Return processes whose command line or environment names the cluster's directory."""
     mark = str(directory).encode()
     found = {}
     for entry in Path("/proc").iterdir():
@@ -219,7 +219,7 @@ def pids_of(directory: Path) -> dict[int, str]:
 
 
 def shared_memory_of(pid: int) -> set[str]:
-    """The files in /dev/shm that a process has mapped and that bear its participant's id."""
+    """Return the files in /dev/shm that a process has mapped for its own DDS participant."""
     with contextlib.suppress(OSError):
         lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
         mapped = [line.split(None, 5)[5] for line in lines if "/dev/shm/" in line]
@@ -236,7 +236,7 @@ def wait_gone(pid: int, timeout: float = PATIENCE) -> None:
 
 
 def wait_until(condition: Callable[[], object], what: str, timeout: float = PATIENCE) -> None:
-    """For what cannot be awaited: a file of another process."""
+    """Poll a condition for which no event exists, such as a file of another process."""
     deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
@@ -254,10 +254,10 @@ def alive(pid: int) -> bool:
 
 
 def end_and_check(cluster: Cluster) -> None:
-    """End a cluster; what it leaves behind is ended too, and fails the test."""
+    """End a cluster; kill its remaining processes, which fail the test."""
     codes = {part.name: part.process.poll() for part in cluster.parts()}
     memory = {part.name: shared_memory_of(part.process.pid) for part in cluster.parts()}
-    # Before anybody has talked to it, a master may not have come so far as to end in good order.
+    # A master that no client has talked to may not yet handle signals.
     good = {0} if cluster.is_connected else {0, -signal.SIGINT}
     cluster.close()
     left = wait_until_none(cluster.directory)
@@ -267,16 +267,16 @@ def end_and_check(cluster: Cluster) -> None:
     assert not left, f"left behind: {left}"
     for part in cluster.parts():
         assert "Traceback" not in (said := cluster.log_of(part.name)), said
-        if codes[part.name] is None:  # it lived, and was ended in good order
+        if codes[part.name] is None:  # the part was alive, and ended on a signal
             assert part.process.returncode in good, (
                 f"{part.name}: {part.process.returncode}\n{said}"
             )
     files = {path for paths in memory.values() for path in paths if Path(path).exists()}
-    if files:  # a peer's are mapped too, and this peer may live
+    if files:  # a peer's files are mapped, too, and that peer may live
         live = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
         files -= set().union(*map(shared_memory_of, live))
     if any(part.process.returncode == -signal.SIGKILL for part in cluster.started):
-        for path in files:  # it had no chance to do this itself
+        for path in files:  # a killed participant cannot remove its files
             for name in (path, f"{path}_el"):
                 Path(name).unlink(missing_ok=True)
     else:
@@ -284,7 +284,7 @@ def end_and_check(cluster: Cluster) -> None:
 
 
 def wait_until_none(directory: Path, timeout: float = PATIENCE) -> dict[int, str]:
-    """What is still there when the time is up."""
+    """Return the processes that are left when the time is up."""
     deadline = time.monotonic() + timeout
     while (left := pids_of(directory)) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -296,7 +296,7 @@ Make = Callable[..., Cluster]
 
 @contextlib.contextmanager
 def clusters(new_directory: Callable[[], Path], **defaults) -> Iterator[Make]:
-    """A factory of clusters, of these settings where they say nothing, that ends all it made."""
+    """Yield a factory of clusters with default settings; end all clusters afterwards."""
     made: list[Cluster] = []
 
     def make(*hosts: HostConfig, **cluster) -> Cluster:

@@ -1,4 +1,4 @@
-"""Clusters of real masters, slaves and processes; a ROS domain of its own for each."""
+"""Fixtures of clusters with real masters, slaves and processes, each in its own ROS domain."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from tests.ros.portable_kit import Ear
 
 @pytest.fixture(scope="session", autouse=True)
 def private_network():
-    """Where it is allowed: nobody else is heard, and who is killed leaves nothing to the next."""
+    """Enter a private network, if permitted: no foreign traffic, no shared memory left by kills."""
     enter_private_network()
 
 
 @pytest.fixture
 def make_cluster(tmp_path_factory):
-    """Makes clusters for one test."""
+    """Yield a factory of clusters for one test."""
     with clusters(lambda: tmp_path_factory.mktemp("c")) as make:
         yield make
 
 
 @pytest.fixture(scope="module")
 def make_shared(tmp_path_factory):
-    """Makes clusters that the tests of a module share."""
+    """Yield a factory of clusters that the tests of a module share."""
     with clusters(lambda: tmp_path_factory.mktemp("c"), liveness=STEADY) as make:
         yield make
 
 
 @pytest.fixture
 def ear(cluster):
-    """Hears the portable counters in the cluster of a module."""
+    """Yield a listener to the portable counters in the module's cluster."""
     with closing(Ear(cluster.domain)) as ear:
         yield ear
 
 
 @pytest.fixture
 def stage():
-    """A ROS context in a domain of its own, for nodes that think they are instances."""
+    """Yield a ROS context in its own domain, for nodes that run as if started by a slave."""
     stage = Stage()
     yield stage
     stage.close()

@@ -1,7 +1,7 @@
-"""Nodes that think they are instances of rosrm's, and a conductor in the master's place.
+"""Nodes that run as instances of rosrm, and a conductor in place of the master.
 
-Real DDS between them; only the master's decisions and the slaves are missing, so that each word
-can be said, or left out, at any moment.
+The nodes talk over real DDS. Only the master's decisions and the slaves are missing, so that a test
+can send, or omit, each message at any moment.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Counter(Node):
-    """Counts by itself, and what it is told to add."""
+    """A node that counts by a timer, and sums up received numbers."""
 
     def __init__(self, name: str = "counter", period: float = 0.02, **named: Any) -> None:
         super().__init__(name, **named)
@@ -63,11 +63,12 @@ class Counter(Node):
 
 
 class Stage:
-    """A ROS context with an executor, on which nodes appear as instances of processes.
+    """A ROS context with an executor, on which nodes run as instances of processes.
 
     Args:
-        beside: another stage: in its domain, spun with it, and a DDS participant of its own.
-        domain: of a cluster that is there already.
+        beside: another stage, whose domain and spinning this one shares, as a separate
+            DDS participant.
+        domain: domain of an existing cluster.
     """
 
     def __init__(self, beside: Stage | None = None, domain: int | None = None) -> None:
@@ -99,7 +100,7 @@ class Stage:
         self, make: Callable[..., Any], number: int, *, name: str = "counter", alias: str = "",
         shadow: bool = False, keep: Any = "", **named: Any,
     ) -> Any:  # fmt: skip
-        """A node that was started by a slave, as it sees it."""
+        """Create a node in the environment that a slave would give the instance."""
         variables = {
             "ROSRM_INSTANCE": f"{name}#{number}", "ROSRM_PROCESS": name, "ROSRM_NODE": f"/{name}",
             "ROSRM_STATE_CONFIG": TOPIC, "ROSRM_MASTER": CLUSTER, "ROSRM_EPOCH": str(EPOCH),
@@ -119,7 +120,7 @@ class Stage:
         timeout: float = PATIENCE,
         seen: Callable[[], object] = lambda: "",
     ) -> None:
-        """Let the nodes work until a condition holds; `seen`: what there is instead."""
+        """Spin the nodes until a condition holds; `seen` describes the actual state."""
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, (
@@ -128,13 +129,13 @@ class Stage:
             self.spin(0.05)
 
     def spin(self, seconds: float) -> None:
-        """Do what is ready, within so long."""
+        """Execute ready callbacks for at most `seconds`."""
         self.executor.spin_once(timeout_sec=seconds)
         for stage in self._beside:
             stage.executor.spin_once(timeout_sec=0.0)
 
     def listen(self, message_type: Any, topic: str, qos: Any = RELIABLE) -> list[Any]:
-        """All that is said on a topic from now on."""
+        """Return a list that collects all messages on a topic from now on."""
         heard: list[Any] = []
         self.plain.create_subscription(message_type, topic, heard.append, qos)
         return heard
@@ -156,7 +157,7 @@ class Stage:
 
 
 class Conductor:
-    """Says what the master would say of one handoff, and hears what comes back."""
+    """A stand-in for the master in one handoff, which publishes phases and records reports."""
 
     def __init__(
         self, stage: Stage, *, source: int, destination: int, name: str = "counter"
@@ -175,18 +176,18 @@ class Conductor:
         )
 
     def say(self, phase: int, **other: Any) -> None:
-        """Say a phase; `other`: fields that differ from what is right."""
+        """Publish a phase; `other` overrides fields of the correct message."""
         right = {
             field: getattr(self.config, field) for field in self.config.get_fields_and_field_types()
         }
         self._publisher.publish(StateConfig(**{**right, "phase": phase, **other}))
 
     def of(self, number: int) -> list[int]:
-        """The phases that an instance reported."""
+        """Return the phases that an instance reported."""
         return [report.phase for report in self.reports if report.instance == number]
 
     def wait(self, number: int, phase: int, timeout: float = PATIENCE) -> HandoffReport:
-        """Until an instance reports a phase."""
+        """Wait until an instance reports a phase."""
         self._stage.spin_until(
             lambda: phase in self.of(number),
             f"report {phase} of {number}",
@@ -199,7 +200,7 @@ class Conductor:
         )  # fmt: skip
 
     def hand_over(self) -> None:
-        """The good course."""
+        """Conduct a handoff without faults."""
         self.say(StateConfig.SHADOW)
         self.wait(self.config.destination, HandoffReport.READY)
         self.say(StateConfig.SWITCH)

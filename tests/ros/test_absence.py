@@ -1,4 +1,4 @@
-"""What a node takes through the time in which it has no part in the ROS graph."""
+"""State that a node keeps across graph departure and rejoin."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.ros.nodes import RELIABLE
 
 
 def again(stage, absence: Absence, name: str = "again", **named) -> Node:
-    """A node that begins with what another one had."""
+    """Return a node that starts with the parameters of a departed one."""
     overrides = absence.overrides(named.pop("parameter_overrides", None))
     return stage.add(Node(name, context=stage.context, parameter_overrides=overrides, **named))
 
@@ -39,7 +39,7 @@ def node(stage):
     ids=str,
 )
 def test_a_parameter_keeps_its_value(stage, node, value) -> None:
-    """Of every type, set at run time, and declared anew with the same words."""
+    """A parameter of any type, set at run time, keeps its value in an identical declaration."""
     default = [type(value[0])()] if isinstance(value, list) else type(value)()
     default = [b"\x01"] if isinstance(value, bytes) else default
     value = [value] if isinstance(value, bytes) else value
@@ -50,7 +50,7 @@ def test_a_parameter_keeps_its_value(stage, node, value) -> None:
 
 
 def test_what_is_declared_elsewhere_is_declared_again(stage, node) -> None:
-    """With its descriptor; what has a type and no value yet has neither more nor less after."""
+    """A parameter declared by others returns with its descriptor; an unset one stays unset."""
     node.declare_parameter("limit", 3, ParameterDescriptor(description="of all", read_only=True))
     node.declare_parameter("unset", Parameter.Type.DOUBLE)
     node.declare_parameter("free", None, ParameterDescriptor(dynamic_typing=True))
@@ -68,7 +68,7 @@ def test_what_is_declared_elsewhere_is_declared_again(stage, node) -> None:
 
 
 def test_a_later_value_goes_before_what_the_author_gave(stage, node) -> None:
-    """And what was given and never declared is still there to be declared."""
+    """A value set at run time precedes the override; an override never declared is kept."""
     node.declare_parameter("speed", 2.0)
     given = [Parameter("speed", value=1.0), Parameter("later", value=5)]
     copy = again(stage, absence_of(node), parameter_overrides=given)
@@ -77,7 +77,7 @@ def test_a_later_value_goes_before_what_the_author_gave(stage, node) -> None:
 
 
 def test_timers_go_on_in_their_period_and_only_the_same_ones(stage, node) -> None:
-    """Matched in order; cancelled ones rest; one of another period is a new one."""
+    """Timers match in order; a cancelled one stays so, another period is a new timer."""
     for period in (50.0, 60.0, 70.0):
         node.create_timer(period, lambda: None)
     kept, cancelled, _ = node.timers
@@ -96,7 +96,7 @@ def test_timers_go_on_in_their_period_and_only_the_same_ones(stage, node) -> Non
 
 
 def test_a_timer_is_back_in_its_own_period_after_the_first(stage, node) -> None:
-    """The first comes when it was due; the next ones a period later each."""
+    """The first call comes when it was due; the next ones a full period later each."""
     node.create_timer(0.5, lambda: None)
     absence = absence_of(node)
     copy, calls = again(stage, absence), []
@@ -108,7 +108,7 @@ def test_a_timer_is_back_in_its_own_period_after_the_first(stage, node) -> None:
 
 
 def test_a_rate_is_left_alone(stage, node) -> None:
-    """Its timer has no callback of an author."""
+    """The timer of a rate has no callback, and is not matched."""
     node.create_rate(10.0)
     absence = absence_of(node)
     copy = again(stage, absence)
@@ -117,7 +117,7 @@ def test_a_rate_is_left_alone(stage, node) -> None:
 
 
 def test_peers_are_counted_by_their_ends(stage, node) -> None:
-    """Two publishers of a topic are two ends; rclpy's own topics are none of the author's."""
+    """Two publishers of a topic are two endpoints; topics of rclpy are not counted."""
     node.create_publisher(Int64, "out", RELIABLE)
     node.create_publisher(Int64, "out", RELIABLE)
     node.create_subscription(Int64, "in", lambda _: None, RELIABLE)
@@ -127,7 +127,7 @@ def test_peers_are_counted_by_their_ends(stage, node) -> None:
 
 
 def test_missing_peers_are_named_when_patience_ends(node) -> None:
-    """Who is there is not named; an end that is not made again is nobody's."""
+    """The result names missing peers only, of endpoints that exist again."""
     node.create_publisher(Int64, "out", RELIABLE)
     node.create_subscription(Int64, "in", lambda _: None, RELIABLE)
     before = {"readers of /out": 2, "writers of /in": 0, "a server of /gone": 1}
@@ -135,7 +135,7 @@ def test_missing_peers_are_named_when_patience_ends(node) -> None:
 
 
 def test_ends_of_others_are_counted(stage, node) -> None:
-    """On the author's topics and clients; neither the node's own, nor anybody else's."""
+    """Endpoints of other nodes on the node's topics and clients are counted, no others."""
     node.create_publisher(Int64, "out", RELIABLE)
     node.create_subscription(Int64, "out", lambda _: None, RELIABLE)
     node.create_subscription(Int64, "in", lambda _: None, RELIABLE)

@@ -1,4 +1,4 @@
-"""A benchmark that is stopped leaves nothing of its cluster."""
+"""Stopped benchmarks, which must leave nothing of their cluster."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_benchmark_that_is_terminated_ends_its_cluster(tmp_path):
-    """SIGTERM, as a service manager or a time limit sends it; Ctrl-C did so before."""
+    """SIGTERM (from a service manager, a time limit) ends the cluster, as Ctrl-C does."""
     benchmark = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.balance"],
         cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)},

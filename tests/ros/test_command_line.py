@@ -59,10 +59,10 @@ class Terminal:
         )  # fmt: skip
 
     def run(self, *words: str, code: int = 0) -> str:
-        """Its standard output, or, of one that fails, its standard error.
+        """Run a command; return its standard output, or its standard error if it is to fail.
 
-        A command looks for the master for less than 3 s, which may be too short while this machine
-        is busy: one that did not find it, and so asked for nothing, is given again.
+        A command looks for the master for less than 3 s, which may be too short on a busy machine.
+        A command that found no master, and so sent no request, is repeated.
         """
         deadline = time.monotonic() + PATIENCE
         run = self.finish(self.start(*words))
@@ -71,7 +71,7 @@ class Terminal:
         return self.check(run, code)
 
     def finish(self, run: subprocess.Popen) -> subprocess.CompletedProcess:
-        """Wait for the end of one that was started."""
+        """Wait for the end of a started command."""
         try:
             output, errors = run.communicate(timeout=PATIENCE)
         finally:
@@ -79,7 +79,7 @@ class Terminal:
         return subprocess.CompletedProcess(run.args, run.returncode, output, errors)
 
     def check(self, run: subprocess.CompletedProcess, code: int) -> str:
-        """What `run` answers, of one that has ended."""
+        """Check an ended command as `run` does, and return its output."""
         said = f"{run.args}: exit {run.returncode}\n{run.stdout}\n{run.stderr}"
         assert run.returncode == code, said
         assert "Traceback" not in said
@@ -87,7 +87,7 @@ class Terminal:
 
     @contextlib.contextmanager
     def follow(self, *words: str, says: str) -> Iterator[tuple[subprocess.Popen, str]]:
-        """One that goes on, once it has said something, and what; given again as by `run`."""
+        """Start a command, repeated as by `run`; yield it and its output once it prints `says`."""
         deadline = time.monotonic() + PATIENCE
         while True:
             with self.start(*words, start_new_session=True) as process:
@@ -131,7 +131,7 @@ def rosrm(cluster, tmp_path_factory) -> Terminal:
 
 
 def test_ps(rosrm, cluster) -> None:
-    """A table for people, all of it as JSON for programs."""
+    """`rosrm ps` prints a table, and everything as JSON."""
     table = rosrm.run("ps")
     assert "talker" in table
     assert "loser" in table
@@ -150,7 +150,7 @@ def test_ps(rosrm, cluster) -> None:
 
 
 def test_hosts(rosrm) -> None:
-    """Both, with usage against limits."""
+    """`rosrm hosts` shows both hosts, with usage and limits."""
     table = rosrm.run("hosts")
     assert "h0" in table
     assert "memory" in table
@@ -162,7 +162,7 @@ def test_hosts(rosrm) -> None:
 
 
 def test_status(rosrm) -> None:
-    """Half a page, and its counts."""
+    """`rosrm status` prints half a page, with counts."""
     text = rosrm.run("status")
     assert "2 up" in text
     assert "loser" in text
@@ -172,7 +172,7 @@ def test_status(rosrm) -> None:
 
 
 def test_events(rosrm) -> None:
-    """What happened, in order; narrowed to a process."""
+    """`rosrm events` prints events in order, optionally of one process."""
     assert "counter" in rosrm.run("events")
     events = rosrm.json("events", "--process", "counter")
     kinds = [event["kind"] for event in events]
@@ -183,7 +183,7 @@ def test_events(rosrm) -> None:
 
 
 def test_explain(rosrm) -> None:
-    """Why it is where it is, with every host."""
+    """`rosrm explain` gives the reason for the placement, with every host."""
     text = rosrm.run("explain", "talker")
     assert "h0" in text
     assert "h1" in text
@@ -193,7 +193,7 @@ def test_explain(rosrm) -> None:
 
 
 def test_plugins(rosrm) -> None:
-    """Those of the master and of every host, and what is installed here."""
+    """`rosrm plugins` lists those of the master, of every host, and of this installation."""
     rows = rosrm.json("plugins")
     assert {"weighted", "threshold", "relaunch"} <= {row["name"] for row in rows}
     selected = [row for row in rows if row["kind"] == "scoring" and row["state"] == "selected"]
@@ -205,7 +205,7 @@ def test_plugins(rosrm) -> None:
 
 
 def test_logs(rosrm) -> None:
-    """All, or the end, of one that runs and of one that has ended."""
+    """`rosrm logs` prints all or the end, of running and ended processes."""
     assert rosrm.run("logs", "counter") == "1\n2\n3\n"
     assert rosrm.run("logs", "counter", "--tail", "1") == "3\n"
     assert rosrm.run("logs", "counter", "--since", "1h") == "1\n2\n3\n"
@@ -221,15 +221,15 @@ def test_logs(rosrm) -> None:
 
 
 def test_top(rosrm) -> None:
-    """A picture, as often as it is told."""
+    """`rosrm top --count` prints a fixed number of pictures."""
     assert "talker" in rosrm.run("top", "--count", "1")
 
 
-# --- what goes on until Ctrl-C ----------------------------------------------------------------
+# --- until Ctrl-C -----------------------------------------------------------------------------
 
 
 def read_until(descriptor: int, text: str) -> str:
-    """All that is said until a text has come, or until the end."""
+    """Return all output until a text has come, or until the end."""
     said, deadline = "", time.monotonic() + PATIENCE
     while text not in said:
         left = max(0.0, deadline - time.monotonic())
@@ -255,7 +255,7 @@ def read_until(descriptor: int, text: str) -> str:
     ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
 )
 def test_following_ends_with_ctrl_c(rosrm, words, says) -> None:
-    """Without a traceback, and with the exit code that a shell expects."""
+    """Ctrl-C ends the command without a traceback, with the exit code that a shell expects."""
     with rosrm.follow(*words, says=says) as (process, _):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=PATIENCE)
@@ -264,7 +264,7 @@ def test_following_ends_with_ctrl_c(rosrm, words, says) -> None:
 
 
 def test_top_in_a_terminal(rosrm) -> None:
-    """A live picture until Ctrl-C."""
+    """`rosrm top` shows a live picture until Ctrl-C."""
     rosrm.run("status")  # a master can be found in time now
     screen, inside = os.openpty()
     with rosrm.start("top", "--period", "0.2", start_new_session=True, stdout=inside) as process:
@@ -273,7 +273,7 @@ def test_top_in_a_terminal(rosrm) -> None:
             for _ in range(2):
                 assert "talker" in read_until(screen, "talker")
             process.send_signal(signal.SIGINT)
-            read_until(screen, "nothing more")  # it may wait until its last picture was read
+            read_until(screen, "nothing more")  # it may block until its last picture is read
             assert process.wait(PATIENCE) in (0, 130)
             assert "Traceback" not in process.stderr.read()
         finally:
@@ -282,7 +282,7 @@ def test_top_in_a_terminal(rosrm) -> None:
 
 
 def test_top_sorts_and_ends_by_a_key(rosrm) -> None:
-    """A key is not shown, `q` ends it with 0, and the terminal echoes again afterwards."""
+    """Keys are not echoed, `q` ends with exit code 0, and the terminal's settings are restored."""
     rosrm.run("status")  # a master can be found in time now
     screen, inside = os.openpty()
     usual = termios.tcgetattr(inside)
@@ -302,7 +302,7 @@ def test_top_sorts_and_ends_by_a_key(rosrm) -> None:
 
 
 def test_following_a_log_to_its_end(rosrm, cluster) -> None:
-    """It ends by itself when the process has ended and everything was shown."""
+    """`rosrm logs -f` ends once the process has ended and all output is shown."""
     go = rosrm.directory / "go"
     work = rosrm.file(
         "slow.yaml",
@@ -322,7 +322,7 @@ def test_following_a_log_to_its_end(rosrm, cluster) -> None:
 
 
 def test_submit_and_wait(rosrm) -> None:
-    """0 when all went well, 1 when one failed, and the failure is named."""
+    """`submit --wait` exits with 0 if all jobs succeed, with 1 if one fails."""
     good = rosrm.file(
         "good.yaml", "processes:\n  - {name: good-job, kind: job, command: ['true']}\n"
     )
@@ -332,7 +332,7 @@ def test_submit_and_wait(rosrm) -> None:
 
 
 def test_a_name_in_use(rosrm) -> None:
-    """Refused with 1; nothing else of the file was queued."""
+    """The submission exits with 1, and no process of the file is queued."""
     work = rosrm.file(
         "twice.yaml",
         "processes:\n  - {name: other, command: ['true']}\n  - {name: talker, command: ['true']}\n",
@@ -342,7 +342,7 @@ def test_a_name_in_use(rosrm) -> None:
 
 
 def test_a_wrong_file(rosrm) -> None:
-    """2, with line and column; nothing was queued."""
+    """The submission exits with 2, line and column in its error; no process is queued."""
     work = rosrm.file("wrong.yaml", "processes:\n  - name: x\n    comand: ['true']\n")
     said = rosrm.run("submit", work, code=2)
     assert "wrong.yaml:3" in said
@@ -351,7 +351,7 @@ def test_a_wrong_file(rosrm) -> None:
 
 
 def test_migrate_restart_cordon_drain_cancel(rosrm, cluster) -> None:
-    """Each says what it does; with --wait it is done when the command ends."""
+    """Each command prints its effect; with --wait it returns after completion."""
     before = cluster.process("talker")
     other = "h1" if before.host == "h0" else "h0"
     said = rosrm.run("migrate", "talker", "--to", other, "--wait", "--timeout", "60s")
@@ -394,12 +394,12 @@ def test_migrate_restart_cordon_drain_cancel(rosrm, cluster) -> None:
     ids=lambda words: words[0],
 )  # fmt: skip
 def test_unknown_names(rosrm, words) -> None:
-    """Refused with 1, naming what there is not."""
+    """A command on an unknown name exits with 1 and the name in its error."""
     assert words[1] in rosrm.run(*words, code=1)
 
 
 def test_config_check(rosrm) -> None:
-    """Good and bad files, without a master."""
+    """`config check` accepts a good file and refuses a bad one, without a master."""
     good = rosrm.file("cluster.yaml", "name: demo\nscoring: {policy: weighted}\n")
     rosrm.run("config", "check", good)
     bad = rosrm.file("bad-cluster.yaml", "name: demo\nscoring: {policy: wieghted}\n")
@@ -416,7 +416,7 @@ NEEDS_A_MASTER = [
 
 
 def test_no_master(tmp_path) -> None:
-    """Every command says so in time, with what it looked for, and exits with 3."""
+    """Without a master every command exits with 3 in time, and names domain and RMW."""
     domain, claim = claim_domain()
     terminal = Terminal(domain, tmp_path)
     work = terminal.file("work.yaml", "processes:\n  - {name: x, command: ['true']}\n")
@@ -426,7 +426,7 @@ def test_no_master(tmp_path) -> None:
     with claim:
         times = []
         while not times or (min(times) >= 4.5 and len(times) < 8):
-            # 3 s are promised. Once is enough: this machine may be busy now, and not in a moment.
+            # 3 s are promised. One attempt in time is enough, because this machine may be busy.
             began = time.monotonic()
             terminal.run("ps", code=NO_MASTER)
             times.append(time.monotonic() - began)
@@ -442,7 +442,7 @@ def test_no_master(tmp_path) -> None:
 
 
 def test_a_cluster_by_hand(tmp_path) -> None:
-    """`rosrm master`, `rosrm slave`, `rosrm submit`, and Ctrl-C for both: clean, code 0."""
+    """`rosrm master`, `rosrm slave` and `rosrm submit` work; Ctrl-C ends both parts with code 0."""
     with by_hand(tmp_path) as (terminal, master, slave):
         work = terminal.file("work.yaml", "processes:\n  - {name: p, command: [sleep, '1000']}\n")
         terminal.run("submit", work, "--wait")
@@ -458,7 +458,7 @@ def test_a_cluster_by_hand(tmp_path) -> None:
 
 
 def test_no_part_receives_through_shared_memory(tmp_path) -> None:
-    """Also with LOCALHOST: the port of a killed part delays the next commands for seconds."""
+    """No part uses shared memory, even with LOCALHOST: a killed part's port delays commands."""
     with by_hand(tmp_path, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST") as (terminal, *parts):
         work = terminal.file("work.yaml", "processes:\n  - {name: p, command: [sleep, '1000']}\n")
         terminal.run("submit", work, "--wait")
@@ -470,7 +470,7 @@ def test_no_part_receives_through_shared_memory(tmp_path) -> None:
 def by_hand(
     directory: Path, **environment: str
 ) -> Iterator[tuple[Terminal, subprocess.Popen, subprocess.Popen]]:
-    """A terminal, a master and a slave in a domain of their own."""
+    """Yield a terminal, a master and a slave in their own domain."""
     domain, claim = claim_domain()
     terminal = Terminal(domain, directory)
     terminal.environment |= environment

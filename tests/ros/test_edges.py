@@ -1,4 +1,4 @@
-"""What strangers, late and mad messages do to a real cluster: nothing, and it is said."""
+"""Foreign, late and malformed messages to a real cluster: refused and reported."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.ros.clusters import PATIENCE, host, job, service
 path = names.Names("/rosrm")
 
 
-#: Seconds for which a request is young: longer than usual, as a busy machine may take its time.
+#: Maximum age of a request in seconds; longer than the default, because a machine may be busy.
 MAX_AGE = 20.0
 
 
@@ -40,7 +40,7 @@ def cluster(make_shared):
 
 
 class Stranger:
-    """A participant that says what rosrm's own parts never would."""
+    """A participant that sends messages which rosrm's own parts never send."""
 
     RUN = 4242  # the incarnation of its hosts
 
@@ -57,7 +57,7 @@ class Stranger:
         return self.clients[name]
 
     def ask(self, kind, name: str, request):
-        """The answer; asked again for one that got lost before DDS knew its way."""
+        """Call a service; repeat requests that are lost before discovery is complete."""
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             future = self.client(kind, name).call_async(request)
@@ -90,7 +90,7 @@ class Stranger:
 
     @contextlib.contextmanager
     def registered(self, name: str, capacity: float, **labels: str) -> Iterator[int]:
-        """A host of one resource that is nothing but this registration; its number."""
+        """Register a host of one resource that consists of this registration; yield its number."""
         description = HostDescription(
             name, self.RUN, labels=labels, period=0.1,
             resources=(ResourceDescription("memory", "B", capacity),),
@@ -127,7 +127,7 @@ def stranger(cluster):
 
 
 def test_a_client_of_another_version_is_refused(cluster, stranger) -> None:
-    """The master says so to it, and keeps a record."""
+    """The master refuses the client with a reason, and records an event."""
     answer = stranger.hello(protocol_version=99, name="from-the-future")
     assert not answer.accepted
     assert "version 99" in answer.message
@@ -137,7 +137,7 @@ def test_a_client_of_another_version_is_refused(cluster, stranger) -> None:
 
 @pytest.mark.parametrize("kind", ["submit", "list", "explain", "read_log"])
 def test_a_request_of_another_version_is_refused(cluster, stranger, kind) -> None:
-    """Also by the services that need no handshake; nothing is done."""
+    """The services without a handshake also refuse the request, without effect."""
     if kind == "submit":
         answer = stranger.submit(
             job("futuristic", "true"), envelope=stranger.envelope(protocol_version=99)
@@ -159,7 +159,7 @@ def test_a_request_of_another_version_is_refused(cluster, stranger, kind) -> Non
 
 
 class OtherMaster:
-    """Answers handshakes as a master of another version would."""
+    """A master of another protocol version, as far as handshakes are concerned."""
 
     def __init__(self, settings: RosSettings):
         self.participant = Participant(settings, "rosrm_test_master")
@@ -183,7 +183,7 @@ class OtherMaster:
 
 
 def test_a_slave_refuses_a_master_of_another_version(make_cluster, tmp_path) -> None:
-    """It says which versions, ends with 1, and leaves nothing behind."""
+    """The slave logs both versions, ends with 1, and leaves nothing behind."""
     cluster = make_cluster()
     domain, claim = claim_domain()
     with claim, OtherMaster(settings_on_this_machine(domain)) as other:
@@ -204,7 +204,7 @@ def test_a_slave_refuses_a_master_of_another_version(make_cluster, tmp_path) -> 
 
 
 def test_a_late_request_is_refused(cluster, stranger) -> None:
-    """By the master's own clock; and one that knows nothing of it as well."""
+    """The master refuses a beat that is too old by its own clock, or not its own."""
     beat = stranger.hello().beat
     for receiver_beat in (beat - int((MAX_AGE + 1.0) * 1e9), beat + 10**12, 0):
         envelope = stranger.envelope(receiver_beat=receiver_beat)
@@ -214,7 +214,7 @@ def test_a_late_request_is_refused(cluster, stranger) -> None:
 
 
 def test_a_repeated_request_is_done_once_and_answered_again(cluster, stranger) -> None:
-    """The same id twice: the same answer twice, one process."""
+    """Two requests with one ID get the same answer, and start one process."""
     envelope = stranger.envelope()
     answers = [stranger.submit(job("once", "true"), envelope=envelope) for _ in range(2)]
     assert all(answer.accepted for answer in answers)
@@ -224,14 +224,14 @@ def test_a_repeated_request_is_done_once_and_answered_again(cluster, stranger) -
 
 
 def test_a_slave_judges_its_orders(cluster, stranger) -> None:
-    """Late, of an older epoch, of another version, unknown: refused, and the process runs on."""
+    """A slave refuses late, outdated, foreign and unknown orders, and its process keeps running."""
     cluster.submit(service("target"))
     row = cluster.wait("target", "running")
     control = path.of_host("h0", names.CONTROL)
     epoch = stranger.hello().epoch
 
     def order(**changes):
-        now = time.monotonic_ns()  # of this machine, and so the slave's own
+        now = time.monotonic_ns()  # this machine's clock, and so the slave's own
         envelope = stranger.control.envelope(now, epoch)
         action = changes.pop("action", srv.ControlHost.Request.STOP)
         for name, value in changes.items():
@@ -257,7 +257,7 @@ def test_a_slave_judges_its_orders(cluster, stranger) -> None:
 
 
 def test_three_hundred_requests_at_once_are_all_answered(cluster, stranger) -> None:
-    """The default depth of a service would drop most of them silently."""
+    """The default queue depth of a service would silently drop most of them."""
     envelopes = [stranger.envelope() for _ in range(3)]
     client = stranger.client(srv.Submit, path(names.SUBMIT))
     futures = []
@@ -285,7 +285,7 @@ def test_three_hundred_requests_at_once_are_all_answered(cluster, stranger) -> N
 
 
 def test_a_submission_that_makes_no_sense_is_refused(cluster, stranger) -> None:
-    """With the reason; the master goes on."""
+    """The refusal has the reason, and the master keeps running."""
     spec = convert.spec_to_msg(job("mad", "true"))
     for name, value, said in (
         ("kind", "daemon", "daemon"),
@@ -315,7 +315,7 @@ def test_a_submission_that_makes_no_sense_is_refused(cluster, stranger) -> None:
     ids=str,
 )
 def test_a_host_that_makes_no_sense_is_refused(cluster, stranger, changes) -> None:
-    """It is not taken in."""
+    """The host is not registered."""
     capacity = changes.pop("capacity", 1.0)
     description = convert.host_to_msg(
         HostDescription(
@@ -347,13 +347,13 @@ def reading(cluster, **changes):
 
 @pytest.mark.parametrize("usage", [float("nan"), -0.5, 1e30, float("inf")], ids=str)
 def test_a_reading_that_makes_no_sense_is_refused(cluster, stranger, usage) -> None:
-    """It is said, the numbers are not taken over, and what the slave itself says counts next."""
+    """The reading is refused with an event and without effect; the next valid reading counts."""
     name = f"mad{usage}"
     with stranger.registered(name, capacity=1000.0) as number:
         publisher = stranger.publisher(msg.ResourceInfo, names.RESOURCE_INFO, qos.READING_OUT)
 
         def told(at: int, value: float, until) -> None:
-            """Best effort, and so until it has arrived; sequences grow from `at` on."""
+            """Publish best-effort readings until one arrives; sequences grow from `at` on."""
             values = np.zeros(16, np.float32)
             values[0] = value
             row = {"host_id": number, "incarnation": Stranger.RUN, "present": 1, "usage": values}
@@ -377,14 +377,14 @@ def test_a_reading_that_makes_no_sense_is_refused(cluster, stranger, usage) -> N
 
 
 def test_a_reading_of_another_version_is_refused(cluster, stranger) -> None:
-    """Of another version, and of another size; told once, not ten times a second."""
+    """The master reports readings of another version once, not ten times a second."""
     publisher = stranger.publisher(msg.ResourceInfo, names.RESOURCE_INFO, qos.READING_OUT)
 
     def told() -> list:
         return [e for e in cluster.events("peer_refused") if "resource_info" in e.message]
 
     began, more = time.monotonic(), 0
-    while more < 20:  # after the first that was heard
+    while more < 20:  # continue after the first refusal
         assert time.monotonic() - began < PATIENCE, "the stranger was not noticed"
         publisher.publish(reading(cluster, protocol_version=99))
         cluster.client.spin(0.05)
@@ -394,7 +394,7 @@ def test_a_reading_of_another_version_is_refused(cluster, stranger) -> None:
 
 
 def test_a_status_that_makes_no_sense_is_refused(cluster, stranger) -> None:
-    """A state that nobody knows, from whoever says it."""
+    """A status with an unknown state is refused, even from a registered host."""
     publisher = stranger.publisher(msg.ProcessStatusBatch, names.PROCESS_STATUS, qos.STATUSES)
     row = cluster.host("h0")
     batch = msg.ProcessStatusBatch(
@@ -407,7 +407,7 @@ def test_a_status_that_makes_no_sense_is_refused(cluster, stranger) -> None:
 
 
 def test_a_host_that_has_told_no_limits_gets_no_work(cluster, stranger) -> None:
-    """A slave that asks before its first reading waits until it has said what it may be given."""
+    """A host that asks before its first reading waits until its limits are known."""
     with stranger.registered("fake", capacity=1000.0, who="fake") as number:
         cluster.submit(
             *(job(f"fake-{n}", "true", required_labels={"who": "fake"}, needs={"memory": 300.0})
@@ -434,16 +434,16 @@ def test_a_host_that_has_told_no_limits_gets_no_work(cluster, stranger) -> None:
     cluster.client.cancel([f"fake-{n}" for n in range(3)])
 
 
-# --- nobody there -----------------------------------------------------------------------------
+# --- absent parts -----------------------------------------------------------------------------
 
 
 def test_no_master_is_said_in_time() -> None:
-    """Within the time that was given, with domain, RMW and namespace."""
+    """The error comes within the timeout, with domain, RMW and namespace."""
     domain, claim = claim_domain()
     settings = settings_on_this_machine(domain)
     times = []
     with claim:
-        # Once is enough: this machine may be busy now, and not in a moment.
+        # One attempt in time is enough, because this machine may be busy.
         while not times or (min(times) >= 2.5 and len(times) < 8):
             began = time.monotonic()
             with pytest.raises(NoMaster) as nobody:
@@ -462,7 +462,7 @@ def test_clusters_of_different_namespaces_do_not_meet(cluster) -> None:
 
 
 def test_a_slave_that_is_not_there_is_said(cluster) -> None:
-    """Asking for a log of a host that nobody serves ends in time."""
+    """A request for a log of an absent host fails in time."""
     client = MasterClient.connect(cluster.ros, name="test", timeout=PATIENCE)
     with client:
         client._timeout = 1.0
@@ -471,7 +471,7 @@ def test_a_slave_that_is_not_there_is_said(cluster) -> None:
 
 
 def test_callbacks_that_raise_end_nothing() -> None:
-    """Without the guard rclpy ends this process: callbacks of a topic, a request and an answer."""
+    """Exceptions in callbacks (topic, request, answer) end no process, unlike in bare rclpy."""
     domain, claim = claim_domain()
     settings = settings_on_this_machine(domain)
     ends: list[object] = []

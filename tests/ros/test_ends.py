@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, SIGHUP, second masters and slaves: every part ends cleanly and says why."""
+"""Ends of every part: Ctrl-C, SIGTERM, SIGHUP, second masters and slaves, kills."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.ros.clusters import (
     wait_until_none,
 )
 
-#: A user ends a part by Ctrl-C, by `kill`, or by closing its terminal.
+#: Signals of Ctrl-C, of `kill`, and of a closed terminal.
 STOPS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
@@ -39,9 +39,10 @@ def end(part, number) -> int:
 
 @pytest.mark.parametrize("number", STOPS)
 def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> None:
-    """Exit code 0, no traceback, no process left; what it ran is queued for another host.
+    """A stopped slave exits with 0, no traceback, no process left; its processes are queued.
 
-    The master acknowledges the last statuses at once: the slave waits less than its 2 s for that.
+    The master acknowledges the last statuses at once, so the slave waits less than its 2 s for
+    that.
     """
     cluster = make_cluster(host("h0"))
     restart = RestartPolicy("always", delay=0.1)
@@ -68,15 +69,15 @@ def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> No
 
 @pytest.mark.parametrize("after", [0.0, 1.3])
 def test_a_slave_that_is_stopped_after_its_master_loses_no_process(make_cluster, after) -> None:
-    """Master first, then the slave: what it ran is queued again when both are back.
+    """Processes of a slave that is stopped after its master are queued when both are back.
 
-    The silence of the master may be noticed while the slave stops.
+    The slave may notice the silence of the master while it stops.
     """
     cluster = make_cluster(host("h0"))
     cluster.submit(service("p"), service("q", restart=RestartPolicy("on-failure", delay=0.1)))
     before = {name: cluster.wait(name, "running").number for name in ("p", "q")}
     assert end(cluster.master, signal.SIGINT) == 0
-    time.sleep(after)  # the instant is what is tested
+    time.sleep(after)  # the instant of the stop is under test
     assert end(cluster.slaves["h0"], signal.SIGINT) == 0
     assert wait_until_none(cluster.directory / "hosts") == {}
     stopping = cluster.log_of("h0").partition("stopping 2 processes")[2]
@@ -98,7 +99,7 @@ def test_a_slave_that_is_stopped_after_its_master_loses_no_process(make_cluster,
 
 @pytest.mark.parametrize("number", STOPS)
 def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> None:
-    """Exit code 0, no traceback; started again it goes on with the same processes."""
+    """A stopped master exits with 0, without a traceback; the next one has the same processes."""
     cluster = make_cluster(host("h0"))
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")
@@ -116,9 +117,9 @@ def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> No
 
 
 def test_parts_that_are_stopped_at_once_say_what_becomes_of_the_processes(make_cluster) -> None:
-    """No process keeps running, and neither log says so; a second signal tells what is left.
+    """Neither log claims that processes keep running; a second signal lists the remaining ones.
 
-    The slave cannot be ready for the second signal before it has begun to stop.
+    The slave can only handle the second signal after it has begun to stop.
     """
     cluster = make_cluster(host("h0"))
     deaf = "trap '' INT TERM; while :; do sleep 0.1; done"
@@ -142,7 +143,7 @@ def test_parts_that_are_stopped_at_once_say_what_becomes_of_the_processes(make_c
 
 
 def test_keep_leaves_the_processes_running(make_cluster) -> None:
-    """`on_stop: keep`: they go on with the supervisor, and the next slave takes them over."""
+    """With `on_stop: keep` processes outlive their slave, and the next slave re-adopts them."""
     cluster = make_cluster(host("h0", on_stop="keep"))
     go = cluster.directory / "go"
     script = f"while [ ! -e {go} ]; do sleep 0.05; done; exit 3"
@@ -158,7 +159,7 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
     view = cluster.client.list(hosts=True, processes=True)
     assert [row.state for row in view.hosts] == ["detached"]
     assert {row.state for row in view.processes} == {"unreachable"}
-    go.touch()  # it ends while no slave is there
+    go.touch()  # it ends while there is no slave
 
     cluster.start_slave(host("h0"))
     after = cluster.wait("p", "running")
@@ -169,7 +170,7 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
 
 
 def test_a_slave_that_keeps_nothing_leaves(make_cluster) -> None:
-    """`on_stop: keep` with no process: the host has left at once, and no supervisor stays."""
+    """With `on_stop: keep` and no process, host and supervisor leave at once."""
     cluster = make_cluster(host("h0", on_stop="keep"))
     assert cluster.run(job("p", "true"))[0].state == "finished"
     assert end(cluster.slaves["h0"], signal.SIGTERM) == 0
@@ -180,13 +181,13 @@ def test_a_slave_that_keeps_nothing_leaves(make_cluster) -> None:
 
 @pytest.mark.parametrize("role", ["master", "slave"])
 def test_interrupted_while_it_starts(make_cluster, role) -> None:
-    """At whatever instant Ctrl-C comes, there is no traceback and nothing is left."""
+    """Ctrl-C at any instant of the start gives no traceback and leaves nothing."""
     cluster = make_cluster()
     if role == "master":
         cluster.close()
     for delay in (0.0, 0.02, 0.05, 0.1, 0.15, 0.3, 0.5, 0.8, 1.2):
         part = cluster.start_master() if role == "master" else cluster.start_slave(host("h0"))
-        time.sleep(delay)  # the instants between are what is tested
+        time.sleep(delay)  # the instants in between are under test
         code = end(part, signal.SIGINT)
         assert code in (0, -signal.SIGINT), cluster.log_of(part.name)
         assert "Traceback" not in cluster.log_of(part.name)
@@ -196,11 +197,11 @@ def test_interrupted_while_it_starts(make_cluster, role) -> None:
         del cluster.slaves["h0"]
 
 
-# --- second ones ------------------------------------------------------------------------------
+# --- second masters and slaves ----------------------------------------------------------------
 
 
 def test_a_second_master_is_refused_naming_the_first(make_cluster) -> None:
-    """On the same state directory, and on the same domain with another one."""
+    """A second master is refused on the same state directory, and on the same domain."""
     cluster = make_cluster(host("h0"))
     first = cluster.master
     same = cluster.start_master()
@@ -221,7 +222,7 @@ def test_a_second_master_is_refused_naming_the_first(make_cluster) -> None:
 
 
 def test_of_two_masters_at_once_one_stays(make_cluster) -> None:
-    """While they start they cannot see each other: then one gives way, and names the other."""
+    """Two masters that start at once cannot see each other; one ends and names the other."""
     cluster = make_cluster()
     cluster.close()
     domain_settings = [
@@ -248,7 +249,7 @@ def test_of_two_masters_at_once_one_stays(make_cluster) -> None:
 
 
 def test_a_second_slave_of_a_name_is_refused(make_cluster) -> None:
-    """On the same state directory at once; on another one by the master, after a moment."""
+    """A second slave is refused by its state directory at once, or later by the master."""
     cluster = make_cluster(host("h0"), liveness=STEADY)
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")
@@ -275,7 +276,7 @@ def test_a_second_slave_of_a_name_is_refused(make_cluster) -> None:
 
 
 def test_a_state_directory_that_cannot_be_used_is_said(make_cluster, tmp_path) -> None:
-    """With its path; no traceback."""
+    """The error has the path and no traceback."""
     cluster = make_cluster()
     (tmp_path / "file").write_text("")
     state = tmp_path / "file" / "state"
@@ -290,11 +291,11 @@ def test_a_state_directory_that_cannot_be_used_is_said(make_cluster, tmp_path) -
     assert "Traceback" not in said
 
 
-# --- killed -----------------------------------------------------------------------------------
+# --- kills ------------------------------------------------------------------------------------
 
 
 def test_a_master_that_is_killed(make_cluster) -> None:
-    """Restarted: same pids, nothing started twice, the queue in order, nothing lost."""
+    """The next master keeps pids and the order of the queue; nothing is lost or started twice."""
     cluster = make_cluster(host("h0", max_processes=3), host("h1", max_processes=3))
     cluster.submit(*(service(f"s{n}") for n in range(6)))
     for n in range(6):
@@ -304,7 +305,7 @@ def test_a_master_that_is_killed(make_cluster) -> None:
     epoch = cluster.events("master_started")[-1].message
 
     end(cluster.master, signal.SIGKILL)
-    # While it is away one ends.
+    # One process ends without a master.
     os.kill(before["s5"].pid, signal.SIGKILL)
     cluster.reconnect()
     cluster.start_master()
@@ -323,7 +324,7 @@ def test_a_master_that_is_killed(make_cluster) -> None:
 
 
 def test_a_master_that_is_killed_again_and_again(make_cluster) -> None:
-    """Whatever was answered is done exactly once, whenever the kill comes."""
+    """Answered requests are executed exactly once, at whatever instant the master is killed."""
     cluster = make_cluster(host("h0", max_processes=4), host("h1", max_processes=4))
     folder = cluster.directory / "ran"
     folder.mkdir()
@@ -346,7 +347,7 @@ def test_a_master_that_is_killed_again_and_again(make_cluster) -> None:
 
 
 def test_a_slave_that_is_killed(make_cluster) -> None:
-    """Restarted: same pids; what ended meanwhile is reported with its exit code; work goes on."""
+    """The next slave finds the same pids, reports exits since, with codes, and takes new work."""
     cluster = make_cluster(host("h0"))
     go = cluster.directory / "go"
     script = f"while [ ! -e {go} ]; do sleep 0.05; done; exit 5"
@@ -368,7 +369,7 @@ def test_a_slave_that_is_killed(make_cluster) -> None:
 
 
 def test_a_supervisor_that_is_killed(make_cluster) -> None:
-    """The slave starts another one: same pids, exits are seen, and work goes on."""
+    """The slave starts another supervisor: same pids, exits are reported, new work runs."""
     cluster = make_cluster(host("h0"))
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")
@@ -388,7 +389,7 @@ def test_a_supervisor_that_is_killed(make_cluster) -> None:
 
 
 def test_both_killed_at_once(make_cluster) -> None:
-    """Master and slave die together and come back: the process never notices."""
+    """Processes keep running while master and slave are killed and restarted."""
     cluster = make_cluster(host("h0"))
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")
@@ -403,7 +404,7 @@ def test_both_killed_at_once(make_cluster) -> None:
 
 
 def test_a_host_that_loses_its_power_starts_its_services_again(make_cluster) -> None:
-    """Slave, supervisor and process end at one moment; the policy starts the service there."""
+    """After a power cut of host, supervisor and process, the restart policy starts the service."""
     cluster = make_cluster(host("h0"), host("h1"))
     cluster.submit(service("p", restart=RestartPolicy("on-failure", delay=0.1)))
     before = cluster.wait("p", "running")
@@ -425,14 +426,15 @@ def test_a_host_that_loses_its_power_starts_its_services_again(make_cluster) -> 
     assert (after.host, after.number) == (before.host, before.number)
 
 
-#: Who comes up without what hosts have seen of its journal gives no work for a lease.
+#: A master without the records that hosts have seen assigns no work for one lease.
 SHORTLY = LivenessSettings(lease=3.0)
 
 
 def test_a_lost_journal(make_cluster) -> None:
-    """Moved away, as the message about a damaged one advises, it leaves the master with nothing.
+    """A master whose damaged journal was moved away, as its error advises, starts empty.
 
-    What ran is stopped as unknown, and the same slaves take new work under the same names.
+    Processes of the old journal are stopped as unknown, and the same slaves take new work under the
+    same names.
     """
     cluster = make_cluster(host("h0"), liveness=SHORTLY)
     cluster.submit(service("p"))
@@ -450,7 +452,8 @@ def test_a_lost_journal(make_cluster) -> None:
     journal.rename(journal.with_name("old"))
     cluster.reconnect()
     cluster.start_master()
-    cluster.wait_for_hosts(timeout=20.0)  # not only when the open request for work is repeated
+    # The host registers before its open request for work is repeated.
+    cluster.wait_for_hosts(timeout=20.0)
     wait_gone(before.pid)
     for number in range(3):
         assert cluster.run(job(f"new{number}", "true"))[0].state == "finished"
@@ -460,7 +463,7 @@ def test_a_lost_journal(make_cluster) -> None:
 
 @pytest.mark.parametrize("epoch", [1, 2])
 def test_a_lost_journal_of_a_master_that_is_back_at_once(make_cluster, epoch) -> None:
-    """The slave hears no silence, and the same epoch or an older one: it registers anew."""
+    """The slave sees no silence, and the same or an older epoch: it registers again."""
     cluster = make_cluster(host("h0"), liveness=SHORTLY)
     for _ in range(1, epoch):
         end(cluster.master, signal.SIGKILL)
@@ -485,7 +488,7 @@ def test_a_lost_journal_of_a_master_that_is_back_at_once(make_cluster, epoch) ->
 
 @pytest.fixture
 def by_hand(make_cluster):
-    """A cluster without hosts, the state directory of a host t, and the command for its slave."""
+    """Return a cluster without hosts, the state directory of a host t, and its slave's command."""
     cluster = make_cluster()
     state = cluster.directory / "hosts" / "t"
     config = cluster.directory / "host.yaml"
@@ -499,7 +502,7 @@ def by_hand(make_cluster):
 
 @pytest.fixture
 def kept(by_hand):
-    """Two processes of which the slave was stopped: the cluster, their rows, `--stop-all`."""
+    """Return a cluster, two processes kept by a stopped slave, and the `--stop-all` command."""
     cluster, _, command = by_hand
     config = Path(command[-1])
     config.write_text(config.read_text() + "on_stop: keep\n")
@@ -515,7 +518,7 @@ def kept(by_hand):
 
 
 def stop_all(command) -> str:
-    """Stop what is left; what was printed."""
+    """Run `--stop-all`, and return its output."""
     done = subprocess.run(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True, timeout=PATIENCE, check=False,
@@ -526,7 +529,7 @@ def stop_all(command) -> str:
 
 
 def test_stop_all_ends_what_a_slave_has_left_and_reports_it(kept) -> None:
-    """A process that is being cancelled is cancelled then; the others wait for another host."""
+    """`--stop-all` completes a pending cancellation; other processes are queued again."""
     cluster, rows, command = kept
     assert "being cancelled: waits for t, whose slave was stopped" in cluster.client.cancel(["p"])
     assert "whose slave was stopped" in cluster.process("p").reason
@@ -539,7 +542,7 @@ def test_stop_all_ends_what_a_slave_has_left_and_reports_it(kept) -> None:
 
 
 def test_stop_all_without_a_master_says_what_follows(kept) -> None:
-    """The processes end all the same; the master learns of it when the slave is started again."""
+    """The processes end without a master, which learns of this from the next slave."""
     cluster, rows, command = kept
     assert end(cluster.master, signal.SIGTERM) == 0
     said = stop_all(command)
@@ -550,7 +553,7 @@ def test_stop_all_without_a_master_says_what_follows(kept) -> None:
 
 
 def test_stop_all_is_refused_while_the_slave_runs(by_hand) -> None:
-    """Its own end stops the processes."""
+    """`--stop-all` is refused while the slave runs, because its end stops the processes."""
     cluster, _, command = by_hand
     with (cluster.directory / "slave.log").open("wb") as sink, subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink
@@ -566,7 +569,7 @@ def test_stop_all_is_refused_while_the_slave_runs(by_hand) -> None:
 
 
 def test_ctrl_c_in_a_terminal(by_hand) -> None:
-    """A process group is interrupted, as a terminal does: the processes end with their slave."""
+    """Ctrl-C interrupts the whole process group, and the processes end with their slave."""
     cluster, state, command = by_hand
     log = cluster.directory / "terminal.log"
     with log.open("wb") as sink, subprocess.Popen(
@@ -583,7 +586,7 @@ def test_ctrl_c_in_a_terminal(by_hand) -> None:
 
 
 def test_a_terminal_that_is_closed(by_hand) -> None:
-    """The slave gets SIGHUP, can write nowhere any more, and stops its processes all the same."""
+    """After SIGHUP the slave cannot write to its terminal, and still stops its processes."""
     cluster, state, command = by_hand
     terminal, its_end = pty.openpty()
     slave = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""The master's side of a handoff's topics against a node of plain rclpy."""
+"""The master's handoff topics against a node of plain rclpy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANNEL = "/rosrm/handoff/p_2"
 
 
 class Stage:
-    """An endpoint, and the node of a destination."""
+    """A handoff endpoint of the master, and the node of a destination."""
 
     def __init__(self) -> None:
         domain, self.claim = claim_domain()
@@ -70,7 +70,7 @@ def stage(monkeypatch):
 
 
 def test_all_that_a_node_must_know_is_said_and_who_comes_late_hears_it(stage):
-    """Cluster, epoch and the name of the channel among it."""
+    """The message has cluster, epoch and channel, and reaches late subscribers."""
     stage.say(HandoffPhase.SHADOW)
     stage.listen()
     assert stage.spin(lambda: stage.configs)
@@ -84,7 +84,7 @@ def test_all_that_a_node_must_know_is_said_and_who_comes_late_hears_it(stage):
 
 
 def test_what_was_reported_before_the_master_listened_is_heard(stage):
-    """As after a restart of it."""
+    """Reports from before the subscription arrive, as after a restart of the master."""
     stage.report(11, message="waits for /scan")
     stage.report(14, sequence=7)
     stage.say(HandoffPhase.SWITCH)
@@ -96,7 +96,7 @@ def test_what_was_reported_before_the_master_listened_is_heard(stage):
 
 
 def test_nonsense_and_other_handoffs_are_not_heard(stage):
-    """Another version and an unknown phase are said; another handoff is none of this one's."""
+    """Foreign versions and unknown phases are refused with a reason; other handoffs are ignored."""
     stage.say(HandoffPhase.SHADOW)
     stage.report(14, destination=9)
     stage.report(14, protocol_version=PROTOCOL_VERSION + 1)
@@ -109,7 +109,7 @@ def test_nonsense_and_other_handoffs_are_not_heard(stage):
 
 
 def test_when_all_is_done_nobody_listens(stage):
-    """The channel has no reader left in the master."""
+    """After DONE the master has no reader on the channel."""
     stage.say(HandoffPhase.SHADOW)
     assert stage.spin(lambda: stage.channel.get_subscription_count() == 1)
     stage.say(HandoffPhase.DONE)

@@ -1,4 +1,4 @@
-"""Handoffs by a real master and real slaves; one that cannot be done says why, clearly."""
+"""Handoffs by a real master and real slaves; failures report a clear reason."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rosrm_msgs.msg import StateConfig
 from tests.ros.clusters import CALM, NODE, PATIENCE, alive, host
 from tests.ros.nodes import Stage
 
-#: A counter with something wrong with it: `{fault}` stands at the end of its constructor.
+#: A counter with a fault: `{fault}` is the end of its constructor.
 COUNTER = """
 import os, sys, rclpy
 from rclpy.executors import ExternalShutdownException
@@ -73,7 +73,7 @@ def cluster(make_shared):
 
 
 def moved(cluster, name: str):
-    """Order a move, and wait for its end; returns the row before and the event."""
+    """Order a migration and wait for its end; return the row before, and the final event."""
     before = cluster.wait(name, "running")
     cluster.client.migrate(name)
     deadline = time.monotonic() + PATIENCE
@@ -86,7 +86,7 @@ def moved(cluster, name: str):
 
 
 def test_the_state_goes_along(cluster) -> None:
-    """The counter counts on, on another host; it is listed under its own name."""
+    """The counter continues on another host, and keeps its process name."""
     cluster.submit(counter("good"))
     before, event = moved(cluster, "good")
     assert event.kind == "migrated", event.message
@@ -97,7 +97,7 @@ def test_the_state_goes_along(cluster) -> None:
 
 
 def test_a_node_whose_clock_stands_still_moves(cluster) -> None:
-    """It wants simulated time, and nobody publishes any: what is ours goes by another clock."""
+    """A node on simulated time without a clock migrates, because rosrm uses another clock."""
     ticks = (
         "from rclpy.clock import Clock, ClockType; clock = Clock(clock_type=ClockType.STEADY_TIME)"
         "; self.create_timer(0.02, self.tick, clock=clock); self.keep()"
@@ -140,7 +140,7 @@ def test_a_node_whose_clock_stands_still_moves(cluster) -> None:
     ],
 )  # fmt: skip
 def test_a_move_that_fails_leaves_the_source_running(cluster, name, fault, message) -> None:
-    """With one clear message, and nothing else left."""
+    """The event has one clear message, and nothing else is left."""
     cluster.submit(counter(name, fault))
     before, event = moved(cluster, name)
     assert event.kind == "stayed"
@@ -161,7 +161,7 @@ def test_a_move_that_fails_leaves_the_source_running(cluster, name, fault, messa
     ],
 )  # fmt: skip
 def test_a_destination_that_is_never_ready_is_given_up_in_time(cluster, name, code, message):
-    """Within `ready_timeout`; what to check is said."""
+    """The migration fails within `ready_timeout`, and the message names possible causes."""
     cluster.submit(spec(name, code, ready_timeout=2.0))
     before, event = moved(cluster, name)
     assert event.kind == "stayed"
@@ -173,7 +173,7 @@ def test_a_destination_that_is_never_ready_is_given_up_in_time(cluster, name, co
 
 
 def test_a_process_that_is_moving_is_not_moved_again(cluster) -> None:
-    """The second order is refused, and says where the first one goes."""
+    """The second order is refused with the destination of the first."""
     cluster.submit(counter("twice"))
     cluster.wait("twice", "running")
     cluster.client.migrate("twice")
@@ -184,7 +184,7 @@ def test_a_process_that_is_moving_is_not_moved_again(cluster) -> None:
 
 
 def test_a_stranger_moves_nothing(cluster, monkeypatch) -> None:
-    """Whoever says `state_config` without being the master: the node says so, and counts on."""
+    """A node logs `state_config` messages of another sender than its master, and ignores them."""
     cluster.submit(counter("steady"))
     row = cluster.wait("steady", "running")
     stage = Stage(domain=cluster.domain)

@@ -1,4 +1,4 @@
-"""Alive is not healthy: real nodes that fall silent, hang or leave their state are ended."""
+"""Health checks: silent, hanging or inactive real nodes are ended although they are alive."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tests.ros.clusters import PATIENCE, STEADY, alive, host, node, service, wai
 SOON = 2.0
 AGAIN = RestartPolicy("on-failure", delay=0.2)
 
-#: A lifecycle node that publishes at 20 Hz. `last`: the number of its last message; `leaves`: with
-#: it, it leaves the state active.
+#: A lifecycle node that publishes at 20 Hz. `last`: number of the last message; `leaves`: leave the
+#: active state with that message.
 TALKER = """
 import rclpy, sys
 from rclpy.lifecycle import LifecycleNode
@@ -50,7 +50,7 @@ except BaseException:
     pass
 """
 
-#: Publishes a topic under an absolute name, as one type or another.
+#: A node that publishes an absolute topic name with a given type.
 SPEAKER = """
 import rclpy, std_msgs.msg
 rclpy.init()
@@ -69,7 +69,7 @@ SCAN = Health("~/scan", 2.0, "active", SOON)
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    """With a node that is healthy all the while."""
+    """Yield a cluster with a node that stays healthy."""
     cluster = make_shared(host("h0"))
     cluster.submit(node("healthy", TALKER, namespace="/robot", health=SCAN, restart=AGAIN))
     cluster.wait("healthy", "running")
@@ -77,7 +77,7 @@ def cluster(make_shared):
 
 
 def failed(cluster, name: str) -> str:
-    """Why it has failed."""
+    """Wait until a process has failed; return the reason."""
     row = cluster.ended(name)
     assert row.state == "failed"
     assert not alive(row.pid)
@@ -85,7 +85,7 @@ def failed(cluster, name: str) -> str:
 
 
 def test_a_topic_that_falls_silent(cluster) -> None:
-    """The node lives and spins; it is ended, and its reason says what was found and wanted."""
+    """A silent node is ended; the reason has the measured and the required rate."""
     cluster.submit(
         node(
             "quiet", TALKER, namespace="/robot", parameters={"last": 40},
@@ -99,19 +99,19 @@ def test_a_topic_that_falls_silent(cluster) -> None:
 
 
 def test_a_topic_that_nobody_publishes(cluster) -> None:
-    """It never was; the reason gives the whole name that was looked for."""
+    """The reason has the full name of a topic that never existed."""
     cluster.submit(node("mute", TALKER, namespace="/robot", health=Health("scan", 1.0, "", SOON)))
     assert "scan: not published as /robot/scan for 2." in failed(cluster, "mute")
 
 
 def test_a_node_that_leaves_its_lifecycle_state(cluster) -> None:
-    """It publishes on, and is no longer active."""
+    """The node keeps publishing, but is no longer active."""
     cluster.submit(node("idle", TALKER, parameters={"last": 40, "leaves": True}, health=SCAN))
     assert failed(cluster, "idle").startswith("unhealthy: lifecycle state inactive for 2.")
 
 
 def test_a_node_that_is_stopped_starts_again(cluster) -> None:
-    """SIGSTOP: nothing of it moves or answers. By its policy it goes on as another process."""
+    """A node paused by SIGSTOP is killed, and its restart policy starts another process."""
     cluster.submit(node("hung", TALKER, health=SCAN, restart=AGAIN))
     before = cluster.wait("hung", "running")
     os.kill(before.pid, signal.SIGSTOP)
@@ -129,14 +129,14 @@ def test_a_node_that_is_stopped_starts_again(cluster) -> None:
 
 
 def test_a_process_without_ros_that_is_stopped(cluster) -> None:
-    """Only a time is given: it must not be stopped for longer."""
+    """With only a timeout given, a process must not be paused for longer."""
     cluster.submit(service("plain", health=Health(timeout=SOON)))
     os.kill(cluster.wait("plain", "running").pid, signal.SIGSTOP)
     assert failed(cluster, "plain").startswith("unhealthy: stopped by a signal (SIGSTOP) for 2.")
 
 
 def test_a_topic_of_two_types(cluster) -> None:
-    """Its own counts, whatever others publish; where none is its own, both types are said."""
+    """A node's own publisher counts, despite others of another type; without one both are named."""
     health = Health("/clash", 2.0, "", SOON)
     cluster.submit(
         node("numbers", SPEAKER, parameters={"type": "Int64"}, health=health),
@@ -153,7 +153,7 @@ def test_a_topic_of_two_types(cluster) -> None:
 
 
 def test_the_next_run_of_the_slave_watches_on(cluster) -> None:
-    """What it watches the supervisor remembers; its own absence is nobody's fault."""
+    """The supervisor stores the health check for the next slave, whose downtime does not count."""
     cluster.submit(service("orphan", health=Health(timeout=SOON)))
     pid = cluster.wait("orphan", "running").pid
     slave = cluster.slaves["h0"].process
@@ -165,7 +165,7 @@ def test_the_next_run_of_the_slave_watches_on(cluster) -> None:
 
 
 def test_a_healthy_node_is_never_ended(cluster) -> None:
-    """It was watched all the while, by two runs of the slave, and for a while longer here."""
+    """A healthy node, watched by two runs of the slave, and for a while longer here, is kept."""
     until = time.monotonic() + 2 * SOON
     while time.monotonic() < until:
         cluster.client.spin(0.2)
@@ -173,7 +173,7 @@ def test_a_healthy_node_is_never_ended(cluster) -> None:
     assert (row.state, row.restarts) == ("running", 0), row.reason
 
 
-#: A stateful node: its output stays below its own name under every alias.
+#: A stateful node, whose output is below its name even under an alias.
 COUNTER = """
 import rclpy
 from std_msgs.msg import Int64
@@ -203,7 +203,7 @@ except BaseException:
 
 
 def test_a_node_that_was_moved_is_watched_where_it_is_now(make_cluster) -> None:
-    """As a shadow it was silent and nobody minded; now it is stopped, and starts again there."""
+    """A silent shadow is not unhealthy; on its new host a paused node is restarted."""
     cluster = make_cluster(host("h0"), host("h1"), liveness=STEADY)
     migration = MigrationPolicy("handoff")
     health = Health("~/count", 5.0, "", SOON)
@@ -228,15 +228,15 @@ def test_a_node_that_was_moved_is_watched_where_it_is_now(make_cluster) -> None:
     )
 
 
-# --- what the slave hears -----------------------------------------------------------------------
+# --- reception in the slave ---------------------------------------------------------------------
 
 
 class Listener:
-    """An ear of a slave, and a publisher for it.
+    """A health subscription of a slave, and its publisher.
 
     Args:
-        stage: of the nodes.
-        rate: that is asked for.
+        stage: stage of the nodes.
+        rate: required rate.
     """
 
     def __init__(self, stage, rate: float) -> None:
@@ -257,9 +257,9 @@ class Listener:
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_what_is_published_is_counted_though_little_of_it_is_kept(stage, alone) -> None:
-    """A flood costs the slave as many messages as a second may hold; numbers tell of the others.
+    """The slave keeps one second's worth of messages, and counts a flood by sequence numbers.
 
-    The numbers of two publishers would be mixed up: then only what came counts.
+    Sequence numbers of two publishers would be mixed up, so then only received messages count.
     """
     listener = Listener(stage, rate=5.0)
     output = stage.plain.create_publisher(Int64, "/scan", 1000)
@@ -286,7 +286,7 @@ def test_what_is_published_is_counted_though_little_of_it_is_kept(stage, alone) 
 
 
 def test_a_type_that_this_host_does_not_know(stage, monkeypatch) -> None:
-    """It is said, and so is what is missing; once it can be read it is heard."""
+    """The trouble names the missing type; once the type is available, messages count."""
     stage.plain.create_publisher(String, "/scan", 1)
     listener = Listener(stage, rate=5.0)
     with monkeypatch.context() as patch:
@@ -300,7 +300,7 @@ def test_a_type_that_this_host_does_not_know(stage, monkeypatch) -> None:
 
 
 def test_another_type_is_followed(stage) -> None:
-    """A publisher that comes back as another type is listened to anew."""
+    """The slave subscribes again when a publisher returns with another type."""
     listener = Listener(stage, rate=5.0)
     first = stage.plain.create_publisher(String, "/scan", 1)
     listener.look_until(lambda look: look[0] is not None, "the first is heard")
@@ -312,7 +312,7 @@ def test_another_type_is_followed(stage) -> None:
 
 
 def test_a_name_that_is_none_harms_nobody(stage) -> None:
-    """Whatever a client submits: the slave says it, and goes on."""
+    """The slave reports an invalid topic name and keeps running."""
     watch = Watch(Health("no topic", 1.0, "active", SOON), ("/no topic",), ("/no-node/get_state",))
     ear = HealthEar(stage.plain, GraphWatch(stage.plain), watch, time.monotonic())
     heard, trouble = ear.topic((1,), time.monotonic())

@@ -1,4 +1,4 @@
-"""A stateful process that crashes, or loses its host, goes on from its last state."""
+"""Restarts of stateful processes from their last snapshot, after crashes and host losses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.ros.clusters import CALM, PATIENCE, STEADY, Cluster, host, pids_of, w
 
 pytestmark = pytest.mark.timeout(120)
 
-#: Counts, and says each count; what is large in its state is as large as its argument says.
+#: Prints each count; the large part of its state has the size given as argument.
 COUNTER = """
 import sys
 import rclpy
@@ -78,9 +78,9 @@ def kept_directory(cluster: Cluster, on: str) -> Path:
 
 
 def counts(log: str) -> list[list[int]]:
-    """What each run has counted."""
+    """Return the counts of each run."""
     runs: list[list[int]] = []
-    for line in log.split("\n")[:-1]:  # the last one may not be whole
+    for line in log.split("\n")[:-1]:  # the last line may be incomplete
         word, _, number = line.partition(" ")
         if word == "begins":
             runs.append([])
@@ -90,7 +90,7 @@ def counts(log: str) -> list[list[int]]:
 
 
 def wait_for_count(cluster: Cluster, at_least: int, run: int = 0) -> list[list[int]]:
-    """Until so many runs have begun, and the last has counted so far."""
+    """Wait until run number `run` has counted to `at_least`; return the counts of all runs."""
 
     def so_far() -> bool:
         runs = counts(cluster._log_so_far("counter"))
@@ -101,7 +101,7 @@ def wait_for_count(cluster: Cluster, at_least: int, run: int = 0) -> list[list[i
 
 
 def test_a_killed_node_goes_on_from_its_last_state(make_cluster):
-    """Its supervisor starts it again, without a word of the master, and it says so."""
+    """The supervisor restarts the node from its snapshot, without the master, and logs this."""
     cluster = make_cluster(host("h0"), liveness=STEADY)
     cluster.submit(counter())
     for run in range(3):
@@ -109,7 +109,7 @@ def test_a_killed_node_goes_on_from_its_last_state(make_cluster):
         row = cluster.wait("counter", "running")
         os.kill(row.pid, signal.SIGKILL)
         runs = wait_for_count(cluster, 1, run + 1)
-        # A cycle that was begun may be done again; a busy machine may be up to a second behind.
+        # An incomplete cycle may repeat; on a busy machine the snapshot may be a second behind.
         last, first = runs[run][-1], runs[run + 1][0]
         assert max(2, last - 60) <= first <= last + 1, runs
         assert runs[run] == list(range(runs[run][0], last + 1))
@@ -117,13 +117,13 @@ def test_a_killed_node_goes_on_from_its_last_state(make_cluster):
 
 
 def test_a_large_state_is_kept_too(make_cluster):
-    """5 MB, of which both parts belong together."""
+    """A snapshot of 5 MB is consistent in both its parts."""
     cluster = make_cluster(host("h0"), liveness=STEADY)
     cluster.submit(counter(5_000_000))
     runs = wait_for_count(cluster, 100)
     os.kill(cluster.wait("counter", "running").pid, signal.SIGKILL)
     runs = wait_for_count(cluster, 1, 1)
-    # By default a state may be a second behind; a busy machine needs its time to write it.
+    # By default a snapshot may be a second behind; a busy machine takes time to write it.
     assert runs[1][0] >= 20, runs
     found = snapshots.newest_head(kept_directory(cluster, "h0"))
     assert found is not None
@@ -131,7 +131,7 @@ def test_a_large_state_is_kept_too(make_cluster):
 
 
 def test_an_orderly_restart_loses_no_cycle(make_cluster):
-    """The last state is kept at the end, however seldom a large one is kept else."""
+    """A restart by order saves a last snapshot, however rare those of a large state are."""
     cluster = make_cluster(host("h0"), liveness=STEADY)
     cluster.submit(counter(2_000_000))
     wait_for_count(cluster, 30)
@@ -141,7 +141,7 @@ def test_an_orderly_restart_loses_no_cycle(make_cluster):
 
 
 def test_a_state_that_cannot_be_restored_stays_as_it_is(make_cluster):
-    """The node says why and fails, by its restart policy; what is kept is not overwritten."""
+    """The node logs the reason and fails by its restart policy; the snapshot is not overwritten."""
     cluster = make_cluster(host("h0"), liveness=STEADY)
     cluster.submit(counter(restart=RestartPolicy("on-failure", delay=0.1, attempts=2)))
     wait_for_count(cluster, 20)
@@ -156,7 +156,7 @@ def test_a_state_that_cannot_be_restored_stays_as_it_is(make_cluster):
 
 
 def rewritten(directory: Path) -> bytes:
-    """Leaves the state of another program there: one without parts."""
+    """Write the snapshot of another program, without parts; return its content."""
     from rclpy.serialization import deserialize_message, serialize_message
 
     from rosrm_msgs.msg import StateMark
@@ -180,10 +180,10 @@ ELSEWHERE = HostLossPolicy("elsewhere")
 
 
 def kill_host(cluster: Cluster, name: str) -> None:
-    """Its slave, its supervisor and its processes, as when its power is cut."""
+    """Kill the slave, the supervisor and the processes of a host, as a power cut does."""
     row = cluster.client.list(processes=True).processes[0]
     slave = cluster.slaves.pop(name)
-    slave.process.kill()  # first, as it would start another supervisor
+    slave.process.kill()  # first, because it would start another supervisor
     slave.process.wait(PATIENCE)
     mark = str(cluster.directory / "hosts" / name)
     victims = [pid for pid, command in pids_of(cluster.directory).items() if mark in command]
@@ -194,7 +194,7 @@ def kill_host(cluster: Cluster, name: str) -> None:
 
 
 def copies(cluster: Cluster) -> dict[str, int]:
-    """By host, the cycle up to which it keeps a copy."""
+    """Return the last cycle of the replica on each host that has one."""
     found = {}
     for name in cluster.slaves:
         head = snapshots.peek(kept_directory(cluster, name) / snapshots.COPY)
@@ -204,7 +204,7 @@ def copies(cluster: Cluster) -> dict[str, int]:
 
 
 def wait_for_copy(cluster: Cluster, at_least: int, on: str | None = None) -> str:
-    """Until another host keeps a state that covers so many cycles; its name."""
+    """Wait until another host has a replica up to this cycle; return the host's name."""
 
     def there() -> list[str]:
         return [
@@ -218,7 +218,7 @@ def wait_for_copy(cluster: Cluster, at_least: int, on: str | None = None) -> str
 
 @pytest.mark.parametrize("ballast", [0, 5_000_000])
 def test_when_its_host_is_lost_it_goes_on_elsewhere_from_the_kept_state(make_cluster, ballast):
-    """On the host that keeps it, which is preferred to others with as much room."""
+    """The process restarts on the host with the replica, preferred to others with as much room."""
     cluster = make_cluster(*(host(f"h{n}") for n in range(3)), liveness=QUICK_LEASE)
     cluster.submit(counter(ballast, host_loss=ELSEWHERE))
     row = cluster.wait("counter", "running")
@@ -236,7 +236,7 @@ def test_when_its_host_is_lost_it_goes_on_elsewhere_from_the_kept_state(make_clu
 
 
 def test_a_host_that_does_not_keep_the_state_fetches_it(make_cluster):
-    """The one that does may take no work."""
+    """The host with the replica may be cordoned: another host fetches the snapshot."""
     cluster = make_cluster(*(host(f"h{n}") for n in range(3)), liveness=QUICK_LEASE)
     cluster.submit(counter(1_000_000, host_loss=ELSEWHERE))
     row = cluster.wait("counter", "running")
@@ -254,7 +254,7 @@ def test_a_host_that_does_not_keep_the_state_fetches_it(make_cluster):
 
 
 def test_a_process_that_is_submitted_anew_begins_from_nothing(make_cluster):
-    """Cancelling it deletes what is kept of it, on every host."""
+    """A cancellation deletes the process's snapshots on every host."""
     cluster = make_cluster(host("h0"), host("h1"), liveness=STEADY)
     cluster.submit(counter())
     wait_for_count(cluster, 20)
@@ -269,7 +269,7 @@ def test_a_process_that_is_submitted_anew_begins_from_nothing(make_cluster):
 
 
 def test_a_host_without_room_refuses_and_says_so_once(make_cluster):
-    """The process goes on, and its state is kept on its own host."""
+    """The process runs on with a local snapshot only; the refusal is logged once."""
     hosts = [host(f"h{n}", keep=KeepSettings(max_bytes=1_000_000)) for n in range(2)]
     cluster = make_cluster(*hosts, liveness=STEADY)
     cluster.submit(counter(2_000_000))
@@ -282,7 +282,7 @@ def test_a_host_without_room_refuses_and_says_so_once(make_cluster):
 
 
 def test_a_state_that_cannot_be_fetched_holds_up_no_start(make_cluster):
-    """The host that keeps it falls silent too: the process begins from nothing, once."""
+    """The host with the replica is also silent: the process starts without a snapshot, once."""
     cluster = make_cluster(*(host(f"h{n}") for n in range(3)), liveness=QUICK_LEASE)
     cluster.submit(counter(1_000_000, host_loss=ELSEWHERE))
     row = cluster.wait("counter", "running")
@@ -303,7 +303,7 @@ def test_a_state_that_cannot_be_fetched_holds_up_no_start(make_cluster):
 
 
 def test_a_moved_process_goes_on_from_the_state_that_its_new_host_keeps(make_cluster):
-    """What the old host keeps is older, and is dropped."""
+    """The snapshot on the old host is older, and is dropped."""
     cluster = make_cluster(
         host("h0"), host("h1"), liveness=STEADY, checkpoint=CheckpointChoice(None)
     )
@@ -322,7 +322,7 @@ def test_a_moved_process_goes_on_from_the_state_that_its_new_host_keeps(make_clu
 
 
 def test_a_node_goes_on_where_nothing_can_be_kept(make_cluster):
-    """As on a full disk; it says so once."""
+    """The node runs without snapshots, as on a full disk, and logs this once."""
     cluster = make_cluster(host("h0"), liveness=STEADY)
     (cluster.directory / "hosts" / "h0" / "kept").write_text("in the way")
     cluster.submit(counter())
@@ -332,7 +332,7 @@ def test_a_node_goes_on_where_nothing_can_be_kept(make_cluster):
 
 
 def test_a_master_that_was_started_again_knows_where_states_lie(make_cluster):
-    """The slaves tell it anew, and it tells them; nothing of it is in its journal."""
+    """Slaves report replicas to a restarted master, which informs them; its journal has none."""
     cluster = make_cluster(host("h0"), host("h1"), liveness=QUICK_LEASE)
     cluster.submit(counter(host_loss=ELSEWHERE))
     row = cluster.wait("counter", "running")

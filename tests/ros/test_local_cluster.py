@@ -1,4 +1,4 @@
-"""A cluster on this machine, as demos and benchmarks make it."""
+"""Local clusters, as used by demos and benchmarks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.ros.clusters import PATIENCE, host, node, wait_until
 
 
 def test_its_directory_may_be_relative(tmp_path, monkeypatch) -> None:
-    """A node, which runs in a directory of its own, finds its parameters all the same."""
+    """A node finds its parameter file, although its working directory is another one."""
     monkeypatch.chdir(tmp_path)
     with LocalCluster(Path("here"), hosts=[host("h0")]) as cluster:
         cluster.client.submit([node("reader", parameters={"answer": 42})])

@@ -1,4 +1,4 @@
-"""Processes that move between hosts: by hand, off a full host, off one that closes."""
+"""Migrations between hosts: by order, by eviction, and by draining."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STOPS_FIRST = MigrationPolicy("relaunch", overlap=False)
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    """Two hosts; nothing moves by itself."""
+    """Yield a cluster of two hosts, without automatic migration."""
     return make_shared(
         host("left"), host("right"),
         migration=MigrationSettings(automatic=False),
@@ -55,7 +55,7 @@ def moved(cluster, name: str, times: int = 1):
 
 
 def written(folder, runs: int) -> None:
-    """Until so many runs have written their beginning."""
+    """Wait until this number of runs has written its start time."""
     wait_until(
         lambda: sum(bool(path.read_text()) for path in folder.iterdir()) == runs,
         f"{runs} runs at work",
@@ -63,7 +63,7 @@ def written(folder, runs: int) -> None:
 
 
 def spans(folder) -> list[tuple[float, float]]:
-    """When each run that wrote its beginning and end there lived."""
+    """Return the start and end times of the runs that wrote both."""
     runs = []
     for path in folder.iterdir():
         times = [float(line) for line in path.read_text().split()]
@@ -71,7 +71,7 @@ def spans(folder) -> list[tuple[float, float]]:
     return sorted(runs)
 
 
-#: Writes the time of its birth (by its /proc entry) and of its end.
+#: Writes the time of its start (from its /proc entry) and of its end.
 RECORDER = """
 import os, signal, sys, time
 log = os.open(os.path.join(sys.argv[1], str(os.getpid())), os.O_WRONLY | os.O_CREAT)
@@ -93,7 +93,7 @@ def recorder(cluster, name: str, migration: MigrationPolicy):
 
 
 def test_start_first_has_never_none(cluster) -> None:
-    """By default the new instance is ready before the old one is stopped; then only it runs."""
+    """By default the new instance is ready before the old one stops; then it runs alone."""
     spec, folder = recorder(cluster, "overlapping", MOVES)
     cluster.submit(spec)
     before = cluster.wait("overlapping", "running")
@@ -112,7 +112,7 @@ def test_start_first_has_never_none(cluster) -> None:
 
 
 def test_stop_first_has_never_two(cluster) -> None:
-    """`overlap: false`: the old instance has ended before the new one begins."""
+    """With `overlap: false` the old instance ends before the new one starts."""
     spec, folder = recorder(cluster, "apart", STOPS_FIRST)
     cluster.submit(spec)
     before = cluster.wait("apart", "running")
@@ -123,11 +123,11 @@ def test_stop_first_has_never_two(cluster) -> None:
     written(folder, 2)
     cluster.cancel("apart")
     (_, first_end), (second_begin, _) = spans(folder)
-    assert first_end <= second_begin + 1 / os.sysconf("SC_CLK_TCK")  # births come in ticks
+    assert first_end <= second_begin + 1 / os.sysconf("SC_CLK_TCK")  # starts are in ticks
 
 
 def test_a_ros_node_moves_under_its_own_name(cluster) -> None:
-    """The new instance is told apart from the source, its namesake, and counts when it is seen."""
+    """The new instance of a name counts only when seen in the graph apart from the source."""
     cluster.submit(node("walker", migration=MOVES))
     before = cluster.wait("walker", "running")
     cluster.client.migrate("walker")
@@ -139,22 +139,22 @@ def test_a_ros_node_moves_under_its_own_name(cluster) -> None:
 
 
 def loyal(name: str, home: Path, *, overlap: bool):
-    """A node; where a file says that its home is elsewhere, one that never comes into the graph."""
+    """Return a node that never joins the graph on any host but its `home`, if that file exists."""
     code = (
         "import os, sys, time\n"
         f"if os.path.exists({str(home)!r}) and os.environ['ROSRM_HOST'] != "
         f"open({str(home)!r}).read(): time.sleep(1000)\n"
     )
     return node(
-        name, code + NODE, readiness=Readiness(timeout=12.0),  # at home it has to be in time
+        name, code + NODE, readiness=Readiness(timeout=12.0),  # in time at home
         migration=MigrationPolicy("relaunch", overlap=overlap),
     )  # fmt: skip
 
 
 def test_a_destination_that_never_gets_ready_changes_nothing(cluster) -> None:
-    """The process stays, or is started again, where it was; what was begun is undone and said.
+    """The process stays, or restarts, on the source host; the migration is undone, with an event.
 
-    Two at once: one that starts there first, and one that stops here first.
+    Two run at once: one that starts the destination first, and one that stops the source first.
     """
     overlaps = {"loyal_first": True, "loyal_after": False}
     homes = {name: cluster.directory / f"{name}-home" for name in overlaps}
@@ -174,7 +174,7 @@ def test_a_destination_that_never_gets_ready_changes_nothing(cluster) -> None:
 
 
 def test_what_cannot_move_is_refused(cluster) -> None:
-    """Without a strategy, while it waits, to where it is, to a host that there is not."""
+    """Refused: without a strategy, while queued, to the current host, to an unknown host."""
     cluster.submit(service("rooted"), service("mobile", migration=MOVES))
     cluster.wait("rooted", "running")
     here = cluster.wait("mobile", "running").host
@@ -192,7 +192,7 @@ def test_what_cannot_move_is_refused(cluster) -> None:
 
 
 def test_drain_empties_a_host(cluster) -> None:
-    """What can move leaves, what cannot stays and is named; uncordon opens it again."""
+    """Movable processes leave, the others stay and are named; uncordon opens the host."""
     cluster.client.set_host_state("right", "cordon")
     cluster.submit(*(service(f"d{n}", migration=MOVES) for n in range(3)), service("fixed"))
     for name in ("d0", "d1", "d2", "fixed"):
@@ -212,7 +212,7 @@ def test_drain_empties_a_host(cluster) -> None:
 
 
 def test_cancel_during_a_move(cluster) -> None:
-    """Nothing of either instance is left."""
+    """A cancellation during a migration leaves neither instance."""
     cluster.submit(node("fleeting", migration=MOVES))
     before = cluster.wait("fleeting", "running")
     cluster.client.migrate("fleeting")
@@ -225,9 +225,9 @@ def test_cancel_during_a_move(cluster) -> None:
     assert not [row for row in view.processes if row.state == "migrating"]
 
 
-# --- by a limit -------------------------------------------------------------------------------
+# --- eviction ---------------------------------------------------------------------------------
 
-#: Holds 50 MiB, and MIB more as soon as the file is there: all at once, on a busy machine too.
+#: Holds 50 MiB, and further MiB once the file exists: all at once, even on a busy machine.
 GROWS = """
 import mmap, os, sys, time
 def hold(mib):
@@ -246,8 +246,8 @@ def grower(cluster, name: str, where: str, mib: int, **options):
 
 
 def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
-    """What relieves it most and fits elsewhere leaves, after the hysteresis; the rest stays."""
-    hysteresis = 4.0  # by then the master knows how large each of them is
+    """After the hysteresis the process that helps most and fits elsewhere leaves; others stay."""
+    hysteresis = 4.0  # seconds; by then the master knows the size of each process
     limits = {"memory": 0.5, "cpu": 1.0}
     cluster = make_cluster(
         host("full", memory=1000 * MIB, limits=limits),
@@ -265,7 +265,7 @@ def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
     cluster.client.set_host_state("free", "uncordon")
     go.touch()
     over = cluster.wait_for_event("over_limit", host="full")
-    # 510 MiB would put the other host over as well: the small one goes, being all that fits.
+    # 510 MiB would put the other host over its limit, so only the small process fits there.
     begun = cluster.wait_for_event("migration_begun")
     assert begun.elapsed - over.elapsed >= hysteresis - 0.05
     assert begun.process == "small"
@@ -278,7 +278,7 @@ def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
 
 
 def test_nothing_moves_when_every_host_is_full(make_cluster) -> None:
-    """Both hosts over their limits: nothing is assigned, nothing migrates, the queue waits."""
+    """With both hosts over their limits nothing is assigned or migrated; the queue waits."""
     limits = {"memory": 0.5, "cpu": 1.0}
     cluster = make_cluster(
         host("a", memory=400 * MIB, limits=limits), host("b", memory=400 * MIB, limits=limits),
@@ -293,7 +293,7 @@ def test_nothing_moves_when_every_host_is_full(make_cluster) -> None:
     cluster.client.set_host_state("b", "cordon")
     cluster.submit(specs[0])
     assert cluster.wait("on-a", "running").host == "a"
-    # Before it is known how large it is, it would fit on the other host.
+    # Before its size is known, the process would fit on the other host.
     cluster.wait_until(
         "a over its limit, and all of on-a seen",
         lambda v: (

@@ -1,4 +1,4 @@
-"""A node written from the guide alone, moved there and back while others work with it."""
+"""A node written from the guide alone, migrated there and back under load."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ DOCK = ProcessSpec(
     readiness=Readiness(timeout=PATIENCE),
 )
 CHARGE = 100  # of each order: more comes than is delivered, so that `current` shows the limit
-ANSWER_TIMEOUT = 1.0  # after it, a call is given up
+ANSWER_TIMEOUT = 1.0  # seconds until a call is given up
 
 
 class Robots:
-    """All that works with the dock: it orders, measures, reserves and listens, in a thread.
+    """Clients of the dock in one thread, which order, measure, reserve and listen.
 
     Attributes:
-        current, receipts, health: what was heard: when, and the message's data.
+        current, receipts, health: received messages: time and data.
         answers: of `reserve`, in order.
-        unanswered: calls that were given up.
-        orders, readings: how many were sent.
+        unanswered: number of calls given up.
+        orders, readings: numbers of messages sent.
     """
 
     def __init__(self, domain: int) -> None:
@@ -79,10 +79,10 @@ class Robots:
     def listener(heard: list):
         return lambda message: heard.append((time.monotonic(), list(message.data)))
 
-    # --- at work ---
+    # --- load ---
 
     def begin(self) -> None:
-        """Once all know of each other."""
+        """Start the load once discovery is complete."""
         wait_until(self.orders_out.get_subscription_count, "the input of orders")
         wait_until(lambda: self.current and self.health, "the dock's outputs")
         wait_until(self.client.service_is_ready, "the service")
@@ -93,7 +93,7 @@ class Robots:
         ]
 
     def end(self) -> None:
-        """Send no more, and wait for what is still to come."""
+        """Stop the load, and wait for the outstanding messages."""
         for timer in self.timers:
             timer.cancel()
         wait_until(lambda: len(self.receipts) >= self.orders, f"{self.orders} receipts", 10.0)
@@ -110,7 +110,7 @@ class Robots:
         self.voltage_out.publish(Float64(data=float(self.readings)))
 
     def reserve(self) -> None:
-        """One call after the other."""
+        """Keep one call of `reserve` pending."""
         now = time.monotonic()
         if self.call is not None and self.call.done():
             self.answers.append(int(self.call.result().message))
@@ -121,10 +121,10 @@ class Robots:
         if self.call is None:
             self.call, self.called = self.client.call_async(Trigger.Request()), now
 
-    # --- the parameters, as `ros2 param` sets and reads them ---
+    # --- parameters, set and read as `ros2 param` does ---
 
     def ask(self, send):
-        """The answer of a parameter service; asked again, for a server may have just gone."""
+        """Call a parameter service; repeat the call, because the server may have just gone."""
         for _ in range(5):
             future = send()
             deadline = time.monotonic() + 2.0
@@ -148,7 +148,7 @@ class Robots:
 
 @pytest.fixture
 def cluster(make_cluster):
-    """Two hosts; nothing moves by itself."""
+    """Yield a cluster of two hosts, without automatic migration."""
     settings = MigrationSettings({"handoff": {}}, automatic=False)
     return make_cluster(host("h0"), host("h1"), migration=settings)
 
@@ -161,7 +161,7 @@ def robots(cluster):
 
 
 def move(cluster, robots, to: str, times: int) -> SimpleNamespace:
-    """Moves the dock; returns when that began and ended."""
+    """Migrate the dock; return the times of begin and end."""
     began = time.monotonic()
     cluster.client.migrate("dock", to)
     cluster.wait_until(
@@ -177,7 +177,7 @@ def move(cluster, robots, to: str, times: int) -> SimpleNamespace:
 
 
 def names(robots) -> set[str]:
-    """Of the dock's topics and services, but the one that rcl makes for the name in the graph."""
+    """Return the dock's topics and services, except the one that rcl creates."""
     found = robots.node.get_topic_names_and_types() + robots.node.get_service_names_and_types()
     mine = {name for name, _ in found if name.startswith("/dock")}
     return {name for name in mine if not name.endswith("/get_type_description")}
@@ -186,7 +186,7 @@ def names(robots) -> set[str]:
 @pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_a_node_from_the_guide_moves_there_and_back_with_its_state(cluster, robots) -> None:
-    """Every order counts once, no number comes twice, and the limit set on the way holds."""
+    """Every order counts once, no number repeats, and a limit set on the way stays."""
     cluster.submit(DOCK)
     home = cluster.wait("dock", "running").host
     away = {"h0": "h1", "h1": "h0"}[home]
@@ -198,7 +198,7 @@ def test_a_node_from_the_guide_moves_there_and_back_with_its_state(cluster, robo
 
     moves = [move(cluster, robots, away, times=1)]
     assert robots.limit() == 750.0
-    assert robots.current[-1][1][1] == 750.0  # what is delivered goes by it
+    assert robots.current[-1][1][1] == 750.0  # the delivered current is at the limit
     assert names(robots) >= before
     assert not [name for name in names(robots) if not name.startswith("/dock/")]
     robots.set_limit(900.0)
@@ -209,23 +209,23 @@ def test_a_node_from_the_guide_moves_there_and_back_with_its_state(cluster, robo
     assert "Traceback" not in (said := cluster.log("dock")), said
     print(summary(robots, moves))
 
-    # Each order once and in order, and both parts of the state agree.
+    # Each order counts once and in order, and both parts of the state agree.
     assert [data for _, data in robots.receipts] == [[n, n, n] for n in counted(robots.orders)]
 
-    # Nothing of a second dock in what may be lost.
+    # The lossy output shows no second dock.
     current = [data for _, data in robots.current]
     assert all(a[0] < b[0] for a, b in pairwise(current)), "repeated or out of order"
     assert all(a[2] <= b[2] and a[3] <= b[3] for a, b in pairwise(current)), "older readings"
     assert current[-1][3] <= robots.readings
     assert [limit for limit, _ in groupby(data[4] for data in current)] == [500.0, 750.0, 900.0]
 
-    # One server at a time, each with the count of the one before.
+    # There is one server at a time, and each continues the count of the former.
     assert all(a < b for a, b in pairwise(robots.answers))
     assert robots.unanswered <= 2 * len(moves)
     reserved = robots.health[-1][1][3]
     assert len(robots.answers) <= reserved <= len(robots.answers) + robots.unanswered + 1
 
-    # The slow timer in step.
+    # The slow timer keeps its period.
     times, reports = zip(*((when, data[0]) for when, data in robots.health), strict=True)
     assert list(reports) == [reports[0] + n for n in range(len(reports))]
     assert all(0.3 < b - a < 1.9 for a, b in pairwise(times))
@@ -237,7 +237,7 @@ def counted(number: int) -> range:
 
 
 def summary(robots, moves) -> str:
-    """For who reads why it failed, and for who wonders what a move costs."""
+    """Return the costs of the migrations, which also explain a failure."""
     times = [when for when, _ in robots.current]
     reports = [when for when, _ in robots.health]
     lost = robots.current[-1][1][0] - robots.current[0][1][0] + 1 - len(robots.current)

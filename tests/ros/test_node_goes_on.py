@@ -1,4 +1,4 @@
-"""A node that goes on with what was kept for it: a successor, or a source that resumes."""
+"""Continuation of a node from buffered inputs: a successor, or a source that resumes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALIAS = "counter_1700000000"
 
 
 class Listener(Counter):
-    """Remembers what came on `in`, in the order in which it came."""
+    """A counter that records messages on `in`, in order of arrival."""
 
     def __init__(self, group=None, work: float = 0.0, depth=RELIABLE, **named) -> None:
         super().__init__(**named)
@@ -34,7 +34,7 @@ class Listener(Counter):
 
 
 class Server(Counter):
-    """Counts the requests that it has executed."""
+    """A counter that counts executed requests."""
 
     def __init__(self, group=None, **named) -> None:
         super().__init__(**named)
@@ -48,7 +48,7 @@ class Server(Counter):
 
 
 class Threads:
-    """Nodes that are spun beside the stage's: by several threads, unless another is said."""
+    """Nodes spun beside the stage, by a multi-threaded executor unless given another."""
 
     def __init__(self, stage: Stage, executor=None) -> None:
         self._stage = stage
@@ -87,7 +87,7 @@ def threads(stage):
 
 
 class Talker:
-    """Numbers on `in`, at an interval of seconds, from a thread of its own."""
+    """A publisher of numbers on `in`, with an interval in seconds, in its own thread."""
 
     def __init__(self, stage: Stage, interval: float, readers: int) -> None:
         self.sent: list[int] = []
@@ -103,7 +103,7 @@ class Talker:
             self._publisher.publish(Int64(data=number))
 
     def has_arrived(self) -> bool:
-        """What was said is in the readers, though nobody may have taken it."""
+        """Return True if the readers have all sent messages, whether processed or not."""
         return self._publisher.wait_for_all_acked()
 
     def _talk(self) -> None:
@@ -131,7 +131,7 @@ def pair_of(stage, make, **named):
 
 
 def silence(pair):
-    """The source is silent, and its destination stays a shadow."""
+    """Silence the source while its destination stays a shadow."""
     pair.second._rosrm._destination._activate = lambda: None
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
@@ -150,7 +150,7 @@ def resume(pair):
 
 
 def test_a_source_that_is_silent_for_long_keeps_all_that_comes(stage):
-    """Its destination may be stuck until time-outs and grace periods are over."""
+    """A source buffers all inputs while its destination exhausts timeouts and grace periods."""
     pair = pair_of(stage, Listener)
     talker = Talker(stage, 0.0, readers=2)
     silence(pair)
@@ -164,7 +164,7 @@ def test_a_source_that_is_silent_for_long_keeps_all_that_comes(stage):
 
 @pytest.mark.parametrize("end", ["resumed", "taken over"])
 def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end):
-    """And what it raises is the author's, as rclpy has it."""
+    """The author's exception is raised from the executor's spin, as in rclpy."""
 
     class Picky(Listener):
         def take(self, message):
@@ -196,19 +196,19 @@ def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end):
     def processed():
         stage.spin_until(lambda: len(goes_on.seen) >= 3, "the others")
 
-    with pytest.raises(ValueError, match="bad input"):  # out of the executor's spin
+    with pytest.raises(ValueError, match="bad input"):  # from the executor's spin
         go_on()
     processed()
     assert goes_on.seen == [0, 2, 3]
 
 
 def test_timers_and_services_go_on_while_more_comes_than_can_be_processed(stage):
-    """As in a busy node that was not moved."""
+    """Timers and services run despite overload, as in a node that was not migrated."""
 
     class Busy(Listener, Server):
         pass
 
-    there = Stage(beside=stage)  # a participant of its own, in a thread of its own
+    there = Stage(beside=stage)  # with its own participant and thread
     stage._beside.clear()
     second = Threads(there, SingleThreadedExecutor(context=there.context))
     make = lambda **named: Busy(work=0.012, depth=10, **named)  # noqa: E731 - each in its context
@@ -229,7 +229,7 @@ def test_timers_and_services_go_on_while_more_comes_than_can_be_processed(stage)
 
 
 def _answer(stage, client):
-    """Asked again every second: a request is lost where nobody serves in this moment."""
+    """Call the service; repeat each second, because requests without a server are lost."""
     asked = []
 
     def is_answered():
@@ -242,7 +242,7 @@ def _answer(stage, client):
 
 
 def test_two_inputs_of_one_topic_have_each_message_both(stage):
-    """Also when the source falls silent between the two."""
+    """Both subscriptions get each message, even if the source falls silent between the two."""
 
     class Both(Listener):
         def __init__(self, **named):
@@ -275,7 +275,7 @@ def test_two_inputs_of_one_topic_have_each_message_both(stage):
 
 
 def test_a_source_processes_what_waits_before_it_falls_silent(stage):
-    """A shadow that joined later never had it."""
+    """A source processes waiting inputs, which a shadow that joined later never received."""
     pair = pair_of(stage, Listener)
     talker = Talker(stage, 0.0, readers=2)
     pair.conductor.say(C.SHADOW)
@@ -290,7 +290,7 @@ def test_a_source_processes_what_waits_before_it_falls_silent(stage):
 
 
 def test_a_request_that_came_in_the_silence_is_answered_by_who_goes_on(stage):
-    """Once, and no thread waits with it."""
+    """A buffered request is answered once, and blocks no thread."""
     pair = pair_of(stage, Server)
     client = stage.plain.create_client(Trigger, "/counter/poke")
     stage.spin_until(client.service_is_ready, "the service")
@@ -309,7 +309,7 @@ def test_a_request_that_came_in_the_silence_is_answered_by_who_goes_on(stage):
 
 
 def test_inputs_stay_in_order_with_several_threads(stage, threads):
-    """Each is processed once, while a large state is restored and after it."""
+    """Each input is processed once and in order, during and after the restore of a large state."""
     group = MutuallyExclusiveCallbackGroup
 
     class Slow(Listener):
@@ -333,7 +333,7 @@ def test_inputs_stay_in_order_with_several_threads(stage, threads):
 
 
 def test_an_input_that_a_thread_holds_is_not_lost(stage, threads):
-    """In a reentrant group a later one may overtake it; the state covers that one alone."""
+    """In a reentrant group a later input may overtake; the snapshot covers that input alone."""
     make = lambda **named: Listener(ReentrantCallbackGroup(), **named)  # noqa: E731 - two of them
     pair = pair_of(stage, make)
     threads.take(pair.first)
@@ -362,7 +362,7 @@ def test_an_input_that_a_thread_holds_is_not_lost(stage, threads):
 
 
 def test_a_silent_source_answers_however_many_requests_come(stage, threads):
-    """None of its threads waits with them."""
+    """Buffered requests block no thread of a silent source."""
     pair = pair_of(stage, lambda **named: Server(ReentrantCallbackGroup(), **named))
     threads.take(pair.first)
     clients = [stage.plain.create_client(Trigger, "/counter/poke") for _ in range(8)]
@@ -375,7 +375,7 @@ def test_a_silent_source_answers_however_many_requests_come(stage, threads):
 
 
 def test_a_tick_that_a_thread_holds_is_not_skipped(stage, threads):
-    """The successor does it at once."""
+    """The successor executes the tick at once."""
 
     class Rare(Counter):
         def __init__(self, **named):

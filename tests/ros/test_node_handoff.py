@@ -1,4 +1,4 @@
-"""`rosrm.node` on real DDS: each word of the handoff protocol, said, left out, or said wrongly."""
+"""`rosrm.node` on real DDS: each message of the handoff protocol sent, omitted or wrong."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ R, C = HandoffReport, StateConfig
 
 @pytest.fixture
 def pair(stage):
-    """A counting source, its shadow, what is heard of both, and a conductor."""
+    """Return a counting source, its shadow, their received outputs, and a conductor."""
     counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")
     first = stage.instance(Counter, 1)
     stage.spin_until(lambda: counts, "the first count")
@@ -41,16 +41,16 @@ def numbers(heard):
 
 
 def goes_on(stage, heard, more=5):
-    """Wait until more is heard than there was."""
+    """Wait until `more` further messages arrive."""
     before = len(heard)
     stage.spin_until(lambda: len(heard) >= before + more, "further counts")
 
 
-# --- the good course --------------------------------------------------------------------------
+# --- without faults ---------------------------------------------------------------------------
 
 
 def test_the_successor_goes_on_where_the_source_stopped(stage, pair):
-    """No count is missing, none comes twice, and they come in order."""
+    """The successor continues the count in order, without a gap or a repetition."""
     pair.conductor.hand_over()
     goes_on(stage, pair.counts)
     assert numbers(pair.counts) == list(range(pair.counts[0].data, pair.counts[-1].data + 1))
@@ -59,7 +59,7 @@ def test_the_successor_goes_on_where_the_source_stopped(stage, pair):
 
 
 def test_every_input_is_processed_once(stage, pair):
-    """While they stream in, through the whole handoff."""
+    """Each input of a stream is processed once, throughout the handoff."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     sent = []
 
@@ -79,7 +79,7 @@ def test_every_input_is_processed_once(stage, pair):
 
 
 def test_a_shadow_that_is_slower_than_its_source_keeps_up(stage):
-    """It takes all that has come at once; one message at a time it would fall behind for ever."""
+    """A slow shadow processes all waiting inputs at once; one by one it would fall behind."""
     busy = Stage(beside=stage)
     counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")
     stage.instance(partial(Counter, period=0.002), 1)
@@ -90,7 +90,7 @@ def test_a_shadow_that_is_slower_than_its_source_keeps_up(stage):
     conductor = Conductor(stage, source=1, destination=2)
 
     def is_ready():
-        for _ in range(12):  # callbacks of the others for one of the shadow
+        for _ in range(12):  # callbacks of the other nodes per callback of the shadow
             stage.executor.spin_once(timeout_sec=0.0)
         return R.READY in conductor.of(2)
 
@@ -100,7 +100,7 @@ def test_a_shadow_that_is_slower_than_its_source_keeps_up(stage):
 
 
 def test_a_shadow_is_not_heard_before_it_is_active(stage, pair):
-    """No output, no state, no timer, no service; a node of one name would be heard twice."""
+    """A shadow has no output, state, timer or service; with the same name it would be doubled."""
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     goes_on(stage, pair.counts, 20)
@@ -110,7 +110,7 @@ def test_a_shadow_is_not_heard_before_it_is_active(stage, pair):
 
 
 def test_the_alias_changes_no_visible_name(stage, pair):
-    """Topics below ~ and parameter services are where they were."""
+    """Private topics and parameter services keep their names under an alias."""
     pair.conductor.hand_over()
     stage.remove(pair.first)
 
@@ -124,7 +124,7 @@ def test_the_alias_changes_no_visible_name(stage, pair):
 
 
 def test_parameters_set_at_run_time_move_along(stage):
-    """With the effect of being set, and those that were declared late."""
+    """Parameters are set with their callbacks, even those declared late."""
 
     class Tuned(Counter):
         def __init__(self, **named):
@@ -152,7 +152,7 @@ def test_parameters_set_at_run_time_move_along(stage):
 
 
 def test_parameters_that_are_valid_only_together_move_along(stage):
-    """Set at once, as they were; a read-only one that equals nothing stays as it is."""
+    """Interdependent parameters are set together; a read-only NaN (unequal to itself) is kept."""
 
     class Bounded(Counter):
         def __init__(self, **named):
@@ -177,7 +177,7 @@ def test_parameters_that_are_valid_only_together_move_along(stage):
 
 
 def test_a_service_is_served_by_the_active_node_alone(stage):
-    """In DDS all servers of one name get a request; a shadow has none, a silent node waits."""
+    """In DDS all servers of a name get a request: a shadow has none, a silent node buffers."""
 
     class Server(Counter):
         def __init__(self, **named):
@@ -214,7 +214,7 @@ def test_a_service_is_served_by_the_active_node_alone(stage):
 
 
 def _servers(stage, name):
-    """The nodes that serve a name, as the graph has it."""
+    """Return the nodes that serve a name, according to the graph."""
     nodes = ("counter", "counter_17")
     return [
         node for node in nodes
@@ -223,7 +223,7 @@ def _servers(stage, name):
 
 
 def test_timers_go_on_in_step(stage):
-    """A slow timer runs when the source's would have, not one period after the handoff."""
+    """A slow timer of the successor keeps the schedule of the source's timer."""
     ticks = stage.listen(Int64, "count")
     times = []
     stage.plain.create_subscription(Int64, "count", lambda _: times.append(time.monotonic()), 10)
@@ -243,7 +243,7 @@ def test_timers_go_on_in_step(stage):
 
 
 def test_a_successor_can_be_succeeded(stage, pair):
-    """There and back again, under another alias."""
+    """A second handoff under another alias continues the count."""
     pair.conductor.hand_over()
     pair.conductor.say(C.DONE)
     stage.remove(pair.first)
@@ -257,7 +257,7 @@ def test_a_successor_can_be_succeeded(stage, pair):
 
 
 def shadowing(stage, pair, text):
-    """It says that it waits, and for what; it is not ready."""
+    """Check that the shadow reports its unmet condition, and not READY."""
     pair.conductor.say(C.SHADOW)
     reports = pair.conductor.reports
     stage.spin_until(lambda: any(text in one.message for one in reports), f"a wait {text}")
@@ -276,7 +276,7 @@ def shadowing(stage, pair, text):
 def test_a_shadow_waits_until_it_is_matched_as_its_source_is(
     stage, pair, monkeypatch, what, method, text
 ):
-    """A reader that it cannot reach would lose what it says first; so too an input."""
+    """A shadow waits for matched readers and inputs, because it would lose messages without."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
     member = pair.second._rosrm.member
@@ -288,7 +288,7 @@ def test_a_shadow_waits_until_it_is_matched_as_its_source_is(
 
 
 def test_a_shadow_waits_until_its_buffer_overlaps_the_state(stage, pair, monkeypatch):
-    """What was sent between the two would be with neither."""
+    """A message between the source's state and the shadow's buffer would be lost."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.plain.create_timer(0.02, lambda: talker.publish(Int64(data=1)))
     stage.spin_until(lambda: pair.sums, "a sum")
@@ -299,7 +299,7 @@ def test_a_shadow_waits_until_its_buffer_overlaps_the_state(stage, pair, monkeyp
 
 
 def test_a_shadow_that_misses_an_input_does_not_become_active(stage, pair, monkeypatch):
-    """The source has it, and goes on."""
+    """The destination fails, and the source, which has the input, resumes."""
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     monkeypatch.setattr(pair.second._rosrm.member.buffer, "misses_one", lambda topic: True)
@@ -312,7 +312,7 @@ def test_a_shadow_that_misses_an_input_does_not_become_active(stage, pair, monke
 
 
 def test_an_input_that_comes_after_the_switch_and_was_processed_before_it_counts_once(stage, pair):
-    """Its way to the successor was longer than the state's."""
+    """An input that reaches the successor after the state which covers it counts once."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
     late, received = [], pair.second._rosrm.member._received
@@ -329,7 +329,7 @@ def test_an_input_that_comes_after_the_switch_and_was_processed_before_it_counts
 
 
 def test_a_source_is_released_when_its_last_outputs_have_arrived(stage, pair, monkeypatch):
-    """Until then it has to stay, to send them again."""
+    """The source stays until its readers have acknowledged all, in order to send again."""
     with monkeypatch.context() as patch:
         patch.setattr(pair.first.output, "wait_for_all_acked", lambda timeout: False)
         pair.conductor.say(C.SHADOW)
@@ -343,7 +343,7 @@ def test_a_source_is_released_when_its_last_outputs_have_arrived(stage, pair, mo
 
 
 def test_a_successor_does_not_take_over_from_a_source_that_still_speaks(stage, pair):
-    """What of its state is on the way still counts."""
+    """A destination waits while a source publishes, because its newer state still counts."""
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     pair.conductor.say(C.TAKE_OVER)
@@ -355,7 +355,7 @@ def test_a_successor_does_not_take_over_from_a_source_that_still_speaks(stage, p
 
 
 def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(stage):
-    """What must not be there twice: an action server, say."""
+    """Unique resources, such as an action server, exist in the active node only."""
     made = []
 
     class Opener(Counter):
@@ -376,7 +376,7 @@ def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(s
 
 
 def test_inputs_are_served_between_two_services_that_open(stage):
-    """To open one takes DDS some ms: nobody waits for all of them."""
+    """The node serves inputs between openings, because DDS takes some ms for each."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     totals = []
 
@@ -399,14 +399,14 @@ def test_inputs_are_served_between_two_services_that_open(stage):
     assert totals[3:] == [("counter_17", 3), ("counter_17", 4), ("counter_17", 5)]
 
 
-# --- called off -------------------------------------------------------------------------------
+# --- aborted ----------------------------------------------------------------------------------
 
 
 def test_a_source_that_resumes_has_lost_nothing(stage, pair):
-    """What came while it was silent is processed; its timers and services go on."""
+    """A resumed source processes its buffered inputs; its timers and services continue."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
-    pair.second._rosrm._destination._activate = lambda: None  # it never becomes active
+    pair.second._rosrm._destination._activate = lambda: None  # never becomes active
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     pair.conductor.say(C.SWITCH)
@@ -424,7 +424,7 @@ def test_a_source_that_resumes_has_lost_nothing(stage, pair):
 
 
 def test_a_shadow_that_was_called_off_never_becomes_active(stage, pair):
-    """Whatever is said afterwards."""
+    """An aborted shadow ignores all later phases."""
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     pair.conductor.say(C.ABORT)
@@ -437,7 +437,7 @@ def test_a_shadow_that_was_called_off_never_becomes_active(stage, pair):
 
 
 def test_an_active_successor_cannot_be_called_off(stage, pair):
-    """It says so again: there must be no second owner."""
+    """An active successor answers ABORT with ACTIVE, because there must be one owner."""
     pair.conductor.hand_over()
     pair.conductor.reports.clear()
     pair.conductor.say(C.ABORT)
@@ -446,8 +446,8 @@ def test_an_active_successor_cannot_be_called_off(stage, pair):
 
 
 def test_a_source_falls_silent_only_when_master_and_destination_both_want_it(stage, pair):
-    """One of them may be wrong."""
-    pair.second._rosrm._destination._review = lambda: None  # it does not ask
+    """A single wrong request does not silence the source."""
+    pair.second._rosrm._destination._review = lambda: None  # does not ask
     pair.conductor.say(C.SHADOW)
     pair.conductor.say(C.SWITCH)
     goes_on(stage, pair.counts, 20)
@@ -455,7 +455,7 @@ def test_a_source_falls_silent_only_when_master_and_destination_both_want_it(sta
 
 
 def test_the_last_state_is_enough_when_the_source_is_lost(stage, pair):
-    """The master says so, for it alone knows."""
+    """With the source gone, only the master's TAKE_OVER activates the destination."""
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     stage.remove(pair.first)
@@ -466,15 +466,15 @@ def test_the_last_state_is_enough_when_the_source_is_lost(stage, pair):
 
 
 def test_what_an_earlier_handoff_ended_with_is_not_taken_for_the_end_of_this_one(stage, pair):
-    """The mark is latched: a later shadow hears it before anything else."""
-    pair.second._rosrm._destination._activate = lambda: None  # it never becomes active
+    """A later shadow receives the latched final mark first, and must not act on it."""
+    pair.second._rosrm._destination._activate = lambda: None  # never becomes active
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     pair.conductor.say(C.SWITCH)
     pair.conductor.wait(1, R.RELEASED)
     pair.conductor.say(C.ABORT)
     pair.conductor.wait(2, R.ABORTED)
-    pair.first._rosrm._source._marks.publish = lambda mark: None  # nothing takes its place
+    pair.first._rosrm._source._marks.publish = lambda mark: None  # no other mark replaces it
     pair.conductor.say(C.RESUME)
     pair.conductor.wait(1, R.RESUMED)
     pair.conductor.say(C.DONE)
@@ -492,7 +492,7 @@ def test_what_an_earlier_handoff_ended_with_is_not_taken_for_the_end_of_this_one
 
 
 def test_a_destination_that_failed_is_one_that_was_called_off(stage, pair):
-    """It will never be active, so the source need not wait for its end."""
+    """A failed destination reports ABORTED, so that the source may resume without its end."""
     pair.second._rosrm._parts[1]._restore = lambda message: 1 // 0
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.FAILED)
@@ -501,7 +501,7 @@ def test_a_destination_that_failed_is_one_that_was_called_off(stage, pair):
 
 
 def test_a_part_that_did_not_change_goes_on_from_successor_to_successor(stage):
-    """An author may say "unchanged" of what was restored."""
+    """A restored part that `save` reports as unchanged (None) still reaches the next successor."""
 
     class Mapper(Counter):
         def __init__(self, **named):
@@ -534,7 +534,7 @@ def test_a_part_that_did_not_change_goes_on_from_successor_to_successor(stage):
 
 
 def test_a_part_that_a_shadow_names_late_is_followed(stage):
-    """As long as no state came that has it."""
+    """A shadow may name a part until it receives a state that contains the part."""
 
     def name_another(node):
         node.keep_state("~/late", String, lambda: String(data="kept"), lambda message: None)
@@ -550,7 +550,7 @@ def test_a_part_that_a_shadow_names_late_is_followed(stage):
 
 
 def test_every_input_is_processed_once_with_several_publishers(stage, pair):
-    """Whose clocks do not agree, and of whom the source is ahead and behind."""
+    """Publishers have unrelated clocks, and source and shadow differ in their progress."""
     talkers = [stage.plain.create_publisher(Int64, "add", RELIABLE) for _ in range(3)]
     sent = []
 
@@ -572,7 +572,7 @@ def test_every_input_is_processed_once_with_several_publishers(stage, pair):
 
 
 def fails(stage, pair, text, *, of=2):
-    """The handoff fails with a message, and the source counts on."""
+    """Check that the handoff fails with a message, and the source continues."""
     pair.conductor.say(C.SHADOW)
     report = pair.conductor.wait(of, R.FAILED)
     assert text in report.message
@@ -581,31 +581,31 @@ def fails(stage, pair, text, *, of=2):
 
 
 def test_a_restore_function_that_raises(stage, pair):
-    """Found out while the source still runs."""
+    """The failure is detected while the source is still active."""
     pair.second._rosrm._parts[1]._restore = lambda message: 1 // 0
     fails(stage, pair, "restoring /counter/state raised ZeroDivisionError")
 
 
 def test_a_save_function_that_raises(stage, pair):
-    """Its node goes on."""
+    """The source keeps running."""
     pair.first._rosrm._parts[1]._save = lambda: 1 // 0
     fails(stage, pair, "saving /counter/state raised ZeroDivisionError", of=1)
 
 
 def test_a_state_of_another_class_than_named(stage, pair):
-    """Said by the source."""
+    """The source reports the wrong class."""
     pair.first._rosrm._parts[1]._save = lambda: String(data="3")
     fails(stage, pair, "returned a String, not a std_msgs/msg/Int64", of=1)
 
 
 def test_a_state_that_is_too_large(stage, pair, monkeypatch):
-    """Refused before it is sent."""
+    """The source refuses to send the state."""
     monkeypatch.setattr(source, "LARGEST_PART", 4)
     fails(stage, pair, "12 bytes, more than the 4 that may travel", of=1)
 
 
 def test_a_state_of_another_type(stage, pair):
-    """Both must be the same program."""
+    """Source and destination must run the same program."""
 
     class Other(Counter):
         def keep_state(self, topic, message_type, save, restore):
@@ -618,19 +618,19 @@ def test_a_state_of_another_type(stage, pair):
 
 
 def test_a_state_topic_that_cannot_be_followed(stage, pair):
-    """The node itself has another type there; said, and no crash."""
+    """A topic with another type in the node itself is reported without a crash."""
     pair.second._rosrm._parts[1].message_type = String
     fails(stage, pair, "/counter/state cannot be followed")
 
 
 def test_a_state_of_other_topics(stage, pair):
-    """A part that only one of them knows."""
+    """The error names the part that only one node has."""
     pair.second.keep_state("~/more", Int64, Int64, lambda message: None)
     fails(stage, pair, "/counter/more is none at the source, and std_msgs/msg/Int64 here")
 
 
 def test_a_state_that_nobody_publishes_is_said_to_be_waited_for(stage):
-    """The master's time-out ends it, with this message."""
+    """The shadow reports the wait, and the master's timeout ends it with this message."""
     stage.instance(Counter, 2, alias="counter_17", shadow=True)
     conductor = Conductor(stage, source=1, destination=2)
     conductor.say(C.SHADOW)
@@ -639,7 +639,7 @@ def test_a_state_that_nobody_publishes_is_said_to_be_waited_for(stage):
 
 
 def test_a_source_that_was_started_again_is_another_one(stage, pair):
-    """Its state begins anew."""
+    """The state of a restarted source is another one, so the handoff fails."""
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
     stage.remove(pair.first)
@@ -649,7 +649,7 @@ def test_a_source_that_was_started_again_is_another_one(stage, pair):
 
 
 def test_more_input_than_can_be_kept(stage, pair, monkeypatch):
-    """The shadow gives up; nothing of the source is lost."""
+    """The shadow gives up; the source loses nothing."""
     monkeypatch.setattr(pair.second._rosrm.member.buffer, "_limit", 3)
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
@@ -670,7 +670,7 @@ def test_more_input_than_can_be_kept(stage, pair, monkeypatch):
     ],
 )
 def test_a_state_config_of_a_stranger_is_left_alone(stage, pair, wrong, text, capfd):
-    """With one line in the log, whatever it says and however often."""
+    """A foreign `state_config` has no effect but one line in the log, however often it comes."""
     for phase in (C.SHADOW, C.SWITCH, C.TAKE_OVER, C.SHADOW):
         pair.conductor.say(phase, **wrong)
     goes_on(stage, pair.counts, 20)
@@ -679,7 +679,7 @@ def test_a_state_config_of_a_stranger_is_left_alone(stage, pair, wrong, text, ca
 
 
 def test_a_state_config_for_a_stranger_is_none_of_a_nodes_business(stage, pair, capfd):
-    """Other processes move all the time."""
+    """A node ignores handoffs of other processes without a log line."""
     pair.conductor.say(C.SHADOW, process="other")
     pair.conductor.say(C.SWITCH, source=7, destination=8)
     goes_on(stage, pair.counts, 20)
@@ -688,7 +688,7 @@ def test_a_state_config_for_a_stranger_is_none_of_a_nodes_business(stage, pair, 
 
 
 def test_a_newer_epoch_fences_an_older_one(stage, pair):
-    """A master that was replaced has nothing to say any more."""
+    """Messages of a replaced master have no effect."""
     pair.conductor.say(C.SHADOW, epoch=EPOCH + 2)
     pair.conductor.wait(2, R.READY)
     pair.conductor.say(C.SWITCH, epoch=EPOCH + 1)
@@ -697,7 +697,7 @@ def test_a_newer_epoch_fences_an_older_one(stage, pair):
 
 
 def test_async_callbacks_are_refused(stage):
-    """A state lies between two callbacks."""
+    """An `async` callback is refused, because states are taken between two callbacks."""
 
     class Async(Counter):
         def __init__(self, **named):
@@ -705,14 +705,14 @@ def test_async_callbacks_are_refused(stage):
             self.create_timer(1.0, self.later)
 
         async def later(self):
-            """Never runs."""
+            """Do nothing; never called."""
 
     with pytest.raises(TypeError, match="is `async`"):
         stage.instance(Async, 1)
 
 
 def test_a_second_node_of_a_process_is_refused(stage):
-    """It would answer for the first, with a state of its own."""
+    """A second node would answer for the first with its own state."""
     stage.instance(Counter, 1)
     with pytest.raises(
         RuntimeError, match="rosrm moves a process by one node, and 'counter' is it"
@@ -721,7 +721,7 @@ def test_a_second_node_of_a_process_is_refused(stage):
 
 
 def test_a_state_topic_is_named_once(stage):
-    """Each part has a topic of its own."""
+    """Two parts cannot share a topic."""
     node = stage.instance(Counter, 1)
     with pytest.raises(ValueError, match="/counter/state is named twice"):
         node.keep_state("/counter/state", Int64, Int64, print)
@@ -731,7 +731,7 @@ def test_a_state_topic_is_named_once(stage):
 
 
 def test_without_rosrm_it_is_rclpys_node(stage):
-    """Not a topic, a callback or an object more."""
+    """The node has no additional topics, callbacks or objects."""
     ours = stage.add(Counter(context=stage.context))
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     sums = stage.listen(Int64, "sum")
@@ -745,7 +745,7 @@ def test_without_rosrm_it_is_rclpys_node(stage):
 
 
 def test_a_lifecycle_node_can_be_made_migratable(stage):
-    """`Migratable` stands before whatever node it is."""
+    """`Migratable` can precede any node class."""
     lifecycle = pytest.importorskip("rclpy.lifecycle")
 
     class Managed(Migratable, lifecycle.LifecycleNode):

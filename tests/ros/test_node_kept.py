@@ -1,4 +1,4 @@
-"""A node that goes on from its kept state: what it does first, and what it does not do again."""
+"""Restart of a node from its snapshot: order of the restore, and nothing processed twice."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LATCHED = QoSProfile(
 
 
 class Busy(Counter):
-    """With a latched input, a service, a parameter and a timer that it has cancelled."""
+    """A counter with a latched input, a service, a parameter and a cancelled timer."""
 
     def __init__(self, **named) -> None:
         super().__init__(**named)
@@ -53,7 +53,7 @@ class Busy(Counter):
 
 
 def crash(stage, node) -> None:
-    """It is no more, and had no time for a last word."""
+    """Remove a node without a last snapshot."""
     node._rosrm._source._keeper._closed = True
     stage.remove(node)
 
@@ -64,7 +64,7 @@ def kept_up_to(directory, sequence: int) -> bool:
 
 
 def test_what_was_processed_is_not_processed_again(stage, tmp_path):
-    """A latched message comes again to the new node, as it would to any; it is known already."""
+    """A latched message that the snapshot covers is not processed again after the restart."""
     talker = stage.plain.create_publisher(Int64, "settings", LATCHED)
     talker.publish(Int64(data=5))
     first = stage.instance(Busy, 1, keep=tmp_path)
@@ -80,11 +80,11 @@ def test_what_was_processed_is_not_processed_again(stage, tmp_path):
 
 
 def test_it_goes_on_as_it_was(stage, tmp_path):
-    """State, parameters, timers, services: before its first cycle, whatever came first."""
+    """State, parameters, timers and services are restored before the first cycle."""
     first = stage.instance(Busy, 1, keep=tmp_path)
     first.set_parameters([Parameter("gain", value=2.5)])
     stage.spin_until(lambda: first.count >= 20 and first.runs == 1, "twenty counts")
-    stage.remove(first)  # in good order: the last state is kept
+    stage.remove(first)  # a clean end, with a last snapshot
     counts = stage.listen(Int64, "count")
     second = stage.instance(Busy, 2, keep=tmp_path)
     assert second.count == 0
@@ -100,7 +100,7 @@ def test_it_goes_on_as_it_was(stage, tmp_path):
 
 
 def test_the_state_in_the_middle_of_a_cycle_is_not_kept(stage, tmp_path):
-    """The callback raised: what is kept is the state before it."""
+    """If a callback raises, the snapshot is from before the callback."""
     first = stage.instance(Busy, 1, keep=tmp_path)
     stage.spin_until(lambda: first.count >= 5, "five counts")
     first.fails_at = first.count + 5
@@ -114,7 +114,7 @@ def test_the_state_in_the_middle_of_a_cycle_is_not_kept(stage, tmp_path):
 
 
 def test_a_revived_node_can_be_moved(stage, tmp_path):
-    """It is a source like any other; and who takes over keeps its own state from then on."""
+    """A restored node can be the source of a handoff; its successor saves its own snapshots."""
     first = stage.instance(Counter, 1, keep=tmp_path / "a")
     stage.spin_until(lambda: first.count >= 10, "ten counts")
     stage.remove(first)
@@ -136,7 +136,7 @@ def test_a_revived_node_can_be_moved(stage, tmp_path):
 
 
 def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
-    """At most one write is lost; only without any it begins from nothing."""
+    """A damaged snapshot costs one write; without any snapshot the node starts empty."""
     first = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: first.count >= 30, "thirty counts")
     stage.remove(first)
@@ -155,7 +155,7 @@ def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
 
 
 class Slow(Counter):
-    """Has no cycle but its input, and takes its time to save."""
+    """A counter that has no cycle but its input, and takes 50 ms to save."""
 
     def __init__(self, **named) -> None:
         super().__init__(period=1000.0, **named)
@@ -166,7 +166,7 @@ class Slow(Counter):
 
 
 def test_what_is_not_kept_at_once_is_kept_though_no_cycle_follows(stage, tmp_path):
-    """A state that takes long to save is saved less often, but not later than it is said."""
+    """A state that takes long to save is saved less often, but within the maximum age."""
     talker = stage.plain.create_publisher(Int64, "add", LATCHED)
     node = stage.instance(Slow, 1, keep=tmp_path)
     for _ in range(5):
@@ -178,7 +178,7 @@ def test_what_is_not_kept_at_once_is_kept_though_no_cycle_follows(stage, tmp_pat
 
 
 class Asking(Counter):
-    """Spins in its constructor, before it has named its state."""
+    """A counter that spins in its constructor, before it has named its state."""
 
     def __init__(self, **named) -> None:
         self._held_back: list = []
@@ -200,7 +200,7 @@ class Asking(Counter):
 
 
 def test_a_constructor_that_spins_is_waited_for(stage, tmp_path):
-    """Nothing is restored before all parts are named, and no cycle runs."""
+    """Nothing is restored and no cycle runs before all parts are named."""
     first = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: first.count >= 10, "ten counts")
     stage.remove(first)
@@ -211,7 +211,7 @@ def test_a_constructor_that_spins_is_waited_for(stage, tmp_path):
 
 
 def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_path):
-    """What has been published and does not change, as the parameters, is still there to be kept."""
+    """A snapshot also has the unchanged parts that were published before, e.g. parameters."""
     marks = stage.listen(StateMark, "/counter/_rosrm/mark", MARK)
     first = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: marks and first.count >= 5, "five counts that somebody follows")
@@ -220,7 +220,7 @@ def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_
 
 
 def test_once_there_is_room_again_every_state_is_kept_again(stage, tmp_path):
-    """Not only the first: the trouble is over, whatever was said of it."""
+    """After a full disk all snapshots are written again, not only the first."""
     directory = tmp_path / "state"
     directory.write_text("in the way")
     node = stage.instance(Counter, 1, keep=directory)

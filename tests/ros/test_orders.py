@@ -1,4 +1,4 @@
-"""What a real slave does for a handoff: another restart policy, readiness, the environment."""
+"""Orders of a handoff to a real slave: restart policy, readiness, environment."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def cluster(make_shared):
 
 
 class Orders:
-    """Gives the slave orders beside the master's; it has the same clock as this test."""
+    """A sender of orders beside the master, on the slave's machine and so with its clock."""
 
     def __init__(self, cluster) -> None:
         self.participant = Participant(cluster.ros, "orders")
@@ -39,7 +39,7 @@ class Orders:
         )
 
     def set_restart(self, instance: InstanceId, restart: RestartPolicy):
-        """The answer."""
+        """Order another restart policy; return the answer."""
         deadline = time.monotonic() + PATIENCE
         assert wait_for_service(self.participant, self.client, deadline)
         request = srv.ControlHost.Request(
@@ -63,7 +63,7 @@ def end(pid: int) -> None:
 
 
 def replace_slave(cluster) -> None:
-    """Another run of it, after a SIGKILL."""
+    """Kill the slave with SIGKILL, and start the next one."""
     part = cluster.slaves["h0"]
     part.process.kill()
     part.process.wait()
@@ -72,7 +72,7 @@ def replace_slave(cluster) -> None:
 
 
 def test_another_policy_counts_from_its_answer_on(cluster, orders) -> None:
-    """Whatever is killed a moment after it."""
+    """An acknowledged policy applies, whatever is killed a moment later."""
     cluster.submit(service("source", restart=ON_FAILURE), service("copy"))
     for name in ("source", "copy"):
         cluster.wait(name, "running")
@@ -95,7 +95,7 @@ def test_another_policy_counts_from_its_answer_on(cluster, orders) -> None:
 
 
 def test_a_policy_for_what_a_killed_slave_left(cluster, orders) -> None:
-    """The next slave knows nothing of its spec."""
+    """The next slave changes the policy, although it does not know the spec."""
     cluster.submit(service("left", restart=ON_FAILURE))
     row = cluster.wait("left", "running")
     replace_slave(cluster)
@@ -107,14 +107,14 @@ def test_a_policy_for_what_a_killed_slave_left(cluster, orders) -> None:
 
 
 def test_a_policy_for_a_stranger_is_refused(orders) -> None:
-    """With a code for programs, and a reason for people."""
+    """The refusal has a code for programs and a reason for users."""
     answer = orders.set_restart(InstanceId("nobody", 99), NEVER)
     assert (answer.accepted, answer.code) == (False, "unknown")
     assert "nobody#99 is not known here" in answer.message
 
 
 def test_a_node_that_is_awaited_when_its_slave_is_killed_is_not_ready(cluster, tmp_path) -> None:
-    """The next slave waits for it; and the one after that knows that it was seen."""
+    """The next slave waits for readiness; the one after that knows that the node was ready."""
     go = tmp_path / "go"
     waits = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.05)\n"
     cluster.submit(node("late", waits + NODE))
@@ -132,7 +132,7 @@ def test_a_node_that_is_awaited_when_its_slave_is_killed_is_not_ready(cluster, t
 
 
 def test_a_process_is_told_who_it_is(cluster) -> None:
-    """And by whom it was started, so that it can judge who speaks to it."""
+    """A process gets its own and its master's identity, in order to check messages."""
     code = "import json, os; print(json.dumps(dict(os.environ)))"
     environment = {"ROS_DOMAIN_ID": str(cluster.domain)}
     cluster.run(python("who", code, kind=Kind.JOB, environment=environment, ros=True))

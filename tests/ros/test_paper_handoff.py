@@ -1,4 +1,4 @@
-"""Nodes that keep only the paper's two constraints, moved with their state by `protocol: paper`."""
+"""Nodes with only the paper's two constraints, moved with their state by `protocol: paper`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from tests.ros.clusters import PATIENCE, QUICK, host
 
-#: Plain rclpy: publishes its state in every cycle; a shadow begins with what it hears there.
+#: Plain rclpy: publishes its state in every cycle; a shadow starts from a received state.
 COUNTER = """
 import os, rclpy
 from rclpy.node import Node
@@ -61,7 +61,7 @@ def counter(name: str = "counter", **options: object) -> ProcessSpec:
 
 
 def test_it_goes_on_counting_there_and_back_again(cluster):
-    """Twice: the second time the source has an alias."""
+    """The counter migrates twice; the second time the source has an alias."""
     cluster.submit(counter())
     here = cluster.wait("counter", "running").host
     there = {"left": "right", "right": "left"}[here]
@@ -75,7 +75,7 @@ def test_it_goes_on_counting_there_and_back_again(cluster):
 
 
 def moved(cluster, times: int):
-    """Its row, once it has moved so many times and runs."""
+    """Return the row of the process, once it runs after so many migrations."""
     view = cluster.wait_until(
         f"moved {times} times",
         lambda v: any(row.migrations == times and row.state == "running" for row in v.processes),
@@ -85,7 +85,7 @@ def moved(cluster, times: int):
 
 
 def test_a_state_below_the_nodes_own_name_is_found_under_an_alias(cluster):
-    """`~/state` is where the others know it."""
+    """`~/state` is the same topic under an alias."""
     private = ProcessSpec(
         "private", command=(sys.executable, "-c", COUNTER.replace("/counter/state", "~/state")),
         ros=True, stop=QUICK, readiness=Readiness(timeout=PATIENCE),
@@ -100,7 +100,7 @@ def test_a_state_below_the_nodes_own_name_is_found_under_an_alias(cluster):
 
 
 def test_a_topic_on_which_nobody_speaks_leaves_it_where_it_is(cluster):
-    """With the reason, as the slave of the destination heard it."""
+    """The process stays; the event has the reason from the destination's slave."""
     cluster.submit(counter("lost", state="/wrong/state", ready_timeout=2.0))
     cluster.wait("lost", "running")
     cluster.client.migrate("lost", None)

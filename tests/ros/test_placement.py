@@ -1,4 +1,4 @@
-"""Where processes go: with the largest margin, first in first out, never over a limit."""
+"""Placement: the largest margin, first in first out, never over a limit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ time.sleep(1000)
 
 
 def holder(name: str, mib: int, **options):
-    """A process that uses so much memory."""
+    """Return a process that uses `mib` MiB of memory."""
     options.setdefault("needs", {"memory": (mib + 10.0) * MIB, "cpu": 0.0})
     spec = python(name, HOLD, **options)
     return replace(spec, arguments=(str(mib * MIB),))
@@ -35,7 +35,7 @@ def on(view, name: str) -> int:
 
 
 def test_sixty_equal_processes_are_spread_evenly(make_cluster) -> None:
-    """Submitted at once to three equal hosts they end 20/20/20, give or take one."""
+    """Three equal hosts get 20 of 60 simultaneously submitted processes each, give or take one."""
     hosts = [host(f"h{n}", memory=4096 * MIB) for n in range(3)]
     cluster = make_cluster(*hosts, liveness=STEADY)
     specs = [service(f"p{n:02}") for n in range(60)]
@@ -55,14 +55,14 @@ def test_sixty_equal_processes_are_spread_evenly(make_cluster) -> None:
 
 @pytest.fixture(scope="module")
 def narrow(make_shared):
-    """One host that holds one process at a time, and a wide one that is closed at first."""
+    """Yield a cluster with one host for one process at a time."""
     return make_shared(
         host("narrow", max_processes=1), defaults=ProcessDefaults(needs={"memory": MIB})
     )
 
 
 def test_first_in_first_out(narrow) -> None:
-    """They run in the order in which they came; a higher priority goes first."""
+    """Processes start in order of submission; a higher priority goes first."""
     narrow.submit(service("blocker"))
     narrow.wait("blocker", "running")
     narrow.submit(job("a", "true"), job("b", "true"), job("c", "true"))
@@ -88,7 +88,7 @@ def test_no_more_processes_than_allowed(narrow) -> None:
 
 
 def test_a_cancelled_one_leaves_the_queue(narrow) -> None:
-    """It never runs, and those behind it move up."""
+    """A cancelled process never runs, and those behind it move up."""
     narrow.submit(service("front"))
     narrow.wait("front", "running")
     narrow.submit(job("never", "true"), job("next", "true"))
@@ -101,11 +101,11 @@ def test_a_cancelled_one_leaves_the_queue(narrow) -> None:
 
 
 def test_an_idle_cluster_is_quiet(narrow) -> None:
-    """No polling: a request for work stays open, and no other is sent while there is none."""
+    """The slave keeps one request for work open, and sends no other while there is none."""
     with Participant(narrow.ros, "rosrm_test_counter") as participant:
         seen = []
         path = names.Names("/rosrm")(names.REQUEST_PROCESS)
-        # In DDS each server of a name sees every request: this one counts them, and answers none.
+        # Each DDS server of a name receives every request: this one counts them without an answer.
         participant.serve(srv.RequestProcess, path, lambda request, _: seen.append(request))
         number = 0
         while not seen:  # until it is discovered
@@ -113,7 +113,7 @@ def test_an_idle_cluster_is_quiet(narrow) -> None:
             assert number < 100, "the request after a job was never seen"
             narrow.run(job(f"wakes-{number}", "true"))
             look(participant, 0.3)
-        for _ in range(3):  # one that came late, or one that was renewed after half a minute
+        for _ in range(3):  # a request may be late, or renewed after half a minute
             seen.clear()
             look(participant, 2.5)
             if not seen:
@@ -134,7 +134,7 @@ def look(participant, seconds: float, found=lambda: False) -> None:
 
 @pytest.fixture(scope="module")
 def two(make_shared):
-    """Two hosts of 1 GiB; a process is counted by what it declares."""
+    """Yield two hosts of 1 and 2 GiB; a process is charged its declared needs."""
     limits = {"memory": 0.5, "cpu": 1.0}
     return make_shared(
         host("small", memory=1024 * MIB, limits=limits),
@@ -145,7 +145,7 @@ def two(make_shared):
 
 
 def test_nothing_is_assigned_over_a_limit(two) -> None:
-    """With 512 MiB and 1 GiB allowed, twelve of 120 MiB each run on neither host over it."""
+    """With 512 MiB and 1 GiB allowed, twelve processes of 120 MiB exceed no limit."""
     specs = [holder(f"m{n:02}", 110) for n in range(14)]
     two.submit(*specs)
     view = two.wait_until(
@@ -173,7 +173,7 @@ def test_nothing_is_assigned_over_a_limit(two) -> None:
 
 
 def test_needs_larger_than_every_host_are_set_aside(two) -> None:
-    """With the reason; those behind it do not wait, and a host that has room brings it back."""
+    """The process has the reason and blocks no other; a host with room brings it back."""
     two.submit(service("giant", needs={"memory": 3000.0 * MIB}), job("behind", "true"))
     assert two.ended("behind").state == "finished"
     row = two.wait("giant", "set_aside")
@@ -182,7 +182,7 @@ def test_needs_larger_than_every_host_are_set_aside(two) -> None:
 
 
 def test_labels(two) -> None:
-    """What a process requires of its host it gets, or it is set aside; a preference is one."""
+    """Required labels are binding: the process is set aside without; preferred ones are not."""
     two.submit(service("driver", required_labels={"arm": "left"}))
     assert two.wait("driver", "running").host == "large"
     two.submit(service("other-arm", required_labels={"arm": "right"}))
@@ -197,9 +197,9 @@ def test_labels(two) -> None:
 
 
 def test_a_host_over_its_limit_takes_nothing(two) -> None:
-    """It does not ask, and is not given; what is freed lets it ask again."""
+    """A host over its limit neither asks for nor gets work until memory is freed."""
     two.client.set_host_state("large", "cordon")
-    # It declares little and takes much: only the readings tell.
+    # The process declares little and uses much: only the readings show this.
     two.submit(holder("liar", 600, needs={"memory": 1.0 * MIB}))
     two.wait("liar", "running")
 
@@ -220,7 +220,7 @@ def test_a_host_over_its_limit_takes_nothing(two) -> None:
 
 
 def test_a_cordoned_host_takes_nothing(two) -> None:
-    """Until it is uncordoned."""
+    """A cordoned host gets no work until it is uncordoned."""
     for name in ("small", "large"):
         two.client.set_host_state(name, "cordon")
     two.submit(job("patient", "true"))
@@ -233,7 +233,7 @@ def test_a_cordoned_host_takes_nothing(two) -> None:
 
 @pytest.mark.parametrize("policy", ["weighted", "threshold"])
 def test_explain_names_every_host(make_cluster, policy) -> None:
-    """Why this host, and why not the others: with the score of each, by either policy."""
+    """The explanation has the score of each host, under either policy."""
     cluster = make_cluster(host("x"), host("y", memory=256 * MIB), scoring=ScoringChoice(policy))
     cluster.submit(service("placed", needs={"memory": 100.0 * MIB, "cpu": 0.1}))
     assert cluster.wait("placed", "running").host in ("x", "y")

@@ -1,4 +1,4 @@
-"""A third party's plugin that raises, hangs or answers nonsense: named, left out, and survived."""
+"""Third-party plugins that raise, hang or give bad answers: named, skipped and survived."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ EXECUTORS = {"forgets": forgets, "forgets_slowly": forgets_slowly, "exits_there"
 
 @pytest.fixture(scope="module")
 def third_party(tmp_path_factory):
-    """A folder that pip could have made: a module and its entry point."""
+    """Yield a folder as pip would create it, with a module and its entry point."""
     site = tmp_path_factory.mktemp("site")
     (site / "odd_plugin.py").write_text(PLUGIN)
     (site / "bad_import.py").write_text("import no_such_module_at_all\n")
@@ -197,7 +197,7 @@ def third_party(tmp_path_factory):
         bad = bad_import
         """)
     )
-    # Who starts a part finds the plugins; the part itself imports them.
+    # The process that starts a part finds the plugins; the part itself imports them.
     before = os.environ.get("PYTHONPATH", "")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join([str(site), *([before] if before else [])]))
@@ -206,7 +206,7 @@ def third_party(tmp_path_factory):
 
 
 def plugins(cluster) -> list:
-    """The rows of `rosrm plugins`."""
+    """Return the rows of `rosrm plugins`."""
     return list(cluster.client.list(plugins=True).plugins)
 
 
@@ -225,7 +225,7 @@ def plugins(cluster) -> list:
     ],
 )
 def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, policy, said) -> None:
-    """What it was to judge is placed without it, and the record says so; the master goes on."""
+    """A process is placed without the failing policy, with an event; the master keeps running."""
     cluster = make_cluster(host("h0"), scoring=ScoringChoice(policy))
     cluster.submit(job("judged", "true"))
     event = cluster.wait_for_event("plugin_failed")
@@ -238,7 +238,7 @@ def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, po
     began = time.monotonic()
     for number in range(5):
         assert cluster.run(job(f"more{number}", "true"))[0].state == "finished"
-    assert time.monotonic() - began < PATIENCE  # it is not waited for again and again
+    assert time.monotonic() - began < PATIENCE  # not awaited again and again
     cluster.wait_until("h0 up", lambda v: [row.state for row in v.hosts] == ["up"])
 
 
@@ -251,13 +251,13 @@ def probes(*names: str) -> dict:
 
 @pytest.fixture(scope="module")
 def cluster(make_shared, third_party):
-    """One host with all of these probes, and a limit on the one that works."""
+    """Yield a host with all these probes, and a limit on the working one."""
     names = ("battery", "fails", "sleeps", "nan_probe", "absent_one", "broken_one")
     return make_shared(host("h0", probes=probes(*names), limits={"battery": 0.5}))
 
 
 def test_a_third_party_s_probe_is_read(cluster) -> None:
-    """Its resource is one like any other: with a limit, in the rows, in what a process needs."""
+    """A third party's resource has a limit, a reading in the rows, and counts in needs."""
 
     def shown(view) -> bool:
         battery = next(r for row in view.hosts for r in row.resources if r.name == "battery")
@@ -273,7 +273,7 @@ def test_a_third_party_s_probe_is_read(cluster) -> None:
 
 @pytest.mark.parametrize("name", ["fails", "sleeps", "nan_probe"])
 def test_a_probe_that_fails_is_stale_never_zero(cluster, name) -> None:
-    """Without a limit on it the host works on; with one it takes nothing until it is mended."""
+    """A failing probe stops new work, until it works, only where its resource has a limit."""
     works, waits, limited = f"works-{name}", f"waits-{name}", f"limited-{name}"
     assert cluster.run(job(works, "true"))[0].state == "finished"
     wait_until(lambda: name in cluster.log_of("h0"), f"a word of h0 about {name}")
@@ -300,7 +300,7 @@ def test_a_probe_that_fails_is_stale_never_zero(cluster, name) -> None:
 
 
 def test_a_probe_that_fails_is_listed_until_it_works_again(make_cluster, third_party) -> None:
-    """With its error and the place; both changes are events of its host."""
+    """The row has the error and its place in the code; both changes are events of the host."""
     sensor = third_party / "sensor"
     sensor.unlink(missing_ok=True)
     cluster = make_cluster(host("h0", probes=probes("comes_back")))
@@ -319,7 +319,7 @@ def test_a_probe_that_fails_is_listed_until_it_works_again(make_cluster, third_p
 
 
 def test_a_probe_that_cannot_be_made_fails_from_the_start(make_cluster, third_party) -> None:
-    """The plugin and the place are in the log, the event and the row; a limit on it bites."""
+    """Log, event and row name plugin and place; a limit on the resource stops new work."""
     cluster = make_cluster()
     cluster.start_slave(host("h0", probes=probes("no_unit"), limits={"no_unit": 0.9}))
     event = cluster.wait_for_event("plugin_failed", host="h0")
@@ -339,7 +339,7 @@ def test_a_probe_that_cannot_be_made_fails_from_the_start(make_cluster, third_pa
 
 
 def test_a_probe_that_is_absent_or_broken_is_listed(cluster) -> None:
-    """With its reason; the host works with the others."""
+    """The rows have the reasons; the host works with its other probes."""
     rows = {row.name: row for row in cluster.client.list(plugins=True).plugins if row.host == "h0"}
     assert (rows["absent_one"].state, rows["absent_one"].reason) == (
         "absent", "no such hardware here",
@@ -354,7 +354,7 @@ def test_a_probe_that_is_absent_or_broken_is_listed(cluster) -> None:
 
 
 def test_a_strategy_that_gives_no_plan(make_cluster, third_party) -> None:
-    """The move is refused with the strategy's name and its reason; the process stays."""
+    """The refusal has the strategy's name and reason; the process stays."""
     cluster = make_cluster(
         host("h0"), host("h1"),
         migration=MigrationSettings({"never_plans": {}, "relaunch": {}}),
@@ -369,7 +369,7 @@ def test_a_strategy_that_gives_no_plan(make_cluster, third_party) -> None:
 
 @pytest.mark.parametrize(("strategy", "said"), [("hangs", "longer than 1 s"), ("exits", "Exit: 3")])
 def test_a_strategy_that_hangs_or_exits(make_cluster, third_party, strategy, said) -> None:
-    """The move is refused within its deadline, the strategy is failing, and the master works on."""
+    """The refusal comes within the deadline, the strategy is failing, the master works on."""
     cluster = make_cluster(
         host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
     )
@@ -394,9 +394,9 @@ def test_a_strategy_that_hangs_or_exits(make_cluster, third_party, strategy, sai
     ],
 )
 def test_an_executor_that_fails(make_cluster, third_party, strategy, said) -> None:
-    """The step fails with that sentence, the move is undone, and the process runs as before.
+    """The step fails with this message, the migration is undone, the process keeps running.
 
-    The strategy is failing on the host.
+    The strategy is listed as failing on the host.
     """
     cluster = make_cluster(
         host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
@@ -416,7 +416,7 @@ def test_an_executor_that_fails(make_cluster, third_party, strategy, said) -> No
 def test_an_executor_that_answers_none_to_a_master_that_was_killed(
     make_cluster, third_party
 ) -> None:
-    """The journalled step is given again, fails again, and the move is undone: not for ever."""
+    """The repeated step fails again, so the migration is undone, not repeated forever."""
     cluster = make_cluster(
         host("h0"), host("h1"),
         migration=MigrationSettings({"forgets_slowly": {}, "relaunch": {}}),
@@ -475,7 +475,7 @@ def test_a_launcher_that_cannot_be_used_is_named(cluster) -> None:
 
 
 def test_a_plugin_that_does_not_import_is_listed_as_broken(cluster) -> None:
-    """With what is missing; everything else works."""
+    """The row names the missing module; everything else works."""
     broken = [row for row in cluster.client.list(plugins=True).plugins if row.state == "broken"]
     assert any("no_such_module_at_all" in row.reason for row in broken)
 
@@ -490,7 +490,7 @@ def test_a_plugin_that_does_not_import_is_listed_as_broken(cluster) -> None:
     ids=["policy", "option", "strategy"],
 )
 def test_an_unknown_name_is_refused_at_start(make_cluster, cluster_settings, said) -> None:
-    """With what was given and what there is; exit code 2, no traceback."""
+    """The error has the given and the allowed names; exit code 2, no traceback."""
     cluster = make_cluster()
     cluster.close()
     cluster.cluster = type(cluster.cluster)(**cluster_settings)
@@ -503,7 +503,7 @@ def test_an_unknown_name_is_refused_at_start(make_cluster, cluster_settings, sai
 
 
 def test_an_unknown_probe_is_refused_at_start(make_cluster) -> None:
-    """Likewise by the slave, and no supervisor is left."""
+    """The slave exits with 2 as well, and leaves no supervisor."""
     cluster = make_cluster()
     part = cluster.start_slave(host("h0", probes={"memery": {}}))
     assert part.process.wait(PATIENCE) == 2

@@ -1,4 +1,4 @@
-"""What becomes of processes on real hosts: started in every form, watched, logged, ended."""
+"""Processes on real hosts: forms of start, readiness, restarts, logs and ends."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def cluster(make_shared):
 
 @pytest.fixture
 def ament_prefix(tmp_path):
-    """A ROS package with a Python executable, as `colcon build` would install it."""
+    """Return the prefix of a ROS package with a Python executable, as colcon installs it."""
     marker = tmp_path / "share/ament_index/resource_index/packages/fake_package"
     marker.parent.mkdir(parents=True)
     marker.write_text("")
@@ -50,7 +50,7 @@ def ament_prefix(tmp_path):
 
 
 def test_a_command_runs_to_its_end(cluster) -> None:
-    """A job that exits with 0 has finished; its whole way is on record."""
+    """A job that exits with 0 has finished, and its events are recorded."""
     row = cluster.run(job("echo", "echo", "hello there"))[0]
     assert (row.state, row.exit_code) == ("finished", 0)
     assert cluster.log("echo") == "hello there\n"
@@ -60,7 +60,7 @@ def test_a_command_runs_to_its_end(cluster) -> None:
 
 
 def test_a_module_runs(cluster) -> None:
-    """As `python -m` would run it, with the slave's Python."""
+    """A module runs as by `python -m`, with the slave's Python."""
     spec = ProcessSpec(
         "module", module="json.tool", arguments=("--help",), kind=Kind.JOB, stop=QUICK
     )
@@ -69,7 +69,7 @@ def test_a_module_runs(cluster) -> None:
 
 
 def test_a_service_runs_until_it_is_cancelled(cluster) -> None:
-    """It has a process id, shows what it uses, and is gone afterwards."""
+    """A service has a pid, shows its usage, and is gone after a cancellation."""
     cluster.submit(service("sleeper"))
     row = cluster.wait("sleeper", "running")
     assert alive(row.pid)
@@ -83,7 +83,7 @@ def test_a_service_runs_until_it_is_cancelled(cluster) -> None:
 
 
 def test_a_service_that_exits_has_finished_or_failed(cluster) -> None:
-    """By its exit code; the code is kept."""
+    """The exit code decides, and is kept."""
     good, bad = cluster.run(service("good", "true"), service("bad", "sh", "-c", "exit 7"))
     assert good.state == "finished"
     assert (bad.state, bad.exit_code) == ("failed", 7)
@@ -98,9 +98,9 @@ def test_a_process_killed_by_a_signal_has_failed(cluster) -> None:
 
 
 def test_a_program_that_is_not_there(cluster) -> None:
-    """Each host is tried; in the end the reason names all of them, and what was looked for.
+    """All hosts are tried; the final reason names them, and the missing program.
 
-    The PATH is told only where it is asked for: in the explanation.
+    Only the explanation has the PATH.
     """
     row = cluster.run(job("nothing", "no-such-program"))[0]
     assert row.state == "failed"
@@ -111,7 +111,7 @@ def test_a_program_that_is_not_there(cluster) -> None:
 
 
 def test_a_directory_that_is_not_there(cluster) -> None:
-    """As a program that is not there; the reason names the directory."""
+    """All hosts are tried, as for a missing program; the reason names the directory."""
     row = cluster.run(job("nowhere", "true", working_directory="/no/such/folder"))[0]
     assert "the working directory '/no/such/folder' cannot be entered" in row.reason
     assert {"h0 and h1", "h1 and h0"} & set(row.reason.split(": "))
@@ -122,12 +122,12 @@ def test_a_directory_that_is_not_there(cluster) -> None:
 
 def said(cluster, name: str) -> dict:
     log = cluster.wait_for_log(name, "}\n")
-    # Fast DDS may have said something of its shared memory before.
+    # Fast DDS may have printed a message about its shared memory before.
     return json.loads(next(line for line in log.splitlines() if line.startswith("{")))
 
 
 def test_name_parameters_and_remappings_reach_the_node(cluster, ament_prefix) -> None:
-    """A package's executable is found in the ament index, and is told all that the spec says."""
+    """A package's executable is found in the ament index, and gets everything in the spec."""
     cluster.submit(
         ProcessSpec(
             "talker", package="fake_package", executable="talker", ros=True, namespace="/robot",
@@ -146,7 +146,7 @@ def test_name_parameters_and_remappings_reach_the_node(cluster, ament_prefix) ->
 
 
 def test_the_environment_is_clean(cluster) -> None:
-    """Nothing of the bootstrapper of the wheels; who it is, and what its spec says."""
+    """The environment has no variable of the wheels' bootstrapper, but identity and spec."""
     code = "import json, os; print(json.dumps(dict(os.environ)))"
     cluster.run(python("environment", code, kind=Kind.JOB, environment={"MINE": "yes"}))
     environment = json.loads(cluster.log("environment"))
@@ -159,7 +159,7 @@ def test_the_environment_is_clean(cluster) -> None:
 
 
 def test_no_descriptor_is_inherited(cluster) -> None:
-    """Standard input is empty, the outputs are the log, and there is nothing else."""
+    """Standard input is empty, the outputs are the log, and no other descriptor is open."""
     code = (
         "import os; print(sorted(int(fd) for fd in os.listdir('/proc/self/fd'))[:4], os.read(0, 9))"
     )
@@ -168,7 +168,7 @@ def test_no_descriptor_is_inherited(cluster) -> None:
 
 
 def test_ready_is_this_instance_not_a_namesake(cluster, tmp_path) -> None:
-    """While a stranger of its name is in the graph, a node that is slow to come is not ready."""
+    """A slow node is not ready although a foreign node of its name is in the graph."""
     environment = {**os.environ, **cluster.ros.environment()}
     command = [sys.executable, "-c", NODE, "--ros-args", "-r", "__node:=twin"]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as stranger:
@@ -193,7 +193,7 @@ def test_ready_is_this_instance_not_a_namesake(cluster, tmp_path) -> None:
 
 
 def test_never_ready_is_stopped_and_has_failed(cluster) -> None:
-    """With the reason: what was awaited, and for how long."""
+    """The reason has the awaited node and the timeout."""
     spec = ProcessSpec(
         "mute", command=("sh", "-c", "echo $$; sleep 1000"), ros=True, namespace="/deep",
         readiness=Readiness(timeout=0.7), stop=QUICK,
@@ -209,7 +209,7 @@ def test_never_ready_is_stopped_and_has_failed(cluster) -> None:
 
 
 def test_restarts_with_back_off_until_the_attempts_are_used_up(cluster) -> None:
-    """Each wait doubles, less the fifth by which it may be spread; then it has failed."""
+    """Each delay doubles, less a random fifth; after the last attempt the process has failed."""
     policy = RestartPolicy("on-failure", delay=0.1, max_delay=10.0, factor=2.0, attempts=3)
     code = "import time; print(time.monotonic(), flush=True); raise SystemExit(3)"
     row = cluster.run(python("crashes", code, restart=policy))[0]
@@ -224,7 +224,7 @@ def test_restarts_with_back_off_until_the_attempts_are_used_up(cluster) -> None:
 
 
 def test_on_failure_leaves_a_success_alone(cluster) -> None:
-    """`on-failure` does not restart what exits with 0, `always` does."""
+    """`on-failure` does not restart a process that exits with 0, `always` does."""
     on_failure = RestartPolicy("on-failure", delay=0.05)
     always = RestartPolicy("always", delay=0.05, attempts=2)
     done, again = cluster.run(
@@ -235,7 +235,7 @@ def test_on_failure_leaves_a_success_alone(cluster) -> None:
 
 
 def test_restart_by_hand(cluster) -> None:
-    """What runs is restarted on its host under a new pid; what has ended is queued anew."""
+    """A running process restarts on its host with a new pid; an ended one is queued again."""
     cluster.submit(service("again-by-hand"))
     before = cluster.wait("again-by-hand", "running")
     cluster.client.restart(["again-by-hand"])
@@ -254,11 +254,11 @@ def test_restart_by_hand(cluster) -> None:
     cluster.cancel("again-by-hand")
 
 
-# --- what cannot run --------------------------------------------------------------------------
+# --- missing requirements ---------------------------------------------------------------------
 
 
 def test_a_missing_package_fails_naming_every_host(cluster) -> None:
-    """It is tried on each host; the reason says for each what was looked for and where."""
+    """All hosts are tried; the reason has the missing package for each."""
     row = cluster.run(ProcessSpec("lost", package="no_such_package", executable="x", ros=True))[0]
     assert row.state == "failed"
     for name in ("h0", "h1"):
@@ -268,7 +268,7 @@ def test_a_missing_package_fails_naming_every_host(cluster) -> None:
 
 
 def test_what_one_host_lacks_goes_to_another(make_cluster, ament_prefix) -> None:
-    """Refused where the package is missing, it runs where it is."""
+    """A process refused by a host without the package runs on a host with it."""
     before = os.environ.get("AMENT_PREFIX_PATH")
     cluster = make_cluster(host("bare"))
     os.environ["AMENT_PREFIX_PATH"] = str(ament_prefix)
@@ -301,7 +301,7 @@ while True: time.sleep(10)
 
 
 def test_what_ignores_signals_is_killed(cluster) -> None:
-    """SIGINT, SIGTERM, SIGKILL, in this order, each after its grace."""
+    """SIGINT, SIGTERM, SIGKILL follow in this order, each after its grace period."""
     stop = StopPolicy(interrupt_grace=1.0, terminate_grace=1.0)
     cluster.submit(python("stubborn", STUBBORN, stop=stop))
     pid = cluster.wait("stubborn", "running").pid
@@ -314,7 +314,7 @@ def test_what_ignores_signals_is_killed(cluster) -> None:
 
 
 def test_children_end_with_their_process(cluster) -> None:
-    """The whole family is stopped, grandchildren in sessions of their own included."""
+    """The whole process tree is stopped, even grandchildren in their own sessions."""
     script = "setsid sleep 1000 & sleep 1000 & echo $! ; wait"
     cluster.submit(service("family", "sh", "-c", script))
     child = int(cluster.wait_for_log("family", "\n"))
@@ -327,7 +327,7 @@ def test_children_end_with_their_process(cluster) -> None:
 
 
 def test_a_flood_of_output_is_bounded(cluster) -> None:
-    """A process that writes without end fills no disk and disturbs nobody."""
+    """A process with endless output neither fills the disk nor disturbs other processes."""
     cluster.submit(service("flood", "sh", "-c", "while :; do echo 0123456789012345678901234; done"))
     row = cluster.wait("flood", "running")
     deadline = time.monotonic() + 2.0
@@ -341,7 +341,7 @@ def test_a_flood_of_output_is_bounded(cluster) -> None:
 
 
 def test_reading_and_following_a_log(cluster) -> None:
-    """From the start, from the end, and on from where the last part ended, until it has ended."""
+    """A log can be read from start or end, and followed by offset until the process ends."""
     code = "import sys\nprint('first')\nfor line in open(sys.argv[1]): print(line, end='')"
     fifo = cluster.directory / "fifo"
     os.mkfifo(fifo)
@@ -366,7 +366,7 @@ def test_reading_and_following_a_log(cluster) -> None:
 
 
 def test_no_log_is_said(cluster) -> None:
-    """Of a process that never ran there."""
+    """The error names a process that never ran on the host."""
     with pytest.raises(Refused, match="no log of nobody"):
         cluster.client.read_log("h0", "nobody", 0, 0, 0)
 
@@ -375,7 +375,7 @@ def test_no_log_is_said(cluster) -> None:
 
 
 def test_a_name_in_use_is_refused_with_nothing_queued(cluster) -> None:
-    """Of a batch with one taken name, none is queued; the message names it."""
+    """A batch with one taken name is refused as a whole; the message has the name."""
     cluster.submit(service("taken"))
     with pytest.raises(Refused, match="taken") as refusal:
         cluster.submit(job("fresh", "true"), service("taken"))
@@ -389,7 +389,7 @@ def test_a_name_in_use_is_refused_with_nothing_queued(cluster) -> None:
 
 
 def test_awkward_names_stay_where_they_belong(cluster) -> None:
-    """Whatever a process is called, its files lie in its host's folder."""
+    """Files of a process with any name stay in its host's folder."""
     for name in ("../../escape", "/absolute", "with space", "ümläut", "a\nb", "."):
         assert cluster.run(job(name, "echo", "fine"))[0].state == "finished", name
         assert cluster.log(name) == "fine\n"
@@ -397,7 +397,7 @@ def test_awkward_names_stay_where_they_belong(cluster) -> None:
 
 
 def test_unknown_names_are_refused(cluster) -> None:
-    """Each says what there is not, and where to look."""
+    """Each refusal has the unknown name."""
     for ask in (
         lambda: cluster.client.cancel(["nobody"]),
         lambda: cluster.client.restart(["nobody"]),

@@ -28,7 +28,7 @@ def test_the_examples_of_the_page_do_what_the_page_shows(make_cluster, tmp_path,
 
 
 def test_a_client_without_a_master_says_so_within_its_time_out():
-    """The error names the domain that was looked in."""
+    """The error names the searched domain."""
     domain, claim = claim_domain()
     began = time.monotonic()
     with claim, pytest.raises(NoMaster, match=rf"no master answered within .*domain {domain}, "):

@@ -1,4 +1,4 @@
-"""The record of a real run: replayed the master decides the same; simulated it is nearly that."""
+"""Recordings of a real run: equal decisions in a replay, similar ones in a simulation."""
 
 from __future__ import annotations
 
@@ -32,10 +32,11 @@ def holder(name: str, mib: int):
 
 @pytest.fixture(scope="module")
 def records(make_shared, tmp_path_factory) -> list[Path]:
-    """Of three runs of one master: one that was stopped, one that was killed, one that goes on.
+    """Return the recordings of three runs of one master: stopped, killed, still running.
 
-    In the first, three hosts are filled with 8 to 80 MiB until their limit, as in Fig. 6 of the
-    paper, and there is a job, a move and a cancellation. Each other one begins with what runs.
+    In the first run, three hosts are filled up to their limit with processes of 8 to 80 MiB, as in
+    Fig. 6 of the paper. There is also a job, a migration and a cancellation. Each later run begins
+    with the running processes.
     """
     directory = tmp_path_factory.mktemp("records")
     cluster = make_shared(
@@ -61,9 +62,9 @@ def records(make_shared, tmp_path_factory) -> list[Path]:
 
 
 def _fill(cluster) -> None:
-    """One after the other, once the master knows what the one before uses, until there is no room.
+    """Submit holders until no host has room, each after the usage of the former is known.
 
-    So the run takes some seconds, of which it is known what was used in them.
+    The run therefore takes some seconds of known usage.
     """
     for number, mib in enumerate(SIZES):
         name = f"hold{number:02}"
@@ -91,7 +92,7 @@ def test_told_again_the_core_decides_the_same(records):
 
 
 def test_also_a_master_that_took_over_what_ran(records):
-    """Its state came from the journal, which is in the record; and it was killed."""
+    """The recording of a killed master has its initial state, taken from the journal."""
     with pytest.raises(RecordError, match="cut short at byte"):
         load_record(records[1])
     recording = load_record(records[1], cut=True)
@@ -110,12 +111,12 @@ def test_one_that_still_grows_is_not_taken_for_a_whole_one(records):
 
 
 def test_the_simulation_of_the_run_agrees_with_it(records):
-    """Bounds for a busy machine: what was seen there is several times closer."""
+    """The bounds are for a busy machine: observed deviations are several times smaller."""
     report = carry_out(Request(records[0]))
     recorded, simulated = report.runs
     agreement = report.agreement
     placed = [len(run.outcome.placements) for run in (recorded, simulated)]
-    assert abs(placed[0] - placed[1]) <= 1  # whether the last one still fits is a matter of chance
+    assert abs(placed[0] - placed[1]) <= 1  # by chance the last one fits or not
     assert agreement.processes == max(placed)
     assert agreement.same_counts >= 0.7
     assert agreement.ranked["memory"] < 0.10

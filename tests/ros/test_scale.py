@@ -1,4 +1,4 @@
-"""Tens of simulated slaves on a real master: nothing of what they say gets lost from the books."""
+"""Tens of simulated slaves on a real master, which counts every reading."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def scale(*words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def report() -> dict:
-    """What the benchmark says of one short run."""
+    """Return the benchmark's report of one short run."""
     ended = scale("--slaves", str(SLAVES), "--hz", str(HZ), "--seconds", "4", "--processes", "2")
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout.splitlines()[-1])
 
 
 def test_every_slave_is_heard_all_the_time(report) -> None:
-    """Also those whose readings hardly change."""
+    """Slaves whose readings hardly change keep their contact, too."""
     assert report["slaves"] == report["hosts_heard"] == SLAVES
 
 
 def test_every_cycle_is_accounted_for_or_missed(report) -> None:
-    """What the slaves say they did and what the master counts are the same, edges aside.
+    """Cycles reported by the slaves equal those counted by the master, except at the edges.
 
-    The two windows differ by up to a second, and on a busy machine cycles are left out.
+    The two windows differ by up to a second, and on a busy machine cycles are skipped.
     """
     counted = report["received_per_s"] + report["missed"] / report["seconds"]
     assert counted == pytest.approx(report["offered_per_s"], rel=0.4)
@@ -48,32 +48,32 @@ def test_every_cycle_is_accounted_for_or_missed(report) -> None:
 
 
 def test_quiet_cycles_cost_no_message(report) -> None:
-    """Readings that hardly move go out twice less often than they are made, never more seldom."""
+    """Nearly constant readings are sent at half the rate of cycles, never more rarely."""
     assert 0.45 < report["messages_per_cycle"] < 0.8
 
 
 def test_each_request_is_answered(report) -> None:
-    """The assignment reaches the slave that it is meant for, among readers of all."""
+    """An assignment reaches its slave, although all slaves read the topic."""
     assert report["request_process_answered"] == report["request_process_asked"]
     assert 0.0 < report["request_process_p50_ms"] <= report["request_process_p99_ms"]
 
 
 def test_the_costs_are_of_one_piece(report) -> None:
-    """CPU by slave-cycle is that of the master's process over the cycles of the same time."""
+    """CPU per slave cycle is that of the master over the cycles of the same period."""
     assert report["us_per_message"] == pytest.approx(
         1e6 * report["master_cpu"] / report["received_per_s"]
     )
 
 
 def test_what_it_was_measured_through_is_told(report) -> None:
-    """As on real hosts where that is allowed: UDP alone."""
+    """The transport is that of real hosts, UDP only, where permitted."""
     rights = int(Path("/proc/self/status").read_text().split("CapEff:")[1].split()[0], 16)
     network = "UDPv4, in a network namespace" if rights >> 21 & 1 else "default, LOCALHOST"
     assert report["transports"] == network
 
 
 def test_a_run_that_fails_says_why_in_its_last_line() -> None:
-    """Slaves that are not registered in time, for one."""
+    """A failed start, here by a timeout of the registration, is explained in the last line."""
     ended = scale("--slaves", "3", "--timeout", "0.001")
     assert ended.returncode == 2
     assert "of 2 registered in 0.001 s" in ended.stderr
@@ -84,7 +84,7 @@ def test_a_run_that_fails_says_why_in_its_last_line() -> None:
 
 
 def test_a_signal_ends_all_that_it_has_started(tmp_path) -> None:
-    """It says which signal, and leaves none of its processes."""
+    """The benchmark names the signal, and leaves none of its processes."""
     process = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.scale", "--slaves", "4", "--settle", "100"],
         cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
@@ -104,7 +104,7 @@ def test_a_signal_ends_all_that_it_has_started(tmp_path) -> None:
 
 @pytest.mark.parametrize("slaves", [1, 10])
 def test_readings_that_move_all_go_out(slaves) -> None:
-    """A reading that has moved is not kept back (at its bounds it does not move)."""
+    """A changed reading is always sent (a reading at its bounds does not change)."""
     ended = scale("--slaves", str(slaves), "--seconds", "4", "--processes", "1", "--step", "0.1")
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout.splitlines()[-1])["messages_per_cycle"] > 0.9
@@ -120,7 +120,7 @@ def test_readings_that_move_all_go_out(slaves) -> None:
     ],
 )
 def test_what_makes_no_sense_is_refused(words, said) -> None:
-    """Before anything is started, with one line."""
+    """Bad arguments are refused with one line, before anything starts."""
     ended = scale(*words)
     assert ended.returncode == 2
     assert said in ended.stderr.splitlines()[-1]

@@ -1,4 +1,4 @@
-"""One drive, mapped live by a SLAM that is sent from host to host ten times meanwhile."""
+"""One drive, mapped live by a SLAM that migrates ten times in its course."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from rosrm_examples.observer import Observer
 from tests.ros.clusters import host, wait_until
 
 MOVES = 10
-#: Seconds that the drive takes, if nobody ends it: so much is needed for ten moves, one after
-#: another, on a busy machine.
+#: Seconds of the complete drive: on a busy machine ten consecutive migrations take so long.
 LONG_S = 90.0
 
 
@@ -48,9 +47,9 @@ def player(drive: Drive, hz: float, report: Path) -> ProcessSpec:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
-    """Every scan is mapped once, and the trajectory is that of the SLAM that stays where it is.
+    """Every scan is mapped once, and the trajectory equals that of a SLAM that stays.
 
-    The drive ends soon after the last move.
+    The test ends the drive soon after the last migration.
     """
     cluster = make_cluster(
         host("left"), host("right"),
@@ -69,12 +68,12 @@ def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
             assert cluster.process("player").state == "running", "the drive was over too early"
         enough = min(len(observer.heard) + 3, len(drive))
         wait_until(lambda: len(observer.heard) >= enough, "scans are mapped after the last move")
-        with suppress(Refused):  # it was at its end anyway
+        with suppress(Refused):  # it was at its end already
             cluster.client.cancel(["player"])
         cluster.ended("player")
         sent = json.loads(report.read_text())["scans_sent"]
         wait_until(lambda: len(observer.heard) >= sent, "all scans are mapped")
-        time.sleep(1.0)  # one more would be one too many
+        time.sleep(1.0)  # one further scan would be one too many
         heard = list(observer.heard)
     cluster.cancel("slam")
     driven = drive.part(0, sent)
@@ -85,7 +84,7 @@ def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
 
 
 def move(cluster, moves: int) -> None:
-    """Send the SLAM to the other host; until it is there, for the so manieth time."""
+    """Migrate the SLAM to the other host; wait until the number of migrations is `moves`."""
     there = {"left": "right", "right": "left"}[cluster.process("slam").host]
     cluster.client.migrate("slam", there)
     view = cluster.wait_until(

@@ -1,4 +1,4 @@
-"""The executor `handoff_watch` against real publishers: it hears the second, whatever its QoS."""
+"""The executor `handoff_watch`, which waits for a second real publisher of any QoS."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TOPIC = "/watched/state"
 
 @pytest.fixture(autouse=True)
 def domain(monkeypatch):
-    """One that no cluster of the tests has."""
+    """Claim a domain that no cluster of the tests uses."""
     number, claim = claim_domain()
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     with claim:
@@ -35,7 +35,7 @@ def domain(monkeypatch):
 
 @contextlib.contextmanager
 def publishing(name: str, qos: QoSProfile = LATCHED, kind: type = Int64, period: float = 0.02):
-    """A node that publishes its state in every cycle, in a participant of its own."""
+    """Run a node that publishes its state in every cycle, in its own participant."""
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = Node(name, context=context)
@@ -55,7 +55,7 @@ def publishing(name: str, qos: QoSProfile = LATCHED, kind: type = Int64, period:
 
 
 def listen(timeout: float = 20.0):
-    """As the slave does it."""
+    """Watch the topic as the slave does."""
     return watch(arguments("std_msgs/msg/Int64", timeout))
 
 
@@ -66,7 +66,7 @@ def arguments(kind: str, timeout: float):
 
 @pytest.mark.parametrize("qos", [LATCHED, LOSSY])
 def test_a_second_publisher_is_heard(qos):
-    """And not before it has spoken."""
+    """The watch ends only after the first message of the second publisher."""
     heard = []
     with publishing("source", qos):
         thread = threading.Thread(target=lambda: heard.append(listen()))
@@ -81,7 +81,7 @@ def test_a_second_publisher_is_heard(qos):
 
 
 def test_a_second_publisher_that_was_first_is_heard():
-    """A watch that begins late: both speak already."""
+    """A watch that begins late finds both publishers active."""
     with publishing("source"), publishing("destination"):
         time.sleep(1.0)
         assert listen()["heard"] > 1
@@ -109,7 +109,7 @@ def test_an_unknown_type_is_said():
 
 
 def test_another_publisher_is_not_taken_for_the_destination():
-    """A bag that is played, say: nobody could tell whether the destination speaks."""
+    """A third publisher, e.g. a played bag, hides the destination's messages: an error."""
     with (
         publishing("source"), publishing("player"),
         pytest.raises(ValueError, match="/watched/state is also published by player"),

@@ -1,4 +1,4 @@
-"""Demos as a user runs them, and proof that they leave nothing behind."""
+"""Demo runs as a user starts them, with a check that nothing is left behind."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ SHARED_MEMORY = re.compile(r"/dev/shm/\S+")
 
 
 class Run:
-    """A demo that was started; everything that comes of it carries a mark in its environment.
+    """A running demo, whose processes all carry a mark in their environment.
 
     Args:
-        module: of the demo.
-        out: folder that it writes to.
+        module: module of the demo.
+        out: output folder.
     """
 
     def __init__(self, module: str, out: Path, *arguments: str) -> None:
@@ -43,19 +43,19 @@ class Run:
         self.began = time.time()
 
     def processes(self) -> list[int]:
-        """All that live, the demo itself included."""
+        """Return the pids of all living processes of the run, including the demo."""
         found = []
         for entry in Path("/proc").iterdir():
             if entry.name.isdigit():
                 try:
                     if self.mark in (entry / "environ").read_bytes().split(b"\0"):
                         found.append(int(entry.name))
-                except OSError:  # it has ended meanwhile
+                except OSError:  # it has ended since
                     continue
         return found
 
     def look(self) -> None:
-        """Note the shared memory that our processes have mapped."""
+        """Record the shared memory that the processes of the run have mapped."""
         for pid in self.processes():
             try:
                 self.shared.update(SHARED_MEMORY.findall(Path(f"/proc/{pid}/maps").read_text()))
@@ -63,7 +63,7 @@ class Run:
                 continue
 
     def wait_for(self, what: str, seconds: float = 40.0) -> None:
-        """Wait until a line of the progress says something."""
+        """Wait until a line of the progress contains `what`."""
         assert self.demo.stdout is not None
         deadline = time.monotonic() + seconds
         for line in self.demo.stdout:
@@ -73,7 +73,7 @@ class Run:
         pytest.fail(f"the demo ended before {what!r}: {self.demo.communicate()[1]}")
 
     def end(self, seconds: float) -> tuple[int, str, str]:
-        """Wait for its end; exit status, standard output, standard error."""
+        """Wait for the end; return exit status, standard output and standard error."""
         deadline = time.monotonic() + seconds
         while self.demo.poll() is None and time.monotonic() < deadline:
             self.look()
@@ -82,15 +82,15 @@ class Run:
         return self.demo.returncode, output, errors
 
     def check_clean(self) -> None:
-        """No process and no shared memory is left."""
+        """Check that no process and no shared memory is left."""
         assert self.processes() == []
         assert [path for path in sorted(self.shared) if self.left(Path(path))] == []
 
     def left(self, path: Path) -> bool:
-        """A file of ours alone, and newer than the demo.
+        """Return True if a file belongs to this run only and is newer than the demo.
 
-        The tracing of ROS and the mutexes of the ports keep theirs on purpose, and the ports from
-        7000 on are shared by all DDS participants of the machine, whatever their domain.
+        ROS tracing and the port mutexes keep their files on purpose. All DDS participants of the
+        machine share the ports from 7000 on, in every domain.
         """
         if re.match(r"lttng|sem\.fastrtps_port|fastrtps_port70", path.name) or not path.exists():
             return False
@@ -111,7 +111,7 @@ def read_lines(path: Path) -> list[dict]:
 
 @contextmanager
 def runs_of(module: str, out: Path) -> Iterator[Callable[..., Run]]:
-    """Starts a demo with the arguments given; what is left of it at the end is killed."""
+    """Yield a function that starts a demo; kill its remaining processes at the end."""
     started: list[Run] = []
 
     def start(*arguments: str) -> Run:

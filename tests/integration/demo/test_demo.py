@@ -1,4 +1,4 @@
-"""The demo as a user runs it: what it leaves, and that it leaves nothing else."""
+"""The demo as a user runs it: its output files, and no other traces."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_short_demo_fills_the_hosts_maps_the_drive_and_migrates(start: Start) 
 def test_ctrl_c_ends_everything_and_says_nothing_but_so(start: Start) -> None:
     run = start("--drive", "street:40", "--pieces", "4")
     run.wait_for("pieces")  # the first line
-    run.wait_for("holder")  # they run
+    run.wait_for("holder")  # the pieces run
     run.look()
     run.demo.send_signal(signal.SIGINT)
     status, _, errors = run.end(seconds=30.0)
@@ -95,7 +95,7 @@ def test_a_piece_that_fails_ends_the_demo_and_names_its_log(start: Start, tmp_pa
 
 
 def write_thinned(path: Path, street: Street) -> None:
-    """A drive as the thinned archives of KITTI have it."""
+    """Write a drive in the format of the thinned KITTI archives."""
     import numpy as np
 
     scans = [street.scan(number) for number in range(len(street.times))]

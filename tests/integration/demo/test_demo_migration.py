@@ -1,4 +1,4 @@
-"""The migration demo as a user runs it: the SLAM moves in mid-drive and no scan is lost."""
+"""The migration demo as a user runs it: the SLAM moves in mid-drive without losing a scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the examples' processes share."""
+"""Environment shared by the tests of the example processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The examples as real processes: the ROS 2 nodes that map, and the process that holds memory."""
+"""The examples as real processes: the ROS 2 mapping nodes, and the memory holder."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rosrm_examples.pieces import load_piece
 
 Start = Callable[..., subprocess.Popen[str]]
 
-#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
 PATIENCE = 30.0
 
 
 @pytest.fixture
 def domain() -> Iterator[int]:
-    """A ROS domain that no other test on this machine has."""
+    """Claim a ROS domain that no other test on this machine uses."""
     number, claim = claim_domain()
     with claim:
         yield number
@@ -32,7 +32,7 @@ def domain() -> Iterator[int]:
 
 @pytest.fixture
 def start(domain: int) -> Iterator[Start]:
-    """Starts modules of the examples; whatever is left at the end is killed."""
+    """Yield a function that starts example modules; kill the remaining ones at the end."""
     started: list[subprocess.Popen[str]] = []
     environment = {
         **os.environ,
@@ -58,7 +58,7 @@ def start(domain: int) -> Iterator[Start]:
 
 
 class Listener:
-    """A ROS node of the test: it hears the odometry, and sees who is there."""
+    """A ROS node that receives odometry and lists the nodes of the graph."""
 
     def __init__(self, topic: str, domain: int) -> None:
         rclpy = pytest.importorskip("rclpy")
@@ -73,11 +73,11 @@ class Listener:
         self._subscription = self._node.create_subscription(Odometry, topic, self.heard.append, 100)
 
     def is_matched(self) -> bool:
-        """Whether somebody who speaks is known: what is said before is not heard."""
+        """Return True if a publisher is discovered; earlier messages do not arrive."""
         return bool(self._subscription.get_publisher_count())
 
     def wait_for(self, count: int, seconds: float = PATIENCE) -> None:
-        """Until so many messages have come; fails when they do not."""
+        """Wait until `count` messages have arrived; fail after `seconds`."""
         deadline = time.monotonic() + seconds
         while len(self.heard) < count:
             left = deadline - time.monotonic()
@@ -85,7 +85,7 @@ class Listener:
             self._executor.spin_once(timeout_sec=left)
 
     def sees(self, name: str) -> bool:
-        """Whether a node of this name is there."""
+        """Return True if a node of this name is in the graph."""
         return name in self._node.get_node_names()
 
     def close(self) -> None:
@@ -95,7 +95,7 @@ class Listener:
 
 @pytest.fixture
 def listen(domain: int) -> Iterator[Callable[[str], Listener]]:
-    """Makes listeners, and ends them. They are there before what they listen to."""
+    """Yield a function that creates listeners, which must exist before their publishers."""
     made: list[Listener] = []
 
     def make(topic: str) -> Listener:
@@ -108,7 +108,7 @@ def listen(domain: int) -> Iterator[Callable[[str], Listener]]:
 
 
 def peak_mb(process: subprocess.Popen[str]) -> float:
-    """The most private memory that a process was seen to have, MB; waits for its end."""
+    """Wait for a process to end; return the highest private memory seen, in MB."""
     peak = 0.0
     while process.poll() is None:
         peak = max(peak, resident_mb(process))
@@ -117,13 +117,13 @@ def peak_mb(process: subprocess.Popen[str]) -> float:
 
 
 def resident_mb(process: subprocess.Popen[str]) -> float:
-    """The private memory that a process really has, MB."""
+    """Return the private resident memory of a process, in MB."""
     pages = Path(f"/proc/{process.pid}/statm").read_text().split()
     return (int(pages[1]) - int(pages[2])) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    """Waits for a condition; fails when it does not come true in time."""
+    """Wait until a condition holds; fail after `seconds`."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it did not come true in time"
@@ -131,7 +131,7 @@ def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE) -> None
 
 
 def test_map_piece_maps_its_piece(start: Start, tmp_path: Path) -> None:
-    """The node writes its piece, tells how far it is, and exits with 0."""
+    """The node writes its piece, prints its progress, and exits with 0."""
     pytest.importorskip("rclpy")
     arguments = ["--drive", "street:30", "--piece", "2", "--of", "2", "--out", str(tmp_path)]
     node = start("map_piece", *arguments, "--ros-args", "-r", "__node:=mapper")
@@ -172,7 +172,7 @@ def test_map_piece_stops_cleanly(start: Start, tmp_path: Path, stop: signal.Sign
 
 
 def test_map_piece_says_what_it_cannot_use(start: Start, tmp_path: Path) -> None:
-    """A piece that is not there ends in one line and exit status 2."""
+    """A piece number out of range gives one line and exit status 2."""
     pytest.importorskip("rclpy")
     arguments = ["--drive", "street:30", "--piece", "3", "--of", "2", "--out", str(tmp_path)]
     node = start("map_piece", *arguments)
@@ -185,7 +185,7 @@ def test_map_piece_says_what_it_cannot_use(start: Start, tmp_path: Path) -> None
 def test_a_played_drive_is_mapped_as_one_that_is_read(
     start: Start, listen, tmp_path: Path, state: str
 ) -> None:
-    """Without rosrm: player and SLAM as two nodes, poses and map to the last bit."""
+    """Player and SLAM without rosrm give the same poses and map as a read drive, bit for bit."""
     listener = listen("/odometry")
     from rosrm_examples.drives import load_drive
     from rosrm_examples.map_part import load_parts
@@ -201,18 +201,18 @@ def test_a_played_drive_is_mapped_as_one_that_is_read(
     assert "10/20 scans" in output
     assert "sent 20 of 20 scans" in output
     assert json.loads(report.read_text()) == {"scans_sent": 20}
-    listener.wait_for(20)  # each scan is mapped before its pose is published
+    listener.wait_for(20)  # a scan is mapped before its pose is published
     slam.send_signal(signal.SIGINT)
     output, errors = slam.communicate(timeout=PATIENCE)
     assert (slam.returncode, errors) == (0, "")
-    # Fast DDS may have said something of its shared memory before.
+    # Fast DDS may have printed a message about its shared memory before.
     assert output.endswith(f"wrote {tmp_path / 'parts' / 'slam.npz'}\n")
     (part,) = load_parts(tmp_path / "parts")
     assert part.poses.tolist() == unmigrated_poses(load_drive("street:20")).tolist()
 
 
 def test_a_player_waits_for_its_listeners_and_not_for_ever(start: Start) -> None:
-    """It says whom it waited for; a signal ends it as well."""
+    """The player names the missing subscribers after its timeout; a signal ends it, too."""
     pytest.importorskip("rclpy")
     player = start("player", "--drive", "street:3", "--wait", "0.3")
     output, errors = player.communicate(timeout=PATIENCE)
@@ -227,7 +227,7 @@ def test_a_player_waits_for_its_listeners_and_not_for_ever(start: Start) -> None
 
 
 def test_the_slam_node_says_what_it_cannot_use(start: Start) -> None:
-    """One line that names the parameter and what is allowed."""
+    """The error is one line that names the parameter and the allowed values."""
     pytest.importorskip("rclpy")
     slam = start("slam_node", "--ros-args", "-p", "state:=half")
     _, errors = slam.communicate(timeout=PATIENCE)
@@ -237,7 +237,7 @@ def test_the_slam_node_says_what_it_cannot_use(start: Start) -> None:
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_holder_holds_what_it_is_told_until_a_signal(start: Start, stop: signal.Signals) -> None:
-    """The memory is really there, beyond the process's own, and a signal ends it with 0."""
+    """The process holds 60 MB more than an empty holder, and a signal ends it with 0."""
     empty, full = start("holder", "--mb", "0"), start("holder", "--mb", "60")
     wait_until(lambda: abs(resident_mb(full) - resident_mb(empty) - 60) < 3)
     full.send_signal(stop)
@@ -245,14 +245,14 @@ def test_holder_holds_what_it_is_told_until_a_signal(start: Start, stop: signal.
 
 
 def test_holder_grows_and_ends_by_itself(start: Start) -> None:
-    """Memory grows at the rate asked for, and the process ends with 0 when its time is over."""
+    """Memory grows at the requested rate, and the process ends with 0 after its time."""
     holder = start("holder", "--mb", "10", "--grow", "40", "--seconds", "1.5")
     wait_until(lambda: resident_mb(holder) > 45)
     assert (holder.wait(timeout=PATIENCE), holder.communicate()) == (0, ("", ""))
 
 
 def test_holder_grows_up_to_its_most(start: Start) -> None:
-    """And holds that: it never had more."""
+    """The process grows to `--most`, holds that, and never has more."""
     empty = start("holder", "--mb", "0", "--seconds", "0.5")
     holder = start("holder", "--mb", "10", "--grow", "100", "--most", "40", "--seconds", "1.5")
     least = peak_mb(empty)
@@ -289,7 +289,7 @@ def test_holder_refuses_what_is_no_size(start: Start, size: str) -> None:
 
 
 def test_holder_says_when_there_is_no_more_memory(start: Start) -> None:
-    """More than the machine can ever give ends in one line, not in a traceback."""
+    """A size beyond the machine's memory gives one line, not a traceback."""
     holder = start("holder", "--mb", "1e12")
     _, errors = holder.communicate(timeout=PATIENCE)
     assert holder.returncode == 1

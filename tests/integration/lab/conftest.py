@@ -1,4 +1,4 @@
-"""Real virtual hosts, and proof that nothing of them is left on the machine."""
+"""Labs of real virtual hosts, with a check that nothing of them is left on the machine."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import pytest
 from rosrm.errors import LabError
 from rosrm_lab import MIB, Lab, needs, store, uniform
 
-#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
 PATIENCE = 30.0
 
 
 def why_not() -> str:
-    """What is missing here for a lab; "" when nothing is.
+    """Return the missing requirement of a lab; "" if all are met.
 
-    It makes none: a lab that cannot be made where nothing is missing is an error, no reason to
-    skip.
+    The function creates no lab. If nothing is missing, a lab that cannot be created is an error, no
+    reason to skip.
     """
     from rosrm_lab import groups
 
@@ -43,14 +43,14 @@ def lab_is_possible():
 
 
 def remains(lab: str) -> dict[str, set[str]]:
-    """All of this machine that a lab could leave behind; other labs may be made meanwhile."""
+    """Return all traces on this machine that a lab could leave; other labs may appear any time."""
     losetup = ["losetup", "-n", "-O", "BACK-FILE"]
     loops = subprocess.run(losetup, capture_output=True, text=True, check=True).stdout.splitlines()
     mounts = Path("/proc/self/mounts").read_text().splitlines()
     commands = {_text(path) for path in Path("/proc").glob("[0-9]*/cmdline")}
     return {
         "namespaces": {path.name for path in Path("/run/netns").glob(f"rosrm-lab:{lab}*")},
-        # pyroute2, as ip does, makes /run/netns a mount point with the first namespace, for good.
+        # pyroute2, like `ip`, makes /run/netns a mount point with the first namespace, permanently.
         "mounts": {
             line for line in mounts if lab in line or not {"rosrm-lab", "/run/netns"} & _words(line)
         },
@@ -62,8 +62,8 @@ def remains(lab: str) -> dict[str, set[str]]:
 
 
 def _below(root: Path, start: str) -> set[str]:
-    """Return the paths below a folder whose name starts so."""
-    # `os.walk` skips a folder of another lab that is removed meanwhile; `rglob` raises.
+    """Return the paths below a folder whose name starts with `start`."""
+    # `os.walk` skips a folder of another lab that is removed during the walk; `rglob` raises.
     return {
         f"{folder}/{name}"
         for folder, folders, files in os.walk(root)
@@ -73,7 +73,7 @@ def _below(root: Path, start: str) -> set[str]:
 
 
 def _words(line: str) -> set[str]:
-    """What a mount is about: its target, and whether it is some lab's."""
+    """Return the target of a mount, and "rosrm-lab" if the mount belongs to a lab."""
     return {line.split()[1]} | ({"rosrm-lab"} if "rosrm-lab" in line else set())
 
 
@@ -86,7 +86,7 @@ def _text(path: Path) -> str:
 
 @pytest.fixture
 def name():
-    """Of a lab, of which nothing is left after the test."""
+    """Yield the name of a lab; check after the test that nothing of the lab is left."""
     chosen = f"t-{uuid.uuid4().hex[:8]}"
     before = remains(chosen)
     yield chosen
@@ -96,7 +96,7 @@ def name():
 
 @pytest.fixture
 def lab(name):
-    """Two small hosts, and one without a quota."""
+    """Yield a lab of two small hosts, and of one without a quota."""
     from rosrm_lab import HostPlan
 
     hosts = uniform(2, memory=128 * MIB, cpu=0.5, disk=32 * MIB)

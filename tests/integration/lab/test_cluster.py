@@ -1,4 +1,4 @@
-"""A real master and real slaves on virtual hosts: the lab's limits are what they see."""
+"""A real master and real slaves on virtual hosts, whose resources are the lab's limits."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import pytest
 from rosrm_lab import DATA, GIB, MIB, HostPlan, Lab, uniform
 
 ROSRM = str(Path(sys.executable).parent / "rosrm")
-#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
 PATIENCE = 60.0
 MEMORY = 512 * MIB
-#: What `rosrm` says while the master is just starting.
+#: Exit status of `rosrm` while the master is starting.
 NO_MASTER_YET = 3
 
 
@@ -47,7 +47,7 @@ class Cluster:
         return {row["name"]: row for row in json.loads(self.ask("ps", "--json"))}
 
     def wait(self, what: str, look, condition):
-        """Look until it is so; says what there was instead."""
+        """Repeat `look` until its result meets the condition; a failure shows the last result."""
         deadline = time.monotonic() + PATIENCE
         while True:
             seen = look()
@@ -74,7 +74,7 @@ class Cluster:
 
 @pytest.fixture
 def cluster(name, tmp_path):
-    """Two hosts of half a gigabyte and half a core each, and a desk without a quota."""
+    """Yield a cluster of two hosts (512 MiB, half a core each), and a desk without a quota."""
     hosts = uniform(2, memory=MEMORY, cpu=0.5, disk=64 * MIB)
     with Lab(name, [*hosts, HostPlan("desk", disk=64 * MIB)]) as lab:
         made = Cluster(lab, tmp_path)
@@ -95,9 +95,9 @@ def holding(name: str, megabytes: int) -> dict:
 
 @pytest.mark.timeout(300)
 def test_processes_go_to_the_hosts_that_have_room(cluster):
-    """Slaves without any file show the lab host as the whole; two large processes need two hosts.
+    """Slaves without a host file measure the lab host; two large processes get two hosts.
 
-    Then a host is cut off and healed, loses its power and comes back: its service comes back too.
+    Then one host is disconnected and healed, loses its power and boots: its service restarts.
     """
     for host in ("host1", "host2"):
         cluster.start(host, "slave")
@@ -145,7 +145,7 @@ def test_processes_go_to_the_hosts_that_have_room(cluster):
 
 @pytest.mark.timeout(300)
 def test_a_slave_beside_the_quota_of_its_jobs(cluster):
-    """The jobs have the host's limits, the slave has none and measures those of the jobs."""
+    """The lab's limits apply to the jobs alone; the slave outside measures the jobs' group."""
     lab, state = cluster.lab, f"{DATA}/slave"
     lab.supervise("host1", state)
     probes = {resource: {"group": lab.group("host1")} for resource in ("cpu", "memory")}
@@ -176,7 +176,7 @@ def _command(pid: int) -> str:
 
 @pytest.mark.timeout(300)
 def test_ten_hosts_find_one_master(name, tmp_path):
-    """As the evaluation needs them: discovery by multicast, and nobody is missed."""
+    """Ten slaves find the master by multicast discovery, as in the evaluation."""
     hosts = uniform(10, memory=GIB // 2, disk=32 * MIB)
     with Lab(name, [*hosts, HostPlan("desk", disk=64 * MIB)]) as lab:
         cluster = Cluster(lab, tmp_path)

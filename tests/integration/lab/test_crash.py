@@ -1,4 +1,4 @@
-"""Whatever is killed, nothing of a lab stays behind."""
+"""Kills, signals and errors at each step of a lab: nothing stays on the machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PATIENCE = 30.0
 ROSRM = Path(sys.executable).parent / "rosrm"
 SIZES = ["-n", "2", "--memory", "64MiB", "--cpu", "0.5", "--disk", "16MiB"]
 
-#: Makes a lab, and kills itself before or after the n-th call of a function on the way.
+#: Creates a lab, and kills itself before or after the n-th call of a given function.
 KILLED_AT = """
 import importlib, os, signal, sys
 from rosrm_lab import MIB, Lab, uniform
@@ -48,17 +48,17 @@ STEPS = [
     ("rosrm_lab.disks", "make", "after", 1),
     ("rosrm_lab.network", "plug_in", "before", 2),
     ("rosrm_lab.network", "plug_in", "after", 1),
-    ("rosrm_lab.host", "_until_ready", "before", 1),  # the host is just booting
+    ("rosrm_lab.host", "_until_ready", "before", 1),  # the host is booting
     ("rosrm_lab.host", "_until_ready", "after", 1),
     ("rosrm_lab.host", "_last_words", "after", 2),
     ("rosrm_lab.store", "write", "before", 2),
-    ("rosrm_lab.store", "write", "after", 2),  # complete, but nobody was told
+    ("rosrm_lab.store", "write", "after", 2),  # complete, but `up` has not returned
 ]
 
 
 @pytest.mark.parametrize(("module", "function", "moment", "count"), STEPS)
 def test_a_killed_up_is_removed_wholly(name, module, function, moment, count):
-    """At each of its steps; by `down` as well as by the next `up`."""
+    """Both `down` and the next `up` remove what a `lab up` killed at any step left."""
     before = remains(name)
     command = [sys.executable, "-c", KILLED_AT, name, module, function, moment, str(count)]
     killed = subprocess.run(command, check=False, timeout=PATIENCE * 2)
@@ -70,7 +70,7 @@ def test_a_killed_up_is_removed_wholly(name, module, function, moment, count):
 
 
 def test_a_second_up_removes_what_a_killed_one_left(name):
-    """And makes its own lab."""
+    """The second `up` also creates its own lab."""
     command = [sys.executable, "-c", KILLED_AT, name, "rosrm_lab.host", "_last_words", "after", "1"]
     subprocess.run(command, check=False, timeout=PATIENCE)
     with pytest.raises(LabError, match="is incomplete: `rosrm lab up` makes it again"):
@@ -83,7 +83,7 @@ def test_a_second_up_removes_what_a_killed_one_left(name):
 
 
 def test_a_lab_whose_owner_was_killed_was_left_behind(name):
-    """The next one of its name takes its place, although it was complete."""
+    """The next lab of the same name replaces a complete one whose owner was killed."""
     code = (
         "import os, signal, sys\nfrom rosrm_lab import Lab, MIB, uniform\n"
         "with Lab(sys.argv[1], uniform(1, disk=16 * MIB)) as lab:\n"
@@ -97,7 +97,7 @@ def test_a_lab_whose_owner_was_killed_was_left_behind(name):
 
 
 def test_a_lab_that_fails_while_it_is_made_leaves_nothing(name, monkeypatch):
-    """Here the second disk cannot be made."""
+    """A failure to create the second disk removes the first host, too."""
     real = disks.make
 
     def fails(image, host):
@@ -113,12 +113,12 @@ def test_a_lab_that_fails_while_it_is_made_leaves_nothing(name, monkeypatch):
 
 
 class Stopped(Exception):
-    """Raised by a signal, as programs do that end in good order."""
+    """An exception raised by a signal handler, as in programs that end cleanly."""
 
 
 @pytest.fixture
 def stopped_at(monkeypatch):
-    """Sends this process a signal, which raises, before or after the first call of a function."""
+    """Yield a function that arms a raising signal at the first call of another function."""
 
     def stop(*_):
         raise Stopped
@@ -154,7 +154,7 @@ REMOVAL = [
 
 @pytest.mark.parametrize(("module", "function", "moment"), REMOVAL)
 def test_a_signal_during_the_removal_leaves_nothing(name, stopped_at, module, function, moment):
-    """It is passed on when the lab has gone."""
+    """The signal's exception is raised after the removal of the lab."""
     before = remains(name)
     with pytest.raises(Stopped), Lab(name, uniform(1, disk=16 * MIB)):
         stopped_at(module, function, moment)
@@ -162,7 +162,7 @@ def test_a_signal_during_the_removal_leaves_nothing(name, stopped_at, module, fu
 
 
 def test_a_signal_while_a_failed_attempt_is_removed_leaves_nothing(name, stopped_at, monkeypatch):
-    """The lab could not be made, and then a signal comes."""
+    """A signal arrives during the removal of a lab that could not be created."""
     before = remains(name)
 
     def fails(image, host):
@@ -176,7 +176,7 @@ def test_a_signal_while_a_failed_attempt_is_removed_leaves_nothing(name, stopped
 
 
 def test_what_a_killed_lab_holds_does_not_hinder_the_next(name, monkeypatch):
-    """It is removed before memory is looked at, also where there is too little even then."""
+    """The old lab is removed before the memory check, even if that check fails afterwards."""
     before = remains(name)
     command = [sys.executable, "-c", KILLED_AT, name, "rosrm_lab.host", "_last_words", "after", "1"]
     subprocess.run(command, check=False, timeout=PATIENCE)
@@ -188,7 +188,7 @@ def test_what_a_killed_lab_holds_does_not_hinder_the_next(name, monkeypatch):
 
 
 def test_a_lab_that_is_up_is_said_to_be_up(lab, monkeypatch):
-    """Even where a second one of its size would find too little memory."""
+    """The error names the existing lab even if memory for a second one is missing."""
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=MIB))
     with pytest.raises(LabError, match="is up already"):
         Lab(lab.name, uniform(1, memory=64 * MIB, disk=16 * MIB)).up()
@@ -197,7 +197,7 @@ def test_a_lab_that_is_up_is_said_to_be_up(lab, monkeypatch):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_file_that_cannot_be_written_is_one_clear_error(name, monkeypatch, count):
-    """When the lab is begun, and when it is complete; nothing is left."""
+    """The write fails at the beginning or at the completion of the lab; nothing is left."""
     real, calls = store.write, []
 
     def full(record):
@@ -214,7 +214,7 @@ def test_a_file_that_cannot_be_written_is_one_clear_error(name, monkeypatch, cou
 
 
 def test_a_kernel_without_bridges_is_one_clear_error(name, monkeypatch):
-    """Here it is asked for a kind of interface that no kernel has; nothing is left."""
+    """The test requests an interface kind that no kernel has; nothing is left."""
     from rosrm_lab import network
 
     class Without(network.IPRoute):
@@ -231,7 +231,7 @@ def test_a_kernel_without_bridges_is_one_clear_error(name, monkeypatch):
 
 
 def test_a_host_that_cannot_boot_says_why(name, monkeypatch):
-    """The words of what failed, and nothing is left."""
+    """The error contains the failed command, and nothing is left."""
     monkeypatch.setattr(disks, "make", lambda image, host: (
         image.parent.mkdir(parents=True, exist_ok=True), image.write_bytes(bytes(MIB))
     ))  # fmt: skip
@@ -243,20 +243,20 @@ def test_a_host_that_cannot_boot_says_why(name, monkeypatch):
 
 @pytest.mark.parametrize("damage", ["", "{", "not json"])
 def test_down_needs_no_state_file(name, damage):
-    """A damaged one does no harm."""
+    """A damaged state file does not prevent the removal."""
     before = remains(name)
     lab = Lab(name, uniform(1, disk=16 * MIB))
     lab.up()
-    process = lab.popen("host1", ["sleep", "1000"])  # at whatever stage it may be by then
+    process = lab.popen("host1", ["sleep", "1000"])  # may be at any stage of its start by now
     (store.RUN / name / "lab.json").write_text(damage)
     assert lab.down()
     assert remains(name) == before
-    assert process.wait(PATIENCE) != 0  # killed, or it found the host gone
+    assert process.wait(PATIENCE) != 0  # killed, or the host was gone when it started
     assert not lab.down()
 
 
 def test_down_ends_what_ignores_signals_and_daemons(lab):
-    """And what was started beside the quota."""
+    """`down` also ends processes that run outside the quota."""
     stubborn = "trap '' TERM INT HUP; (setsid sleep 1000 &) ; sleep 1000"
     process = lab.popen("host1", ["sh", "-c", stubborn], limited=False)
     deadline = time.monotonic() + PATIENCE
@@ -278,24 +278,24 @@ def _alive(pid):
 
 
 def test_ctrl_c_during_up_leaves_nothing(name):
-    """At whatever moment it comes."""
+    """Ctrl-C at any moment of `up` removes everything."""
     before = remains(name)
     for wait in (0.6, 0.9, 1.2):
         process = subprocess.Popen(
             [ROSRM, "lab", "up", "--lab", name, *SIZES], stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
-        time.sleep(wait)  # anywhere on the way is good
+        time.sleep(wait)  # any moment of `up` is good
         os.killpg(process.pid, signal.SIGINT)
         said, _ = process.communicate(timeout=PATIENCE)
         assert b"Traceback" not in said
-        if process.returncode == 0:  # it was through already
+        if process.returncode == 0:  # `up` was complete already
             Lab(name).down()
         assert remains(name) == before
 
 
 def test_the_command_line_from_up_to_down(name):
-    """What a user types."""
+    """The commands that a user types work, with their output and exit codes."""
 
     def rosrm(*words):
         done = subprocess.run(
@@ -330,7 +330,7 @@ def test_the_command_line_from_up_to_down(name):
 
 
 def test_an_ordinary_user_is_told_what_is_missing(name):
-    """No traceback, nothing made; the way without root is shown."""
+    """The error shows the alternative without root; no traceback, nothing created."""
     nobody = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=-all"]
     done = subprocess.run(
         [*nobody, ROSRM, "lab", "up", "--lab", name, *SIZES], capture_output=True, text=True,

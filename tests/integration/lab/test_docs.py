@@ -1,4 +1,4 @@
-"""The page on virtual hosts, followed where root is: commands and files as printed."""
+"""The page on virtual hosts, followed with root rights: commands and files as printed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A virtual host is a host of its own, and its limits hold."""
+"""Isolation and resource limits of virtual hosts."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ PYTHON = [sys.executable, "-ISc"]
 
 
 def test_each_host_has_a_name_and_processes_of_its_own(lab):
-    """Its first process is its own, and it sees no other host's."""
+    """Each host has its own init process and sees no process of another host."""
     assert lab.exec("host1", ["hostname"]).stdout == "host1\n"
     assert lab.exec("host2", ["cat", "/proc/sys/kernel/hostname"]).stdout == "host2\n"
     pids = "import os; print([p for p in os.listdir('/proc') if p.isdigit()].__len__())"
-    assert int(lab.exec("host1", [*PYTHON, pids]).stdout) == 2  # the first one, and Python
+    assert int(lab.exec("host1", [*PYTHON, pids]).stdout) == 2  # init and Python
 
 
 def test_each_host_has_its_own_shared_memory_and_disk(lab):
-    """What one writes the other does not see, and neither does the machine."""
+    """A file written on one host is invisible to the other hosts and to the machine."""
     lab.exec("host1", ["touch", "/dev/shm/mine", f"{DATA}/mine"])
     for path in ("/dev/shm/mine", f"{DATA}/mine"):
         assert lab.exec("host2", ["test", "-e", path], check=False).returncode == 1
@@ -36,7 +36,7 @@ def test_each_host_has_its_own_shared_memory_and_disk(lab):
 
 
 def test_hosts_reach_each_other_by_name_and_nobody_else(lab):
-    """There is no route out, and the switch is connected to nothing but the hosts."""
+    """There is no route out, and the switch is connected only to the hosts."""
     server = lab.popen("host1", [*PYTHON, ECHO], stdout=-1)
     assert server.stdout.readline() == b"ready\n"
     try:
@@ -72,7 +72,7 @@ s.sendall(b'hello'); print(s.recv(99).decode())
 
 
 def test_who_takes_more_memory_than_the_host_has_is_killed(lab):
-    """The limit is the kernel's, and the host lives on."""
+    """The kernel kills the process that exceeds the memory limit; the host stays up."""
     taken = "x = bytearray(%d << 20); print(len(x) >> 20)"
     assert lab.exec("host1", [*PYTHON, taken % 64]).stdout == "64\n"
     assert lab.exec("host1", [*PYTHON, taken % 256], check=False).returncode == -signal.SIGKILL
@@ -89,19 +89,19 @@ print(time.process_time())
 
 
 def test_a_host_gets_no_more_than_its_share_of_cpu(lab):
-    """Half a core is one second of two, however hard it tries."""
+    """Half a core gives a busy process at most one second of CPU time in two."""
     used = float(lab.exec("host1", [*PYTHON, BURN]).stdout)
     assert used < 1.25
 
 
 def test_beside_the_limits_there_are_none(lab):
-    """On the same host, in another group, and it may have what the limits forbid."""
+    """A process outside the quota, in another group of the same host, may exceed the limits."""
     words = [*PYTHON, "x = bytearray(256 << 20); print(open('/proc/self/cgroup').read())"]
     assert "/host1/free\n" in lab.exec("host1", words, limited=False).stdout
 
 
 def test_a_disk_can_be_full(lab):
-    """Its size is that of the plan, less what the file system itself takes."""
+    """The disk has the planned size, less the overhead of the file system."""
     fill = f"open('{DATA}/big', 'wb').write(bytes(64 << 20))"
     assert "No space left" in lab.exec("host1", [*PYTHON, fill], check=False).stderr
     size = "import os; s = os.statvfs('/run/data'); print(s.f_blocks * s.f_frsize)"
@@ -109,7 +109,7 @@ def test_a_disk_can_be_full(lab):
 
 
 def test_another_user_can_work_on_a_host(lab):
-    """With a place to write, and no more rights than it has."""
+    """An unprivileged user has a writable folder, and no additional rights."""
     words = ["sh", "-c", f"id -un; touch {DATA}/state/x && echo wrote; echo $HOME"]
     said = lab.exec("host1", words, user="nobody").stdout.split()
     assert said[:2] == ["nobody", "wrote"]
@@ -118,7 +118,7 @@ def test_another_user_can_work_on_a_host(lab):
 
 
 def test_killing_a_host_is_a_power_cut(lab):
-    """All end at once; who was connected hears nothing; the disk stays; the address too."""
+    """All processes die, peers get no packet; disk contents and address survive the next boot."""
     sleepers = [lab.popen("host1", ["sleep", "1000"]) for _ in range(3)]
     server = lab.popen("host1", [*PYTHON, HOLD], stdout=-1)
     assert server.stdout.readline() == b"ready\n"
@@ -163,7 +163,7 @@ OWN_ADDRESS = "import socket, sys; print(socket.gethostbyname(sys.argv[1]))"
 
 
 def test_booting_a_host_that_is_up_is_refused(lab):
-    """And nothing of it is touched."""
+    """The refused boot leaves the host's processes alone."""
     sleeper = lab.popen("host1", ["sleep", "1000"])
     with pytest.raises(LabError, match=r"host host1 .* is up already"):
         lab.boot("host1")
@@ -173,7 +173,7 @@ def test_booting_a_host_that_is_up_is_refused(lab):
 
 
 def test_the_status_tells_what_there_is(lab):
-    """As `rosrm lab status --json` prints it."""
+    """The status has the fields of `rosrm lab status --json`."""
     sleeper = lab.popen("host1", ["sleep", "1000"])
     deadline = time.monotonic() + PATIENCE
     while lab.status()[0].processes != 1:
@@ -191,7 +191,7 @@ def test_the_status_tells_what_there_is(lab):
 
 
 def test_two_labs_live_side_by_side(lab, name):
-    """With addresses of their own; neither sees the other."""
+    """Each lab has its own addresses, and neither reaches the other."""
     other = f"{name}-b"
     with Lab(other, uniform(1, disk=16 * MIB)) as second:
         assert second.address("host1") != lab.address("host1")
@@ -206,7 +206,7 @@ def test_two_labs_live_side_by_side(lab, name):
 
 
 def test_a_range_of_this_machine_is_refused(name):
-    """Nobody could tell the two apart."""
+    """A subnet of this machine's network is refused as ambiguous."""
     from rosrm_lab.network import ranges_in_use
 
     used = ranges_in_use()
@@ -217,6 +217,6 @@ def test_a_range_of_this_machine_is_refused(name):
 
 
 def test_the_machine_keeps_its_name_and_its_mounts(lab):
-    """What a host mounts, the machine does not see."""
+    """Mounts and host names of a lab are invisible to the machine."""
     assert os.uname().nodename not in {"host1", "host2", "desk"}
     assert str(DATA) not in Path("/proc/self/mounts").read_text()

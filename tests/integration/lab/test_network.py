@@ -1,4 +1,4 @@
-"""What `cut`, `loss`, `delay` and `heal` do to packets."""
+"""Effects of `cut`, `loss`, `delay` and `heal` on packets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosrm.errors import ConfigError, LabError
 
 PYTHON = [sys.executable, "-ISc"]
 PORT = 9100
-#: Hears for a while, then says from whom how many packets came.
+#: Receives packets for a while, then prints their number per sender.
 HEAR = """
 import collections, socket, sys, time
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -32,7 +32,7 @@ import socket, sys
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 for _ in range(int(sys.argv[2])): s.sendto(b'x' * 100, (sys.argv[1], 9100))
 """
-#: To the host itself: what ends the listening is never lost.
+#: Sent from the host to itself, because the packet that ends the reception must not be lost.
 END = """
 import socket
 socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'end', ('127.0.0.1', 9100))
@@ -40,7 +40,7 @@ socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'end', ('127.0.0.1', 91
 
 
 def heard(lab, at, *speakers, number=50):
-    """How many packets of each speaker a host hears."""
+    """Return the number of packets that a host receives from each speaker."""
     listener = lab.popen(at, [*PYTHON, HEAR], stdout=subprocess.PIPE)
     assert listener.stdout.readline() == b"ready\n"
     for speaker in speakers:
@@ -52,7 +52,7 @@ def heard(lab, at, *speakers, number=50):
 
 
 def test_a_cut_in_one_direction_is_one_direction(lab):
-    """`in`: the host hears nobody and is heard. `out`: the reverse. The others notice nothing."""
+    """`in` cuts packets to the host, `out` packets from it; other hosts are unaffected."""
     lab.cut("host1", "in")
     assert heard(lab, "host1", "host2", "desk") == [0, 0]
     assert heard(lab, "host2", "host1", "desk") == [50, 50]
@@ -68,7 +68,7 @@ def test_a_cut_in_one_direction_is_one_direction(lab):
 
 
 def test_multicast_is_cut_too(lab):
-    """DDS finds its peers by it."""
+    """A cut also stops multicast packets, by which DDS discovers its peers."""
     listen = HEAR.replace(
         "print('ready'",
         "s.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, "
@@ -91,7 +91,7 @@ def test_multicast_is_cut_too(lab):
 
 
 def test_a_share_of_the_packets_is_lost(lab):
-    """20 % of 3,000 is 600; six standard deviations are 131."""
+    """A loss of 20 % drops 600 of 3,000 packets, within six standard deviations (131)."""
     lab.loss("host1", 0.2, "in")
     (arrived,) = heard(lab, "host1", "host2", number=3000)
     assert 2400 - 131 < arrived < 2400 + 131
@@ -103,7 +103,7 @@ def test_a_share_of_the_packets_is_lost(lab):
 
 
 def test_faults_add_up_and_are_healed_together(lab):
-    """The status has them in words."""
+    """The status lists all faults of a host; `heal` removes all."""
     lab.loss("host1", 0.01)
     lab.cut("host1", "out")
     assert lab.status()[0].network == "in: loss 1 %; out: cut, loss 1 %"
@@ -112,7 +112,7 @@ def test_faults_add_up_and_are_healed_together(lab):
 
 
 def test_a_cut_outlives_a_power_cut(lab):
-    """It is the cable that is cut, not the host."""
+    """A cut belongs to the cable, so a rebooted host is still cut off."""
     lab.cut("host1", "in")
     lab.kill("host1")
     lab.boot("host1")
@@ -138,7 +138,7 @@ while True: s.sendto(*s.recvfrom(9))
 
 
 def test_packets_are_late_or_the_kernel_cannot(lab):
-    """Both ways by 50 ms: 100 ms a round. Without netem: said, and nothing changed."""
+    """A delay of 50 ms each way gives 100 ms per round trip; without netem an error, no change."""
     back = lab.popen("host2", [*PYTHON, BACK], stdout=subprocess.PIPE)
     assert back.stdout.readline() == b"ready\n"
     try:
@@ -164,7 +164,7 @@ def test_packets_are_late_or_the_kernel_cannot(lab):
 
 
 def test_the_end_of_a_delay_takes_its_queue_away(lab):
-    """Also shown by a kernel without netem, with a queue that it has."""
+    """A kernel without netem shows the removal, too, with another queue."""
     from pyroute2 import IPRoute
 
     from rosrm_lab import network
@@ -197,7 +197,7 @@ def test_the_end_of_a_delay_takes_its_queue_away(lab):
     ],
 )
 def test_bad_input_changes_nothing(lab, change):
-    """One clear error each."""
+    """Each bad argument gives one clear error."""
     before = lab.status()
     with pytest.raises(ConfigError):
         change(lab)
@@ -208,7 +208,7 @@ def test_bad_input_changes_nothing(lab, change):
 
 
 def test_changing_the_network_takes_a_moment_only(lab):
-    """A chaos test cuts and heals many times."""
+    """Ten changes take less than 10 s, because a chaos test makes many."""
     begin = time.monotonic()
     for _ in range(5):
         lab.cut("host1", "in")

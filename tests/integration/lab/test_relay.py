@@ -1,4 +1,4 @@
-"""A command on a host behaves as if it were typed there."""
+"""Commands on a host, relayed as if they were typed there."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosrm.errors import LabError
 
 PATIENCE = 30.0
 PYTHON = [sys.executable, "-ISc"]
-#: Says each signal it gets, and ends with SIGTERM.
+#: Prints each signal it receives, and ends on SIGTERM.
 TELL = """
 import os, signal, sys
 def tell(number, frame):
@@ -32,7 +32,7 @@ while True: signal.pause()
 
 
 def test_exit_codes_and_signals_are_the_commands(lab):
-    """Ends and deaths alike."""
+    """The relay ends with the exit code or the fatal signal of the command."""
     for code in (0, 1, 42, 255):
         assert lab.exec("host1", ["sh", "-c", f"exit {code}"], check=False).returncode == code
     for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGSEGV, signal.SIGINT):
@@ -41,7 +41,7 @@ def test_exit_codes_and_signals_are_the_commands(lab):
 
 
 def test_a_command_that_is_not_there(lab, tmp_path):
-    """As shells say it, with the host's name."""
+    """The error has the exit codes of shells (127, 126), and the host's name."""
     missing = lab.exec("host1", ["no-such-command"], check=False)
     assert (missing.returncode, missing.stderr) == (
         127,
@@ -55,12 +55,12 @@ def test_a_command_that_is_not_there(lab, tmp_path):
 
 
 def test_standard_input_reaches_the_command(lab):
-    """And its end too."""
+    """The command receives all input and its end of file."""
     assert lab.exec("host1", ["wc", "-c"], input="x" * 100_000).stdout.strip() == "100000"
 
 
 def test_the_directory_is_the_callers(lab, tmp_path, monkeypatch):
-    """Where the host has it; else its disk."""
+    """The command runs in the caller's directory if the host has it, else on the host's disk."""
     monkeypatch.chdir(tmp_path)
     assert lab.exec("host1", ["pwd"]).stdout.strip() == str(tmp_path)
     there = lab.popen("host1", ["pwd"], cwd="/run/rosrm-lab", stdout=subprocess.PIPE)
@@ -68,7 +68,7 @@ def test_the_directory_is_the_callers(lab, tmp_path, monkeypatch):
 
 
 def test_signals_are_passed_on(lab):
-    """Each once, and the command decides what they mean."""
+    """Each signal arrives once, and the command decides its meaning."""
     process = lab.popen("host1", [*PYTHON, TELL], stdout=subprocess.PIPE)
     assert process.stdout.readline() == b"ready\n"
     for number in (signal.SIGUSR1, signal.SIGINT, signal.SIGHUP):
@@ -80,7 +80,7 @@ def test_signals_are_passed_on(lab):
 
 
 def test_killing_the_relay_kills_the_command(lab):
-    """`kill()` of what `popen` returns would else leave it behind."""
+    """`kill()` of the process from `popen` also kills the command on the host."""
     process = lab.popen("host1", [*PYTHON, TELL], stdout=subprocess.PIPE)
     assert process.stdout.readline() == b"ready\n"
     (inner,) = lab.pids("host1")
@@ -92,7 +92,7 @@ def test_killing_the_relay_kills_the_command(lab):
 
 
 def test_a_command_that_takes_too_long_is_killed(lab):
-    """With all that it is."""
+    """A timeout kills the command and all its processes."""
     with pytest.raises(subprocess.TimeoutExpired):
         lab.exec("host1", ["sleep", "1000"], timeout=1.0)
     deadline = time.monotonic() + PATIENCE
@@ -103,7 +103,7 @@ def test_a_command_that_takes_too_long_is_killed(lab):
 
 @pytest.fixture
 def terminal(lab):
-    """`rosrm lab exec` in a terminal; what it says can be awaited."""
+    """Yield a function that runs `rosrm lab exec` in a terminal, whose output a test can await."""
     opened = []
 
     def run(*words):
@@ -119,7 +119,7 @@ def terminal(lab):
     yield run
     for pid, master in opened:
         os.close(master)
-        with contextlib.suppress(ChildProcessError, ProcessLookupError):  # it has been waited for
+        with contextlib.suppress(ChildProcessError, ProcessLookupError):  # already waited for
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
 
@@ -138,7 +138,7 @@ def _read_until(master, wanted):
 
 
 def test_ctrl_c_reaches_the_command_once(terminal):
-    """The terminal sends it to relay and command: the relay must not send it again."""
+    """The terminal sends SIGINT to relay and command, so the relay must not send it again."""
     pid, master = terminal(sys.executable, "-ISc", TELL)
     _read_until(master, b"ready")
     os.write(master, b"\x03")
@@ -152,13 +152,13 @@ def test_ctrl_c_reaches_the_command_once(terminal):
 
 
 def test_a_shell_on_a_host_has_a_terminal(terminal):
-    """With job control: Ctrl-C ends what runs in it, and not the shell."""
+    """Job control works: Ctrl-C ends the foreground command, not the shell."""
     pid, master = terminal("bash", "--norc", "-i")
     os.write(master, b"tty -s && echo on-$(hostname)-with-a-tty\n")
     _read_until(master, b"on-host1-with-a-tty\r\n")
     os.write(master, b"sleep 1000\n")
     _read_until(master, b"sleep 1000\r\n")
-    time.sleep(0.5)  # the shell hands the terminal on; nothing tells when
+    time.sleep(0.5)  # the shell hands over the terminal; no event signals this
     os.write(master, b"\x03")
     os.write(master, b"echo still-$((40 + 2))\n")
     _read_until(master, b"still-42")

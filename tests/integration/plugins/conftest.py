@@ -1,8 +1,9 @@
-"""A fresh virtual environment that sees everything of this one, and into which plugins go by pip.
+"""Fresh virtual environments on top of the running one, for the installation of plugins by pip.
 
-Fresh, so that what a test installs is nowhere else afterwards; not empty, so that it is quick and
-needs no network: a `.pth` file shows it the folders of the running Python. pip and the build
-backend are therefore those of the running Python too, and pip is told to fetch nothing.
+A fresh environment, so that a test's installation affects nothing else. The environment is not
+empty, so that it is quick and needs no network: a `.pth` file adds the folders of the running
+Python. pip and the build backend are therefore those of the running Python, too, and pip downloads
+nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGES = Path(__file__).resolve().parent / "packages"
 
-#: The words of a user's `pip install`, with nothing fetched and nothing isolated.
+#: A user's `pip install`, without downloads and without build isolation.
 PIP = """#!/bin/sh
 action="$1"; shift
 [ "$action" = install ] && set -- --no-deps --no-build-isolation --no-index "$@"
@@ -34,7 +35,7 @@ exec "{python}" -m rosrm.cli "$@"
 
 @dataclass(frozen=True)
 class Environment:
-    """A virtual environment and a folder to work in."""
+    """A virtual environment and a working folder."""
 
     bin: Path
     folder: Path
@@ -63,7 +64,7 @@ class Environment:
         )
 
     def python(self, code: str) -> str:
-        """What a piece of Python prints in this environment."""
+        """Run Python code in this environment and return its output."""
         done = subprocess.run(
             [self.bin / "python", "-c", code],
             cwd=self.folder,
@@ -97,7 +98,7 @@ def environment(tmp_path) -> Environment:
 
 
 def _is_shown(path: str) -> bool:
-    """Every folder but the standard library's, which an environment has by itself."""
+    """Return True for folders outside the standard library, which each environment has."""
     standard = sysconfig.get_path("stdlib")
     return Path(path).is_dir() and path not in (standard, f"{standard}/lib-dynload")
 

@@ -1,4 +1,4 @@
-"""A third party's probe and migration strategy, installed by pip and chosen by name."""
+"""A third party's probe and migration strategy, installed by pip and selected by name."""
 
 from __future__ import annotations
 

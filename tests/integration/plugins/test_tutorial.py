@@ -1,4 +1,4 @@
-"""The tutorials of plugins, done as written: files made, commands run, answers compared."""
+"""The plugin tutorials, followed as written: files created, commands run, outputs compared."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BLOCK = re.compile(
 
 @dataclass(frozen=True)
 class Command:
-    """A line that a reader types, and what the page shows as the answer."""
+    """A command that a reader types, with the output and the exit code that the page shows."""
 
     line: str
     answer: str
@@ -28,7 +28,7 @@ class Command:
 
 
 def blocks(page: Path) -> Iterator[tuple[str, str] | Command]:
-    """The files (name and text) and the commands of a tutorial, in its order."""
+    """Yield the files (name and text) and the commands of a tutorial, in order."""
     for block in _BLOCK.finditer(page.read_text(encoding="utf-8")):
         about, text = block["about"] or "", block["text"]
         if block["what"] == "file":
@@ -41,14 +41,14 @@ def blocks(page: Path) -> Iterator[tuple[str, str] | Command]:
 
 
 def matches(shown: str, given: str) -> bool:
-    """`...` in the page stands for anything, and every run of spaces for any other."""
+    """Return True if the output fits: `...` is a wildcard, and runs of spaces are equal."""
     parts = [re.escape(part.strip()) for part in shown.split("...")]
     pattern = ".*".join(part.replace(r"\ ", r"\s+").replace("\\\n", r"\s+") for part in parts)
     return re.fullmatch(pattern, given.strip(), re.DOTALL) is not None
 
 
 def do(page: Path, environment) -> list[str]:
-    """Make the files of a tutorial and run its commands; returns these."""
+    """Create the files of a tutorial and run its commands; return these."""
     folder, done = environment.folder, []
     for block in blocks(page):
         if isinstance(block, Command):
@@ -95,7 +95,7 @@ def test_the_tutorial_does_what_it_says(environment):
 
 @pytest.mark.parametrize(("page", "only_shown"), [(SCORING, 1), (MIGRATION, 0)])
 def test_every_marked_block_is_found(page, only_shown):
-    """A block whose mark is misspelt would silently not be tested."""
+    """The pattern finds all marked blocks; a misspelt mark would silently skip a block."""
     text = page.read_text(encoding="utf-8")
     assert text.count("<!--") == len(list(_BLOCK.finditer(text)))
     assert text.count("```") == 2 * (text.count("<!--") + only_shown)

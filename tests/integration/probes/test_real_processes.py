@@ -1,4 +1,4 @@
-"""The probes on real processes, and on the control groups of this machine."""
+"""Probes on real processes, and on the control groups of this machine."""
 
 import contextlib
 import os
@@ -28,7 +28,7 @@ MIB = 2**20
 
 @pytest.fixture
 def start():
-    """Starts Python programs as session leaders and ends them with their children."""
+    """Yield a function that starts session leaders; kill their sessions at the end."""
     started = []
 
     def run(code, *arguments, ready=False):
@@ -53,7 +53,7 @@ def start():
 
 
 def watch(seconds, read):
-    """Call `read` ten times a second; its last answer."""
+    """Call `read` ten times a second for `seconds`; return its last result."""
     tick = threading.Event()
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -63,13 +63,13 @@ def watch(seconds, read):
 
 
 def burnt(pid):
-    """CPU seconds of a process, by another way."""
+    """Return the CPU seconds of a process, by psutil."""
     times = psutil.Process(pid).cpu_times()
     return times.user + times.system
 
 
 def test_slice_cpu_is_what_the_process_burns(start):
-    """Over two seconds the reading is the CPU time that the process was given."""
+    """Over two seconds the reading equals the CPU time that the process received."""
     sessions = SessionTable()
     gauge = SliceCpu(1.0, sessions, 2.0)
     burner = start(BURN)
@@ -83,7 +83,7 @@ def test_slice_cpu_is_what_the_process_burns(start):
 
 
 def test_slice_cpu_of_an_ended_session_neither_jumps_nor_lasts(start):
-    """Killed, reaped and only then told of: no reading exceeds the cores of the machine."""
+    """A session removed late, after the kill: no reading exceeds the machine's cores."""
     sessions = SessionTable()
     gauge = SliceCpu(1.0, sessions, 1.0)
     burner = start(BURN)
@@ -115,7 +115,7 @@ def test_slice_memory_is_what_the_processes_hold(start):
 
 
 def test_sessions_find_the_children(start):
-    """A child of a child is known after a walk, and gone after the next when it has ended."""
+    """One refresh finds the children; the refresh after a child's end removes the child."""
     shell = subprocess.Popen(
         ["sh", "-c", "sleep 300 & sleep 300 & read line; kill $!; wait $!; read line"],
         start_new_session=True, stdin=subprocess.PIPE, bufsize=0,
@@ -134,7 +134,7 @@ def test_sessions_find_the_children(start):
 
 
 def test_machine_cpu_is_what_psutil_reads(start):
-    """The same two seconds, read by both, while a process burns."""
+    """Probe and psutil measure the same two seconds while a process is busy."""
     start(BURN)
     gauge = MachineCpu(2.0)
     psutil.cpu_percent(None)
@@ -157,7 +157,7 @@ def test_default_probes_are_quick_and_sane():
 
 
 def test_default_probes_are_lean():
-    """The slave's memory is budgeted: what only some hosts need is not imported on all of them."""
+    """Default probes import neither psutil nor pydantic, because the slave's memory is limited."""
     code = (
         "import sys; import rosrm_resources.plugin as plugin\n"
         "from pathlib import Path; from rosrm.extensions.contracts import ProbeContext\n"
@@ -184,7 +184,7 @@ def memory_group():
 
 
 def test_memory_of_the_own_group(memory_group):
-    """The kernel's figure less the inactive cache, whatever the version is."""
+    """The reading is the kernel's figure less the inactive cache, in either version."""
     v1 = memory_group.version == 1
     current = memory_group.directory / ("memory.usage_in_bytes" if v1 else "memory.current")
     if not current.exists():
@@ -196,13 +196,13 @@ def test_memory_of_the_own_group(memory_group):
 
 
 def test_cpu_time_of_the_own_group():
-    """It grows, and by no more than the cores of the machine allow."""
+    """The CPU time grows, by no more than the cores of the machine allow."""
     group = find_group("cpu")
     if group is None:
         pytest.skip("no control group with the cpu controller is mounted here")
     used = GroupTime(group, group.directory, Path("/"))
     before, begun = used.seconds(), time.monotonic()
-    while time.process_time() % 0.1 < 0.09:  # burn a little
+    while time.process_time() % 0.1 < 0.09:  # burn some CPU time
         pass
     grown, passed = used.seconds() - before, time.monotonic() - begun
     assert 0 < grown <= os.cpu_count() * (passed + 0.1)
@@ -224,7 +224,7 @@ print(memory.capacity, memory.usage() - before, cpu.capacity, usage)
 
 
 def test_limited_group_of_version_1(tmp_path):
-    """A real group of 256 MiB and half a core: both are the capacity, and both are felt."""
+    """In a real group of 256 MiB and half a core, both limits are the capacity and take effect."""
     groups = {name: find_group(name) for name in ("memory", "cpu", "cpuacct")}
     if any(group is None or group.version != 1 for group in groups.values()):
         pytest.skip("this machine has no control groups of version 1")
@@ -252,11 +252,11 @@ def test_limited_group_of_version_1(tmp_path):
             _until(lambda: _removed(directory))  # noqa: B023 - called at once
     assert (capacity, cores) == (256 * MIB, 0.5)
     assert grown == pytest.approx(20 / 256, abs=0.02)
-    assert 0.3 < busy < 1.35  # on a busy machine it may get less than its quota
+    assert 0.3 < busy < 1.35  # a busy machine may give less than the quota
 
 
 def test_group_of_this_process_is_read_or_is_the_machine():
-    """Whatever this machine is, the scope `cgroup` gives readings."""
+    """The scope `cgroup` gives readings on any machine."""
     for offer in register_probes()[:2]:
         probe = offer.create(offer.options(), probe_context("cgroup"))
         assert probe.resources[0].scope in ("cgroup", "machine")
@@ -268,7 +268,7 @@ def test_group_of_this_process_is_read_or_is_the_machine():
 def _removed(directory):
     try:
         directory.rmdir()
-    except OSError:  # its last process is still on its way out
+    except OSError:  # its last process is still exiting
         return False
     return True
 

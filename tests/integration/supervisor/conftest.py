@@ -1,4 +1,4 @@
-"""A supervisor in a folder of the test's own; whatever the test does, no process outlives it."""
+"""A supervisor in a test's own folder; no process outlives the test."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rosrm.supervisor import instance_record, procfs
 from rosrm.supervisor.client import Amended, LaunchOrder, SupervisorClient, log_path
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
-#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
 TIMEOUT = 30.0
 
 
 class Host:
-    """One state directory, its supervisor, and what a test does with them."""
+    """One state directory with its supervisor, and the operations that tests need."""
 
     def __init__(self, state: Path):
         self.state = state
@@ -46,7 +46,7 @@ class Host:
         return log_path(self.state, InstanceId(name, number))
 
     def wait(self, client, name: str, *states: InstanceState, number: int = 1):
-        """The first status of an instance in one of the states."""
+        """Return the first status of an instance in one of the given states."""
         instance, deadline = InstanceId(name, number), time.monotonic() + TIMEOUT
         seen = []
         while time.monotonic() < deadline:
@@ -59,7 +59,7 @@ class Host:
         pytest.fail(f"{instance} was in none of {states} within {TIMEOUT} s; told: {seen}")
 
     def run(self, client, order: LaunchOrder):
-        """Start it and return its final status."""
+        """Start an order and return its final status."""
         client.start([order])
         return self.ended(client, order.instance.process, number=order.instance.number)
 
@@ -71,7 +71,7 @@ class Host:
         return self.wait(client, name, *final, number=number)
 
     def amend(self, client, name: str, restart: RestartPolicy) -> None:
-        """Until the supervisor has it in its record; as the slave orders it."""
+        """Change the restart policy as the slave does; wait for the supervisor's record."""
         instance, deadline = InstanceId(name, 1), time.monotonic() + TIMEOUT
         client.amend(instance, restart, {"ROSRM_SHADOW": None})
         wanted = Amended(instance, restart)
@@ -84,7 +84,7 @@ class Host:
         client.close()
 
     def alive(self) -> list[int]:
-        """Every process that the supervisor started, and what came of it."""
+        """Return the pids of all processes of the supervisor and their descendants."""
         found = procfs.find_marked(str(self.state))
         return [stat.pid for stats in found.values() for stat in stats]
 
@@ -102,7 +102,7 @@ class Host:
             os.kill(pid, signal.SIGKILL)
 
     def recorded(self) -> list[int]:
-        """Leaders that live, by the record: one that is just being executed shows no marks yet."""
+        """Return living leaders from the record: during its exec a leader shows no marks yet."""
         recorded = instance_record.read(str(self.state))
         leaders = []
         for key, instance in recorded.instances.items():
@@ -120,7 +120,7 @@ def command_line(pid: int) -> str:
 
 
 def wait_gone(pid: int, timeout: float = TIMEOUT) -> None:
-    """Until a process has ended."""
+    """Wait until a process has ended."""
     try:
         pidfd = os.pidfd_open(pid)
     except ProcessLookupError:
@@ -133,7 +133,7 @@ def wait_gone(pid: int, timeout: float = TIMEOUT) -> None:
 
 
 def wait_until(condition, what: str, timeout: float = TIMEOUT):
-    """For what cannot be awaited: a file of another process."""
+    """Poll a condition for which no event exists, such as a file of another process."""
     deadline = time.monotonic() + timeout
     while not (result := condition()):
         assert time.monotonic() < deadline, f"not within {timeout} s: {what}"

@@ -1,4 +1,4 @@
-"""Another restart policy for what runs: for the two ends of a handoff. And what is remembered."""
+"""Changes of the restart policy of running instances, as in handoffs, and memos."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ NEVER = RestartPolicy("never")
 ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
 SAYS_WHAT_IT_IS = ("sh", "-c", "echo shadow: $ROSRM_SHADOW; exec sleep 1000")
 
-#: The supervisor is killed at either moment, or not at all.
+#: Kill of the supervisor before or after the change, or no kill.
 KILLS = pytest.mark.parametrize("killed", ["never", "before", "after"])
 
 
 def shadow(host, name: str, **options):
-    """An order as the slave makes it for the destination of a handoff."""
+    """Return an order as the slave makes it for the destination of a handoff."""
     environment = {**os.environ, "ROSRM_SHADOW": "1"}
     return host.order(name, *SAYS_WHAT_IT_IS, environment=environment, restart=NEVER, **options)
 
 
 def amended(host, client, name: str, restart: RestartPolicy, killed: str):
-    """Set the policy, with a SIGKILL of the supervisor before or after; returns the client."""
+    """Set the policy, with a SIGKILL of the supervisor before or after; return the client."""
     if killed == "before":
         host.kill_supervisor(client)
         client = host.connect()
@@ -39,7 +39,7 @@ def amended(host, client, name: str, restart: RestartPolicy, killed: str):
 
 
 def kill(host, pid: int, name: str) -> None:
-    """End a run that has said what it is."""
+    """Kill a run that has printed its output."""
     wait_until(lambda: host.log(name).exists() and host.log(name).read_text(), "it has spoken")
     os.kill(pid, signal.SIGKILL)
     wait_gone(pid)
@@ -47,7 +47,7 @@ def kill(host, pid: int, name: str) -> None:
 
 @KILLS
 def test_a_suspended_policy_lets_the_source_end(host, client, killed):
-    """With `never` its end is final, though it was ordered to be restarted."""
+    """With `never` the end of the source is final, although its order has a restart policy."""
     client.start([host.order("source", *SAYS_WHAT_IT_IS, restart=ON_FAILURE)])
     pid = host.running(client, "source").pid
     client = amended(host, client, "source", NEVER, killed)
@@ -58,7 +58,7 @@ def test_a_suspended_policy_lets_the_source_end(host, client, killed):
 
 @KILLS
 def test_a_confirmed_shadow_is_restarted_as_none(host, client, killed):
-    """It follows its policy from then on, and its next run is not told that it is a shadow."""
+    """A confirmed shadow follows its policy, and its next run has no ROSRM_SHADOW."""
     client.start([shadow(host, "copy")])
     pid = host.running(client, "copy").pid
     client = amended(host, client, "copy", ON_FAILURE, killed)
@@ -70,7 +70,7 @@ def test_a_confirmed_shadow_is_restarted_as_none(host, client, killed):
 
 
 def test_an_end_while_no_supervisor_runs_follows_the_new_policy(host, client):
-    """Supervisor and process are killed at once: the next supervisor goes by what was recorded."""
+    """The next supervisor applies the recorded policies to processes that died with the former."""
     client.start([shadow(host, "copy"), host.order("source", "sleep", "9", restart=ON_FAILURE)])
     source = host.running(client, "source").pid
     host.amend(client, "copy", ON_FAILURE)
@@ -88,7 +88,7 @@ def test_an_end_while_no_supervisor_runs_follows_the_new_policy(host, client):
 
 
 def test_a_shadow_ends_for_good_whoever_is_killed(host, client):
-    """Not even a restart of slave and supervisor makes one that was not confirmed start again."""
+    """An unconfirmed shadow does not restart, even after restarts of slave and supervisor."""
     client.start([shadow(host, "copy")])
     pid = host.running(client, "copy").pid
     host.kill_supervisor(client)
@@ -101,14 +101,14 @@ def test_a_shadow_ends_for_good_whoever_is_killed(host, client):
 
 
 def test_a_shadow_says_nothing_of_those_beside_it(host, client):
-    """The environment of the first order is the base of the others: its mark is not theirs."""
+    """The first order's environment is the base of the others, without its shadow mark."""
     client.start([shadow(host, "copy"), host.order("plain", *SAYS_WHAT_IT_IS)])
     host.running(client, "plain")
     wait_until(lambda: host.log("plain").read_text() == "shadow:\n", "it has spoken")
 
 
 def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
-    """As a user may order it later."""
+    """A restart on a user's order does not set ROSRM_SHADOW of a confirmed shadow again."""
     client.start([shadow(host, "copy")])
     host.running(client, "copy")
     wait_until(lambda: host.log("copy").read_text(), "it has spoken")
@@ -120,7 +120,7 @@ def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
 
 
 def test_an_amendment_of_what_has_ended_is_answered(host, client):
-    """With its end, which it does not change."""
+    """The reply is the instance's end, which the amendment does not change."""
     host.run(client, host.order("job", "false"))
     host.amend(client, "job", ON_FAILURE)
     client.close()
@@ -129,7 +129,7 @@ def test_an_amendment_of_what_has_ended_is_answered(host, client):
 
 
 def test_a_restart_beats_the_end_that_is_under_way(host, client):
-    """Its leader has ended, what it left is being stopped: the order to restart is not lost."""
+    """An order to restart is kept while the children of an ended leader are being stopped."""
     leaves = "echo run; trap '' INT; (trap '' INT; sleep 1000) & sleep 0.2; exit 0"
     client.start([host.order("leaver", "sh", "-c", leaves)])
     host.wait(client, "leaver", InstanceState.STOPPING)
@@ -140,7 +140,7 @@ def test_a_restart_beats_the_end_that_is_under_way(host, client):
 
 
 def test_what_is_to_be_remembered_is(host, client):
-    """For the next slave, over a SIGKILL of the supervisor, until the instance has ended."""
+    """Memos outlive slave and supervisor (SIGKILL), and end with their instance."""
     kept, other = InstanceId("kept", 1), InstanceId("other", 1)
     orders = [host.order("kept", "sleep", "1000", memo="a"), host.order("other", "sleep", "1000")]
     client.start(orders)
@@ -151,7 +151,7 @@ def test_what_is_to_be_remembered_is(host, client):
     client.remember(kept, "b")
     client.remember(other, "c")
     client.stop(kept)
-    host.ended(client, "kept")  # by then the orders were read
+    host.ended(client, "kept")  # by then the supervisor has read the orders
     client.remember(kept, "too late")
     host.amend(client, "other", NEVER)
     host.kill_supervisor(client)
@@ -160,7 +160,7 @@ def test_what_is_to_be_remembered_is(host, client):
 
 
 def test_a_record_of_an_earlier_version_is_taken_over(host, client):
-    """Its launches have no memo; what runs, runs on, and can be amended."""
+    """Launches recorded by an earlier version, without memos, run on and can be amended."""
     client.start([host.order("kept", *SAYS_WHAT_IT_IS)])
     pid = host.running(client, "kept").pid
     host.kill_supervisor(client)

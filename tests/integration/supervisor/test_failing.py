@@ -1,4 +1,4 @@
-"""A run that its client has found unhealthy is ended, and its restart policy goes on from there."""
+"""Runs that the client reports as unhealthy: ended, then subject to their restart policy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ AGAIN = RestartPolicy("on-failure", delay=0.05)
 
 @pytest.mark.parametrize("killed", ["never", "after"])
 def test_a_stopped_process_ends_and_starts_again(host, client, killed):
-    """SIGSTOP lets no SIGINT through; the order reaches all of it, and survives the supervisor."""
+    """The order ends the whole paused tree, which SIGINT cannot reach, and survives a kill."""
     client.start([host.order("hung", "sh", "-c", "sleep 1000; true", restart=AGAIN)])
     pid = host.running(client, "hung").pid
     os.kill(pid, signal.SIGSTOP)
@@ -35,7 +35,7 @@ def test_a_stopped_process_ends_and_starts_again(host, client, killed):
 
 
 def test_a_failed_run_that_exits_well_has_failed(host, client):
-    """Without a restart policy its end is final; the reason stays readable."""
+    """Without a restart policy the end is final; the status keeps the reason."""
     code = "import time, signal, sys; signal.signal(signal.SIGINT, lambda *_: sys.exit(0)); "
     client.start([host.python("calm", code + "print('up', flush=True); time.sleep(1000)")])
     pid = host.running(client, "calm").pid

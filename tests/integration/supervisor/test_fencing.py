@@ -1,4 +1,4 @@
-"""Fences with real processes: who ends in time, whoever is stopped or killed, and who goes on."""
+"""Fences of real processes while slave and supervisor are paused or killed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEAF = ("sh", "-c", "trap '' INT TERM; echo deaf; (trap '' INT TERM; sleep 1000)
 ONE = InstanceId("one", 1)
 ALWAYS = RestartPolicy("always", delay=0.05)
 
-#: A slave that says `heard` all the time: it has a singleton with a fence, and a driver without.
+#: A slave that renews the lease continually, with a fenced singleton and an unfenced driver.
 SLAVE = """
     import os, sys, time
     from pathlib import Path
@@ -68,14 +68,14 @@ def of_one(client):
 
 
 def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
-    """SIGSTOP of the slave: what has a fence ends in its time, what has none goes on."""
+    """With a paused slave, the fenced instance ends in time; the one without a fence runs on."""
     supervisor, one, driver = map(int, slave.stdout.readline().split())
     host.pids.add(supervisor)
     os.kill(slave.pid, signal.SIGSTOP)
     stopped = time.monotonic()
     wait_gone(one)
     took = time.monotonic() - stopped
-    assert 1.5 < took < TIMEOUT / 2, took  # heard 0.1 s before, on a quiet machine
+    assert 1.5 < took < TIMEOUT / 2, took  # the last renewal was 0.1 s before, on a quiet machine
     assert alive(driver)
     slave.kill()
     slave.wait()
@@ -85,7 +85,7 @@ def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
 
 
 def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client):
-    """Whatever the master hears; then, without a sign of life, it ends."""
+    """A fence with `alive` is renewed by the slave's sign of life alone, and ends without it."""
     fences = {"one": Fence(2.0, 0.0, alive=True), "two": Fence(2.0, 0.0)}
     client.start([host.order(name, *SLEEPS, fence=fence) for name, fence in fences.items()])
     host.running(client, "one")
@@ -101,7 +101,7 @@ def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client
 
 
 def test_it_goes_on_while_somebody_says_heard(host, client):
-    """Several times as long as its fence; then, without another word, it ends."""
+    """Renewals keep an instance alive far beyond its fence; without one the instance ends."""
     client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0), restart=ALWAYS)])
     pid = host.running(client, "one").pid
     until = time.monotonic() + 5.0
@@ -116,7 +116,7 @@ def test_it_goes_on_while_somebody_says_heard(host, client):
 
 
 def test_all_of_it_ends_within_its_grace(host, client):
-    """Deaf to SIGINT and SIGTERM, with long graces of its own, and with a child: SIGKILL."""
+    """An instance deaf to SIGINT and SIGTERM ends by SIGKILL, with its child, within the fence."""
     graces = StopPolicy(interrupt_grace=500.0, terminate_grace=500.0)
     client.start([host.order("one", *DEAF, fence=Fence(2.0, 0.5), stop=graces)])
     host.running(client, "one")
@@ -126,7 +126,7 @@ def test_all_of_it_ends_within_its_grace(host, client):
 
 
 def test_the_order_to_fence_leaves_nothing(host, client):
-    """Nothing is asked to end by itself; and nothing starts again."""
+    """A fence order sends SIGKILL at once, and nothing restarts."""
     client.start([host.order("one", *DEAF, restart=ALWAYS)])
     host.running(client, "one")
     wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
@@ -137,7 +137,7 @@ def test_the_order_to_fence_leaves_nothing(host, client):
 
 
 def test_one_that_was_fenced_before_its_start_came_is_refused(host, client):
-    """Orders may overtake one another."""
+    """Orders may overtake one another, so a fence refuses a later start."""
     client.fence(ONE)
     client.start([host.order("one", *SLEEPS)])
     assert host.ended(client, "one").state is InstanceState.REFUSED
@@ -145,7 +145,7 @@ def test_one_that_was_fenced_before_its_start_came_is_refused(host, client):
 
 
 def test_a_killed_supervisor_puts_no_fence_off(host, client):
-    """It is killed again and again; each next one goes on counting where the first began."""
+    """Repeated kills of the supervisor do not postpone the fence."""
     client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0))])
     pid = host.running(client, "one").pid
     deadline = time.monotonic() + TIMEOUT
@@ -159,14 +159,14 @@ def test_a_killed_supervisor_puts_no_fence_off(host, client):
 
 
 def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
-    """By its start alone the instance would have been fenced long ago."""
+    """The next supervisor counts from the last renewal, not from the start of the instance."""
     heard = time.monotonic()
     client.start([host.order("one", *SLEEPS, fence=Fence(15.0, 0.0), heard=heard - 14.0)])
     pid = host.running(client, "one").pid
     client.heard(time.monotonic(), 0.0)
     client.remember(ONE, "after the word that counts")
     client.start([host.order("other", "true")])
-    host.ended(client, "other")  # by then all of it was read
+    host.ended(client, "other")  # by then the supervisor has read all orders
     wait_until(lambda: time.monotonic() > heard + 1.5, "its start lies back so far")
     host.kill_supervisor(client)
     client = host.connect()
@@ -177,7 +177,7 @@ def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
 
 
 def test_without_a_supervisor_nobody_fences_until_the_next(host, client):
-    """What no supervisor watches goes on: the next one, started by the slave, ends it at once."""
+    """An unsupervised instance outlives its fence; the next supervisor ends it at once."""
     client.start([host.order("one", *SLEEPS, fence=Fence(0.5, 0.0))])
     pid = host.running(client, "one").pid
     host.kill_supervisor(client)
@@ -191,7 +191,7 @@ def test_without_a_supervisor_nobody_fences_until_the_next(host, client):
 
 
 def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
-    """Nobody knows how long the host was away, and whether a successor runs elsewhere."""
+    """The length of the outage is unknown, so a successor may run elsewhere: no restart."""
     client.start([host.order("driver", *SLEEPS, restart=ALWAYS)])
     pids = [host.running(client, "driver").pid]
     client.start([host.order("one", *SLEEPS, restart=ALWAYS, fence=Fence(1000.0, 0.0))])
@@ -208,7 +208,7 @@ def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
 
 
 def test_after_a_restart_of_the_machine_the_policy_decides(host, client):
-    """A service comes back, also one that had used up its restarts; another one has failed."""
+    """A service restarts, even with its restarts used up; a process without a policy has failed."""
     again = RestartPolicy("on-failure", delay=0.05, attempts=1, window=1e6)
     client.start([host.order("once", *SLEEPS)])
     pid = host.running(client, "once").pid
@@ -223,7 +223,7 @@ def test_after_a_restart_of_the_machine_the_policy_decides(host, client):
 
 
 def lose_power(host, client, *pids: int) -> None:
-    """All is gone at once, and the next supervisor starts after a restart of the machine."""
+    """Kill supervisor and processes, and rewrite the record as after a reboot of the machine."""
     host.kill_supervisor(client)
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
@@ -232,7 +232,7 @@ def lose_power(host, client, *pids: int) -> None:
 
 
 def rewrite(host, **header) -> None:
-    """The record as another machine, or another version, would have left it."""
+    """Rewrite the record's header as another machine, or another version, would have left it."""
     path = host.state / "instances.jsonl"
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     for line in lines:
@@ -242,7 +242,7 @@ def rewrite(host, **header) -> None:
 
 
 def test_a_record_without_fences_is_taken_over(host, client):
-    """Of an earlier version: what runs, runs on."""
+    """Instances in a record of an earlier version, without fences, keep running."""
     client.start([host.order("one", *SLEEPS)])
     pid = host.running(client, "one").pid
     host.kill_supervisor(client)
@@ -259,7 +259,7 @@ def test_a_record_without_fences_is_taken_over(host, client):
 
 
 def test_a_supervisor_that_was_stopped_hears_first_what_was_said_in_time(host, client):
-    """Its client was at work all the while, and the fence has passed by its clock."""
+    """A resumed supervisor reads its client's renewals before it applies an expired fence."""
     client.start([host.order("one", *SLEEPS, fence=Fence(1.0, 0.0, alive=True))])
     pid = host.running(client, "one").pid
     os.kill(client.pid, signal.SIGSTOP)

@@ -1,4 +1,4 @@
-"""The supervisor itself: it outlives its slave, is taken over, refuses a second one, ends clean."""
+"""The supervisor's lifetime: take-over, refusal of a second one, and its end."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SLAVE = """
 
 
 def start_slave(host: Host) -> subprocess.Popen:
-    """A process of its own that is connected and has started `kept`."""
+    """Start a slave process that is connected and has started `kept`."""
     root = str(Path(rosrm.__file__).parent.parent)
     slave = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(SLAVE), str(host.state)],
@@ -60,7 +60,7 @@ def slave(host):
 
 
 def test_processes_survive_a_killed_slave(host, slave):
-    """SIGKILL the slave: the next one finds the process running, and the same supervisor."""
+    """After a SIGKILL of the slave the next one finds the process and the same supervisor."""
     slave.kill()
     slave.wait()
     client = host.connect(start=False)
@@ -81,14 +81,14 @@ def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):
 
 
 def test_a_second_live_slave_is_refused(host, slave):
-    """While one is connected another is turned down, and is told which one is there."""
+    """While one slave is connected, another is refused with the pid of the first."""
     with pytest.raises(SupervisorError, match=f"another slave .pid {slave.pid}. is connected"):
         host.connect()
 
 
 @pytest.mark.parametrize("number", [OURS - 1, OURS + 1])
 def test_a_slave_of_another_version_is_refused(host, client, monkeypatch, number):
-    """With both numbers; what the supervisor runs goes on."""
+    """The refusal names both versions; the supervisor's processes keep running."""
     client.start([host.order("kept", "sleep", "1000")])
     pid = host.running(client, "kept").pid
     client.close()
@@ -100,7 +100,7 @@ def test_a_slave_of_another_version_is_refused(host, client, monkeypatch, number
 
 
 def test_final_statuses_are_kept_until_forgotten(host):
-    """They are told at each connection until the client has acknowledged them."""
+    """The supervisor reports final statuses at each connection until the client acknowledges."""
     client = host.connect()
     final = host.run(client, host.order("job", "sh", "-c", "exit 5"))
     client.close()
@@ -113,7 +113,7 @@ def test_final_statuses_are_kept_until_forgotten(host):
 
 
 def test_a_killed_supervisor_is_taken_over(host):
-    """SIGKILL the supervisor: the next one has the same processes, and can stop them."""
+    """After a SIGKILL the next supervisor has the same processes, and can stop them."""
     client = host.connect()
     client.start([host.order("kept", "sh", "-c", "echo ran; sleep 1000 & wait")])
     before = host.running(client, "kept")
@@ -129,7 +129,7 @@ def test_a_killed_supervisor_is_taken_over(host):
 
 
 def test_an_end_that_nobody_saw_is_said_to_be_unknown(host):
-    """It ended while no supervisor ran: failed, with an unknown exit code, not started again."""
+    """A process that ended without a supervisor has failed, with exit code unknown; no restart."""
     client = host.connect()
     client.start([host.order("gone", "sleep", "1000")])
     pid = host.running(client, "gone").pid
@@ -143,7 +143,7 @@ def test_an_end_that_nobody_saw_is_said_to_be_unknown(host):
 
 
 def test_an_unseen_end_follows_the_restart_policy(host):
-    """For a process that is to be restarted, an unknown exit is a failure."""
+    """For a process with a restart policy, an unknown exit is a failure."""
     client = host.connect()
     restart = RestartPolicy(when="on-failure", delay=0.05)
     client.start([host.order("again", "sleep", "1000", restart=restart)])
@@ -158,7 +158,7 @@ def test_an_unseen_end_follows_the_restart_policy(host):
 
 
 def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host):
-    """Leader and supervisor are gone, a child lives on: the next supervisor finds and stops it."""
+    """The next supervisor finds and stops the child of a dead leader."""
     client = host.connect()
     client.start([host.order("leaver", "sh", "-c", "sleep 1000 & wait")])
     pid = host.running(client, "leaver").pid
@@ -172,7 +172,7 @@ def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host):
 
 
 def test_a_taken_over_process_that_ends_is_noticed(host):
-    """It is nobody's child here; its pidfd tells."""
+    """The new supervisor is not the parent, and notices the end by the pidfd."""
     client = host.connect()
     client.start([host.order("kept", "sleep", "1000")])
     pid = host.running(client, "kept").pid
@@ -183,7 +183,7 @@ def test_a_taken_over_process_that_ends_is_noticed(host):
 
 
 def test_a_spawn_without_an_outcome_is_not_tried_again(host):
-    """Killed between the spawn and its record: it may have run, so it does not run again."""
+    """A kill between the spawn and its record: the process may have run, so no second run."""
     client = host.connect()
     host.run(client, host.order("model", "touch", "ran"))
     host.kill_supervisor(client)
@@ -200,7 +200,7 @@ def test_a_spawn_without_an_outcome_is_not_tried_again(host):
 
 
 def test_a_start_that_was_never_tried_is_carried_out(host):
-    """Killed between the order's record and the spawn: the next supervisor spawns it, once."""
+    """A kill between the order's record and the spawn: the next supervisor spawns it, once."""
     client = host.connect()
     host.run(client, host.order("model", "sh", "-c", "echo ran"))
     host.kill_supervisor(client)
@@ -216,7 +216,7 @@ def test_a_start_that_was_never_tried_is_carried_out(host):
 
 
 def test_a_spawn_without_a_record_is_found_by_its_marks(host):
-    """Killed right after a spawn: the process runs, its pid was not recorded; it is found."""
+    """A kill right after the spawn: the next supervisor finds the unrecorded process."""
     client = host.connect()
     client.start([host.order("found", "sleep", "1000")])
     pid = host.running(client, "found").pid
@@ -231,7 +231,7 @@ def test_a_spawn_without_a_record_is_found_by_its_marks(host):
 
 
 def test_a_torn_tail_is_left_out_and_said(host):
-    """The record ends in half a line: the rest counts, and the client hears of it."""
+    """A record that ends in half a line is read up to there, and the client gets a note."""
     client = host.connect()
     client.start([host.order("kept", "sleep", "1000")])
     host.running(client, "kept")
@@ -244,7 +244,7 @@ def test_a_torn_tail_is_left_out_and_said(host):
 
 
 def test_a_damaged_line_is_left_out_and_said(host):
-    """A line in the middle cannot be read: its place is said, everything else counts."""
+    """An unreadable line is skipped, and the client gets a note with its line number."""
     client = host.connect()
     host.run(client, host.order("job", "true"))
     host.kill_supervisor(client)
@@ -257,7 +257,7 @@ def test_a_damaged_line_is_left_out_and_said(host):
 
 
 def test_what_starts_after_the_record_was_compacted_is_taken_over(host):
-    """Compacted while nothing ran: the environment that the client sent once is still there."""
+    """Compaction with nothing running keeps the environment that the client sent once."""
     client = host.connect()
     large = "x" * (instance_record.COMPACT_BYTES + 1)
     host.run(client, host.order("large", "/no/such/program", memo=large))
@@ -276,7 +276,7 @@ def test_what_starts_after_the_record_was_compacted_is_taken_over(host):
 
 
 def test_without_its_environment_nothing_is_restarted(host):
-    """A damaged line takes it: what runs is taken over, and why it does not start again is said."""
+    """The process with a lost environment is taken over, but refused a restart, with the reason."""
     client = host.connect()
     always = RestartPolicy(when="always", delay=0.01)
     client.start([host.order("one", "sleep", "1000", restart=always)])
@@ -298,7 +298,7 @@ def test_without_its_environment_nothing_is_restarted(host):
 
 
 def test_a_second_supervisor_is_refused(host, client):
-    """One state directory, one supervisor; the second says which one is there."""
+    """A second supervisor on a state directory ends with the pid of the first."""
     command = [sys.executable, "-m", "rosrm.supervisor", "--state", str(host.state)]
     root = str(Path(rosrm.__file__).parent.parent)
     result = subprocess.run(
@@ -314,7 +314,7 @@ def test_a_second_supervisor_is_refused(host, client):
 
 
 def test_two_slaves_that_start_at_once_get_one_supervisor(host):
-    """Both try to start it; one supervisor serves, one slave is refused as the second."""
+    """Both slaves try to start it; one supervisor serves, and the second slave is refused."""
     outcomes: list[object] = []
 
     def connect() -> None:
@@ -334,7 +334,7 @@ def test_two_slaves_that_start_at_once_get_one_supervisor(host):
 
 
 def test_a_long_path_is_no_trouble(tmp_path):
-    """A Unix socket's path holds 108 bytes; a state directory may be deeper."""
+    """A state directory may be deeper than the 108 bytes of a Unix socket's path."""
     host = Host(tmp_path / ("deep" * 20) / ("deeper" * 20))
     try:
         client = host.connect()
@@ -344,21 +344,21 @@ def test_a_long_path_is_no_trouble(tmp_path):
 
 
 def test_no_supervisor_is_started_unless_asked(host):
-    """`start=False` only looks."""
+    """With `start=False` a client only connects."""
     with pytest.raises(SupervisorError, match="no supervisor serves"):
         host.connect(start=False)
     assert not host.state.exists()
 
 
 def test_an_unusable_state_directory_is_said(tmp_path):
-    """What cannot be made is named, at once."""
+    """The error names the directory that cannot be created, at once."""
     (tmp_path / "file").write_text("")
     with pytest.raises(SupervisorError, match="file/state cannot be used"):
         SupervisorClient.connect(tmp_path / "file" / "state")
 
 
 def test_shutdown_ends_everything_and_leaves_nothing(host, client):
-    """Every process is stopped, the socket is gone, and so is the supervisor."""
+    """After the shutdown no process, no socket and no supervisor is left."""
     client.start([host.order("a", "sleep", "1000"), host.order("b", "sleep", "1000")])
     host.running(client, "b")
     client.shutdown()
@@ -379,7 +379,7 @@ def test_sigterm_is_a_shutdown(host, client):
 
 
 def test_it_ends_when_nothing_runs_and_nobody_is_there(host):
-    """A slave that keeps its processes leaves no supervisor behind for those that have ended."""
+    """A supervisor without a client ends when all its processes have ended."""
     first = host.connect()
     first.start([host.python("p", "import sys; sys.stdin.read(); input()")])
     assert host.ended(first, "p").exit_code == 1
@@ -391,7 +391,7 @@ def test_it_ends_when_nothing_runs_and_nobody_is_there(host):
 
 
 def test_it_stays_for_what_runs_and_ends_with_it(host):
-    """Nobody is there, and its last process ends: then it ends too."""
+    """A supervisor without a client ends with its last process."""
     first = host.connect()
     first.start([host.python("p", "import time; time.sleep(1000)")])
     pid = host.running(first, "p").pid
@@ -405,14 +405,14 @@ def test_it_stays_for_what_runs_and_ends_with_it(host):
 
 
 def test_a_lost_supervisor_is_told(host, client):
-    """A slave that waits hears at once that its supervisor is gone."""
+    """A waiting slave is notified at once of the end of its supervisor."""
     os.kill(client.pid, signal.SIGKILL)
     with pytest.raises(SupervisorError, match="is gone; its processes go on"):
         client.receive(10)
 
 
 def test_orders_pass_while_another_thread_waits(host, client):
-    """One thread blocks in `receive`; another one's order wakes it by its answer."""
+    """While one thread blocks in `receive`, another can send orders; the answer wakes the first."""
     received = []
     thread = threading.Thread(target=lambda: received.extend(client.receive(10)))
     thread.start()
@@ -422,7 +422,7 @@ def test_orders_pass_while_another_thread_waits(host, client):
 
 
 def test_it_sleeps_while_nothing_happens(host, client):
-    """No process, no order: it is not scheduled once."""
+    """Without processes or orders the supervisor is not scheduled at all."""
     host.run(client, host.order("job", "true"))
 
     def switches() -> str:
@@ -452,6 +452,6 @@ def test_it_imports_nothing_heavy():
 
 
 def test_it_is_small(client):
-    """At most 12 MiB by itself, alone on the machine (about 8 beside other Pythons)."""
+    """The supervisor uses at most 12 MiB, alone on the machine (about 8 beside other Pythons)."""
     rollup = Path(f"/proc/{client.pid}/smaps_rollup").read_text().split()
     assert int(rollup[rollup.index("Pss:") + 1]) < 12 * 1024

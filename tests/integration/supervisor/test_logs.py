@@ -1,4 +1,4 @@
-"""The logs of real processes: rotated, bounded, pruned."""
+"""Logs of real processes: rotation, size limits and pruning."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ with open("/dev/stdout", "ab", buffering=0) as out:
 
 
 def test_a_flood_is_bounded(host):
-    """Files of the limit's size, as many as are kept, however much is written."""
+    """The number and size of log files stay within the limits, however much is written."""
     limits = LogLimits(max_bytes=256 * KIB, keep=2)
     client = host.connect(log=limits)
     client.start([host.python("flood", FLOOD)])
@@ -49,7 +49,7 @@ def test_a_rotated_log_keeps_its_newest_lines(host):
 
 
 def test_logs_of_old_instances_are_pruned(host):
-    """Of one process only the newest instances' logs stay, with the files beside them."""
+    """Only the logs of a process's newest instances stay, with the files beside them."""
     client = host.connect(log=LogLimits(instances=3))
     for number in range(1, 6):
         host.log("many", number).with_suffix(".parameters.yaml").write_text("{}")
@@ -61,7 +61,7 @@ def test_logs_of_old_instances_are_pruned(host):
 
 
 def test_the_index_of_logs_survives_the_supervisor(host):
-    """A new supervisor knows the logs that are there, and prunes them too."""
+    """A new supervisor knows the existing logs, and prunes them, too."""
     client = host.connect(log=LogLimits(instances=2))
     for number in range(1, 3):
         host.run(client, host.order("many", "true", number=number))
@@ -75,7 +75,7 @@ def test_the_index_of_logs_survives_the_supervisor(host):
 
 
 def test_logs_of_old_processes_are_pruned(host):
-    """Jobs with names of their own leave a bounded number of logs."""
+    """Jobs with unique names leave a bounded number of logs."""
     client = host.connect(log=LogLimits(processes=10))
     for number in range(100):
         host.run(client, host.order(f"job{number}", "true", number=number))
@@ -87,7 +87,7 @@ def test_logs_of_old_processes_are_pruned(host):
 
 
 def test_logs_with_numbers_in_the_name_stay_apart(host):
-    """`a` and `a.1` are two processes."""
+    """The processes `a` and `a.1` have separate logs."""
     client = host.connect()
     host.run(client, host.order("a", "echo", "first", number=2))
     host.run(client, host.order("a.1", "echo", "second", number=3))
@@ -96,7 +96,7 @@ def test_logs_with_numbers_in_the_name_stay_apart(host):
 
 
 def test_any_process_name_is_a_safe_file_name(host):
-    """A name with slashes and dots stays below the folder of logs."""
+    """A process name with slashes and dots gives a path below the log folder."""
     client = host.connect()
     name = "../../ns/talker é"
     host.run(client, host.order(name, "echo", "hello"))

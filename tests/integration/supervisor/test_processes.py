@@ -1,4 +1,4 @@
-"""Real processes under a real supervisor: how they start, run and end."""
+"""Real processes under a real supervisor: start, run and end."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ while not os.path.exists("daemon.pid"): time.sleep(0.01)
 
 
 def test_exit_status_usage_and_output_are_kept(host, client):
-    """A process that exits at once: its code, its times, its memory and its last words."""
+    """The final status of a short process has its exit code, times, memory; its output is kept."""
     status = host.run(client, host.order("short", "sh", "-c", "echo out; echo err >&2; exit 3"))
     assert (status.state, status.exit_code) == (InstanceState.FAILED, 3)
     assert status.message == "exit code 3"
@@ -46,14 +46,14 @@ def test_exit_status_usage_and_output_are_kept(host, client):
 
 
 def test_a_crash_is_told_by_its_signal(host, client):
-    """Killed by a signal that nobody here sent: failed, with the signal's name."""
+    """A process killed by a foreign signal has failed, and the message names the signal."""
     status = host.run(client, host.order("crash", "sh", "-c", "kill -SEGV $$"))
     assert (status.state, status.exit_signal) == (InstanceState.FAILED, signal.SIGSEGV)
     assert status.message == "killed by SIGSEGV"
 
 
 def test_a_process_is_alone_in_its_session(host, client):
-    """A session leader with nothing inherited but a log, and nothing on its standard input."""
+    """A process leads its own session, inherits only its log, and reads /dev/null."""
     code = """
 import os
 print(os.getsid(0) == os.getpid() == os.getpgrp(), os.readlink("/proc/self/fd/0"))
@@ -65,7 +65,7 @@ print(sorted(int(fd) for fd in os.listdir("/proc/self/fd"))[:-1], os.getcwd())
 
 
 def test_a_process_starts_with_every_signal_at_its_default(host, client):
-    """Nothing is blocked, and nothing ignored that the supervisor or its Python ignores."""
+    """No signal is blocked, or ignored because the supervisor or its Python ignores it."""
     host.run(client, host.order("signals", "grep", "-E", "SigBlk|SigIgn", "/proc/self/status"))
     _, blocked, _, ignored = host.log("signals").read_text().split()
     own_to_glibc = 1 << 31 | 1 << 32  # signals 32 and 33, which its posix_spawn ignores
@@ -74,7 +74,7 @@ def test_a_process_starts_with_every_signal_at_its_default(host, client):
 
 
 def test_it_runs_in_its_environment_and_directory_alone(host, client, tmp_path):
-    """The environment is the order's, plus the supervisor's two marks; so is the directory."""
+    """Environment and directory are those of the order, plus two marks of the supervisor."""
     order = host.order(
         "env", "/usr/bin/env", environment={"A": "1"}, working_directory=str(tmp_path)
     )
@@ -84,7 +84,7 @@ def test_it_runs_in_its_environment_and_directory_alone(host, client, tmp_path):
 
 
 def test_environments_of_one_batch_stay_apart(host, client):
-    """Variables that are added, changed or left out against the first order's arrive so."""
+    """Variables added, changed or omitted against the first order arrive as ordered."""
     first = {"PATH": os.environ["PATH"], "A": "1", "B": "2"}
     second = {"PATH": os.environ["PATH"], "A": "3", "C": "4"}
     command = ("sh", "-c", "echo $A,$B,$C")
@@ -105,7 +105,7 @@ def _written(log):
 
 
 def test_a_process_that_ignores_everything_is_killed(host, client):
-    """SIGINT, SIGTERM, SIGKILL, each step told as it is taken and kept in the last message."""
+    """Each of SIGINT, SIGTERM, SIGKILL is reported when sent, and named in the final message."""
     client.start([host.python("deaf", IGNORES_ALL)])
     pid = host.running(client, "deaf").pid
     wait_until(lambda: host.log("deaf").read_text(), "it said that it is deaf")
@@ -121,13 +121,13 @@ def test_a_process_that_ignores_everything_is_killed(host, client):
     )
     assert times, told[-1].message
     terminated, killed = map(float, times.groups())
-    assert 0.3 <= terminated <= killed - 0.2  # they are rounded
+    assert 0.3 <= terminated <= killed - 0.2  # both are rounded
     assert killed >= 0.6
     wait_gone(pid)
 
 
 def test_a_stop_reaches_the_whole_group(host, client):
-    """What a process has started is stopped with it."""
+    """A stop also ends the children of the process."""
     client.start([host.order("group", "sh", "-c", "sleep 1000 & sleep 1000 & wait")])
     host.running(client, "group")
     wait_until(lambda: len(host.alive()) == 3, "a shell and two sleeps run")
@@ -137,14 +137,14 @@ def test_a_stop_reaches_the_whole_group(host, client):
 
 
 def test_children_that_survive_their_leader_are_stopped(host, client):
-    """The leader exits and leaves a child: it ends before the instance does; its code is kept."""
+    """A child of an exited leader ends before the instance does; the leader's exit code is kept."""
     status = host.run(client, host.order("leaver", "sh", "-c", "sleep 1000 & exit 4"))
     assert (status.state, status.exit_code) == (InstanceState.FAILED, 4)
     assert host.alive() == []
 
 
 def test_a_daemon_that_left_the_session_is_found(host, client):
-    """Two forks and a setsid do not make an orphan."""
+    """A daemon that left the session by two forks and setsid is still stopped."""
     status = host.run(client, host.python("daemon", DAEMON))
     assert status.state is InstanceState.EXITED
     wait_gone(int((host.state / "work" / "daemon.pid").read_text()))
@@ -152,7 +152,7 @@ def test_a_daemon_that_left_the_session_is_found(host, client):
 
 
 def test_a_deaf_child_that_is_left_over_is_killed(host, client):
-    """The escalation goes on for what the leader left."""
+    """The escalation to SIGKILL also applies to children that outlive their leader."""
     code = f"""
 import os, time
 if os.fork() == 0:
@@ -178,7 +178,10 @@ time.sleep(0.3)
     ],
 )
 def test_what_cannot_be_started_says_why(host, client, tmp_path, argv, directory, said):
-    """A clear message, at once, whatever the restart policy; another host may have it."""
+    """The start is refused at once with a reason, because another host may have the program.
+
+    The restart policy does not apply.
+    """
     for name, text in (("orphaned-script", "#!/no/such/interpreter\n"), ("nonsense", "x\n")):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o700)
@@ -192,7 +195,7 @@ def test_what_cannot_be_started_says_why(host, client, tmp_path, argv, directory
 
 
 def test_restarts_back_off_and_run_out(host, client):
-    """On failure it is started again, after growing waits, and at last it has failed."""
+    """A failing process is restarted after growing delays, until its attempts are used up."""
     policy = RestartPolicy(when="on-failure", delay=0.05, factor=2.0, attempts=3)
     order = host.order("flaky", "sh", "-c", "date +%s.%N; exit 1", restart=policy)
     status = host.run(client, order)
@@ -201,12 +204,12 @@ def test_restarts_back_off_and_run_out(host, client):
     times = [float(line) for line in host.log("flaky").read_text().split()]
     assert len(times) == 4
     waits = [later - earlier for earlier, later in itertools.pairwise(times)]
-    # A wait may be shorter by a fifth, so that what crashed together does not start together.
+    # A delay may be a fifth shorter, so that processes that crash together restart apart.
     assert all(wait >= 0.8 * most for wait, most in zip(waits, (0.05, 0.1, 0.2), strict=True))
 
 
 def test_a_forced_restart_is_a_new_process(host, client):
-    """Stop, then start: another pid, the same instance, no restart counted."""
+    """A restart by order gives another pid for the same instance, and counts no restart."""
     client.start([host.order("again", "sleep", "1000")])
     before = host.running(client, "again").pid
     client.restart(InstanceId("again", 1))
@@ -226,7 +229,7 @@ def test_a_late_start_is_refused(host, client):
 
 
 def test_a_repeated_start_starts_once(host, client):
-    """DDS repeats; the process does not."""
+    """A start order repeated by DDS starts one process."""
     order = host.order("once", "sh", "-c", "echo ran; sleep 1000")
     client.start([order, order])
     client.start([order])
@@ -238,7 +241,7 @@ def test_a_repeated_start_starts_once(host, client):
 
 
 def test_three_hundred_at_once(host, client):
-    """A burst of short jobs: each ends once, with its own status."""
+    """A burst of 300 short jobs ends with one final status for each."""
     began = time.monotonic()
     client.start([host.order(f"job{number}", "true", number=number) for number in range(300)])
     final = {}

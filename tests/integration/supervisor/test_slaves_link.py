@@ -1,4 +1,4 @@
-"""The slave's end: whatever becomes of its supervisor, its loop does not wait, nothing is lost."""
+"""The slave's connection to its supervisor: the loop never blocks, no order is lost."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from rosrm.supervisor.client import SupervisorClient
 
 from .conftest import TIMEOUT, wait_gone
 
-#: Together more than a socket holds.
+#: Together more than a socket buffer holds.
 COUNT, LARGE = 10, "x" * 100_000
 MANY = tuple(InstanceId(f"p{number}", 1) for number in range(COUNT))
 
 
 class Loop:
-    """What a slave does with its supervisor: it takes in what is posted, one after the other."""
+    """The event loop of a slave: it runs posted functions one after the other."""
 
     def __init__(self, host) -> None:
         self.posted: queue.Queue = queue.Queue()
@@ -76,7 +76,7 @@ def loop(host):
 
 
 def test_a_killed_supervisor_is_replaced_without_the_loop(loop, monkeypatch) -> None:
-    """To start another one takes as long as it takes: the slave must be heard meanwhile."""
+    """The new supervisor starts in another thread, because the slave must keep its lease."""
     by: list[threading.Thread] = []
     connect = SupervisorClient.connect
 
@@ -101,7 +101,7 @@ def test_a_killed_supervisor_is_replaced_without_the_loop(loop, monkeypatch) -> 
 
 
 def test_a_supervisor_that_was_ended_by_another_is_replaced(loop) -> None:
-    """SIGTERM to it alone: the slave reports what it stopped, and the next one takes orders."""
+    """After a SIGTERM the slave reports the stopped processes, and the next supervisor works."""
     loop.link.start([loop.host.order("one", "sleep", "1000")])
     loop.wait(loop.started, "it runs")
     os.kill(loop.pid, signal.SIGTERM)
@@ -116,7 +116,7 @@ def test_a_supervisor_that_was_ended_by_another_is_replaced(loop) -> None:
 
 
 def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
-    """More than the socket holds: none makes the loop wait, none is lost, in order."""
+    """Orders beyond the socket's buffer do not block the loop, and all arrive in order."""
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
     loop.link.carry_out(core.Fence(MANY[-1]))
@@ -129,7 +129,7 @@ def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
 
 
 def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, monkeypatch) -> None:
-    """What it had taken runs and is told; what it had not is given to it again: all of it runs."""
+    """The slave reconnects and repeats the orders that were not read: each process runs, once."""
     monkeypatch.setattr(send_buffer, "MOST_UNSENT", 300_000)
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
@@ -143,7 +143,7 @@ def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, mon
 
 
 def test_a_launch_that_comes_between_two_supervisors_is_not_lost(loop) -> None:
-    """Nor is one that is stopped before it was given to the next one started."""
+    """A launch stopped before the next supervisor received it is not started."""
     os.kill(loop.pid, signal.SIGKILL)
     wait_gone(loop.pid)
     stopped = InstanceId("stopped", 1)
@@ -158,7 +158,7 @@ def test_a_launch_that_comes_between_two_supervisors_is_not_lost(loop) -> None:
 
 
 def test_the_shutdown_reaches_one_that_is_just_taking_over(loop) -> None:
-    """The supervisor is killed in the moment in which the slave is told to end."""
+    """A shutdown during the take-over reaches the next supervisor."""
     loop.link.start([loop.host.order("one", "sleep", "1000")])
     loop.wait(loop.started, "it runs")
     os.kill(loop.pid, signal.SIGKILL)

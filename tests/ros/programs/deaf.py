@@ -1,4 +1,4 @@
-"""A program of `benchmarks.handoff_nodes` that SIGINT and SIGTERM do not reach."""
+"""A program of `benchmarks.handoff_nodes` that blocks SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ import sys
 
 from benchmarks import handoff_nodes
 
-# Blocked, not ignored: rclpy sets handlers of its own.
+# Blocked, not ignored, because rclpy installs its own handlers.
 signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])
 handoff_nodes.main(sys.argv)

@@ -1,7 +1,7 @@
-"""A charging dock that can be moved from host to host while robots charge at it.
+"""A charging dock that can migrate while robots charge at it.
 
-Each order is for some charge into one bay. A fast loop delivers to the bay that waits for most, by
-no more than `limit`, while there is a supply; a slow one reports.
+Each order adds charge to one bay. A fast loop delivers to the bay with the largest pending charge,
+by at most `limit`, while there is a supply. A slow loop reports.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ARRAYS = ("pending", "orders", "history")
 
 
 class Dock(Node):
-    """Charges what was ordered, bay by bay.
+    """A dock that charges what was ordered, bay by bay.
 
     Subscribes:
         orders: [number, bay, mAs]; each counts.
@@ -41,7 +41,7 @@ class Dock(Node):
     """
 
     def __init__(self) -> None:
-        """Begins with empty bays."""
+        """Begin with empty bays."""
         super().__init__("dock")
         fixed = ParameterDescriptor(read_only=True)
         self.bays: int = self.declare_parameter("bays", 4, fixed).value
@@ -71,16 +71,16 @@ class Dock(Node):
         self.keep_state("~/bays", Arrays, self.save_bays, self.restore_bays)
 
     def check_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Refuses a limit that would harm the batteries."""
+        """Refuse a limit that would harm the batteries."""
         fine = all(0 <= p.value <= 5000 for p in parameters if p.name == "limit")
         return SetParametersResult(successful=fine, reason="" if fine else "0 to 5000 mA")
 
     def take_parameters(self, parameters: Sequence[Parameter]) -> None:
-        """Has the next control cycle go by what was set."""
+        """Apply the new limit from the next control cycle on."""
         self.limit = next((p.value for p in parameters if p.name == "limit"), self.limit)
 
     def on_order(self, order: Int64MultiArray) -> None:
-        """Books an order and confirms it."""
+        """Book an order and confirm it."""
         number, bay, charge = order.data
         self.pending[bay % self.bays] += charge
         self.orders[bay % self.bays] += 1
@@ -90,18 +90,18 @@ class Dock(Node):
         self.receipts_out.publish(Int64MultiArray(data=receipt))
 
     def on_voltage(self, voltage: Float64) -> None:
-        """Remembers the newest reading."""
+        """Store the newest reading."""
         self.volts = voltage.data
         self.readings += 1
 
     def reserve(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        """Counts a reservation."""
+        """Count a reservation."""
         self.reservations += 1
         answer.success, answer.message = True, str(self.reservations)
         return answer
 
     def control(self) -> None:
-        """Delivers to the bay that waits for most."""
+        """Deliver to the bay with the largest pending charge."""
         bay = int(self.pending.argmax())
         delivered = min(self.pending[bay], self.limit * PERIOD) if self.volts else 0.0
         if delivered:
@@ -112,7 +112,7 @@ class Dock(Node):
         self.current_out.publish(Float64MultiArray(data=[*map(float, values)]))
 
     def report(self) -> None:
-        """Sums up, and remembers it."""
+        """Sum up the pending charge, and append it to the history."""
         self.reports += 1
         left = self.pending.sum()
         self.history = np.vstack([self.history, [self.volts, left]])[-600:]
@@ -121,23 +121,23 @@ class Dock(Node):
         self.health_out.publish(Float64MultiArray(data=[*map(float, values)]))
 
     def save(self) -> Float64MultiArray:
-        """Returns the counters and the last reading."""
+        """Return the counters and the last reading."""
         counts = [self.sequence, self.receipts, self.reports, self.readings, self.reservations]
         return Float64MultiArray(data=[*map(float, counts), self.volts])
 
     def restore(self, state: Float64MultiArray) -> None:
-        """Takes them over."""
+        """Restore the counters and the last reading."""
         *counts, self.volts = state.data
         whole = map(int, counts)
         self.sequence, self.receipts, self.reports, self.readings, self.reservations = whole
 
     def save_bays(self) -> Arrays | None:
-        """Returns what each bay waits for, if that has changed."""
+        """Return the pending charge of each bay, if changed."""
         changed, self.bays_changed = self.bays_changed, False
         return arrays_message({name: getattr(self, name) for name in ARRAYS}) if changed else None
 
     def restore_bays(self, message: Arrays) -> None:
-        """Takes it over."""
+        """Restore the pending charge of each bay."""
         for name, array in arrays_of(message).items():
             setattr(self, name, array)
 

@@ -1,7 +1,7 @@
-"""The portable counter, with something that keeps it from a move: the first argument says what.
+"""The portable counter with a reason against migration, by its first argument.
 
-`pipe`: it holds a pipe whose other end belongs to a process outside. `hangs FILE`: a callback does
-not end while there is this file.
+`pipe`: the process holds a pipe whose other end belongs to an outside process. `hangs FILE`: a
+callback does not return while this file exists.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rosrm_examples.portable_counter import PortableCounter
 class Troubled(PortableCounter):
     def __init__(self) -> None:
         super().__init__(mb=1.0, period=0.02)
-        if sys.argv[1] == "pipe":  # the shell ends, and `cat` has nobody but the supervisor
+        if sys.argv[1] == "pipe":  # the shell ends, so the supervisor is the parent of `cat`
             shell = ["sh", "-c", "exec 3<&0; cat <&3 >/dev/null &"]
             self.child = subprocess.Popen(shell, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
             self.child.wait()

@@ -22,23 +22,23 @@ from rosrm import (
 
 @dataclass(frozen=True)
 class TeleportOptions:
-    """What cluster.yaml may set.
+    """Options of the strategy in cluster.yaml.
 
     Attributes:
-        patience: seconds for each step.
+        patience: timeout of each step in seconds.
     """
 
     patience: PositiveSeconds = 10.0
 
 
 class Teleport:
-    """Stops the source first, after the destination was told."""
+    """A strategy that announces the move on the destination, then stops the source first."""
 
     def __init__(self, _options: TeleportOptions) -> None:
-        """Take nothing: each move brings its options."""
+        """Ignore the defaults: each move carries its options."""
 
     def propose(self, move: Move) -> Plan:
-        """Tell, stop here, start there, be ready there."""
+        """Announce, stop the source, start the destination, await its readiness."""
         wait = move.options.patience
         back = Start(move.fallback, move.source_host, wait)
         undo = Stop(move.destination, move.destination_host, wait)
@@ -54,7 +54,7 @@ class Teleport:
 
 
 def announce(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Runs on the destination's slave."""
+    """Announce the move, on the destination's slave."""
     return {"announced": arguments["who"]}
 
 

@@ -1,4 +1,4 @@
-"""A third party's probe: how hot the machine is, as a fraction of what it stands."""
+"""A third party's probe: the machine's temperature as a fraction of its maximum."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rosrm import ProbeContext, ProbeOffer, Reading, ResourceDescription, SkipPl
 
 @dataclass(frozen=True)
 class ThermometerOptions:
-    """What host.yaml may set.
+    """Options of the probe in host.yaml.
 
     Attributes:
-        sensor: file that holds thousandths of a degree.
-        hottest: degrees that count as 1.0.
+        sensor: file with the temperature in thousandths of a degree.
+        hottest: temperature in degrees that counts as 1.0.
     """
 
     sensor: str = "/sys/class/thermal/thermal_zone0/temp"
@@ -26,7 +26,7 @@ class ThermometerOptions:
 
 
 class Thermometer:
-    """Reads one sensor."""
+    """A probe of one temperature sensor."""
 
     def __init__(self, options: ThermometerOptions, context: ProbeContext) -> None:
         if not Path(options.sensor).is_file():
@@ -36,16 +36,16 @@ class Thermometer:
 
     @property
     def resources(self) -> Sequence[ResourceDescription]:
-        """One: heat."""
+        """Return the only resource, `heat`."""
         return [self._resource]
 
     def read(self) -> Iterable[Reading]:
-        """The temperature now."""
+        """Return the current temperature."""
         degrees = int(Path(self._options.sensor).read_text(encoding="ascii")) / 1000.0
         return [Reading("heat", max(0.0, degrees / self._options.hottest))]
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: the probe holds no resources."""
 
 
 @hookimpl
