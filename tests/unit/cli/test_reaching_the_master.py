@@ -75,7 +75,7 @@ def test_each_command_that_asks_the_master_joins_ros_early():
 
 @pytest.fixture
 def joined(monkeypatch):
-    """Record the ends of participants that were made early."""
+    """Record creation and close of participants that were made early."""
     became = []
 
     class Participant:

@@ -235,7 +235,7 @@ class Air:
         ]  # fmt: skip
 
     def master_is_gone(self) -> None:
-        """Drop the master's messages that no node has received yet."""
+        """Drop the master's topics with all messages that were not received yet."""
         self.latched.clear()
         self.channels.clear()
         self.to_master.clear()

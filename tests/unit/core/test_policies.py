@@ -252,7 +252,7 @@ def test_processes_that_differ_in_nothing_that_is_read_share_a_ranking() -> None
 
 
 def test_a_policy_may_read_what_decides_where_a_process_may_go() -> None:
-    """Runs, namespace, kind, priority, needs and labels need no declaration."""
+    """Program, namespace, kind, priority, needs and labels need no declaration."""
     read: dict[str, object] = {}
 
     def look(hosts: HostView, process: ProcessView) -> Scores:

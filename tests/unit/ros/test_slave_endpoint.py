@@ -243,7 +243,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     slave.pass_time(5.0, new)
     assert slave.link is Link.REGISTERED
     assert len(slave.sent(srv.RegisterHost)) == 2
-    slave.pass_time(3.0)  # the first run is silent for a while
+    slave.pass_time(3.0)  # the new run is silent for a while
     slave.pass_time(PERIOD, new)
     new.greet()
     new.take_in()
