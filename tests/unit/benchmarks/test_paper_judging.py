@@ -86,7 +86,7 @@ def test_an_assignment_that_is_given_again_counts_once():
 
 
 def test_a_host_that_joins_is_judged_from_when_it_is_seen():
-    """Before that, no process could have gone there."""
+    """A process placed earlier could not have gone to that host."""
     trace = Trace(looks=[look_at(0.0, {"host1": 0.5})])
     trace.looks.append(look_at(2.0, {"host1": 0.5, "host2": BASE}))
     trace.events = [

@@ -69,7 +69,7 @@ def test_a_wrong_number_is_refused(number):
 
 @pytest.mark.parametrize(("text", "value"), [("1%", 0.01), ("0.01", 0.01), ("100%", 1.0), ("0", 0)])
 def test_a_share_is_percent_or_a_fraction(text, value):
-    """Both forms are common."""
+    """Users write shares in both forms."""
     assert fraction(text) == pytest.approx(value)
 
 

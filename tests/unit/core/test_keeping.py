@@ -345,7 +345,7 @@ def test_where_it_was_submitted_is_not_forgotten_with_the_master():
 
 
 def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer_one():
-    """Until then the old replicas are the only ones if the new host is lost."""
+    """The old replicas are the only ones if the new host is lost before its first snapshot."""
     cluster = running(Asked(), "a", "b")
     source = where(cluster)
     number = cluster["p"].owner

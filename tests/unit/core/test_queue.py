@@ -213,7 +213,7 @@ def test_an_assignment_that_was_lost_is_given_again_as_an_order() -> None:
 
 
 def test_an_assignment_that_arrives_twice_is_one() -> None:
-    """The answer was only late."""
+    """A late answer and the repeated order start one instance."""
     machine = Machine("a")
     cluster = Cluster(machine, order_retry=2.0, delivery_timeout=5.0)
     commands = cluster.decide(happened.SubmissionReceived(1, (job("p"),)))

@@ -182,7 +182,7 @@ def test_cancel_of_one_that_does_not_end_is_asked_again() -> None:
 
 
 def test_cancel_of_one_whose_host_is_lost_ends_when_the_host_is_back() -> None:
-    """Until then the process shows as being stopped."""
+    """The process shows as being stopped until its host rejoins."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.machines["a"].connected = False
@@ -379,7 +379,7 @@ def test_a_job_that_exits_with_0_has_finished_one_that_does_not_has_failed() -> 
 
 
 def test_a_node_runs_once_it_is_seen_in_the_graph() -> None:
-    """Until then it is starting."""
+    """A node counts as starting until the graph shows it."""
     cluster = Cluster("a")
     cluster.submit(node("p"))
     assert cluster.phase("p") == "starting"
@@ -527,7 +527,7 @@ def test_the_record_of_a_request_names_its_requester() -> None:
 
 
 def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ended() -> None:
-    """Until then that instance still runs."""
+    """The process shows as being cancelled while that instance runs."""
     cluster = Cluster("a")
     cluster.machines["a"].stubborn.add("p")
     cluster.submit(process("p"))

@@ -52,7 +52,7 @@ def test_the_street_is_mapped_truly() -> None:
 
 
 def test_mapping_may_start_anywhere_and_fast(street) -> None:
-    """With no motion known yet, 20 m/s are found at once, wherever on the street it starts."""
+    """Without a known motion, SLAM finds 20 m/s at once, at any start on the street."""
     drive = street(60)
     assert drive.truth is not None
     for start in range(0, 56, 4):
