@@ -1,4 +1,4 @@
-"""The architecture's contracts, the style and the types, as tests: what `make lint` runs."""
+"""Checks of `make lint` as tests: import contracts, style and types."""
 
 from __future__ import annotations
 

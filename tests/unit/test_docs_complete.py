@@ -1,4 +1,4 @@
-"""The reference pages name everything there is: hooks, offers, settings, commands, JSON fields."""
+"""Completeness of the reference pages: hooks, offers, settings, commands, JSON fields."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def page(name: str) -> str:
 
 
 def section(text: str, heading: str) -> str:
-    """What stands under a heading, up to the next of its level or above."""
+    """Return the text under a heading, up to the next one of its level or above."""
     found = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE)
     assert found, f"no section {heading!r}"
     rest = text[found.end() :]
@@ -47,7 +47,7 @@ def section(text: str, heading: str) -> str:
 
 
 def keys(kind: type, before: str = "") -> Iterator[str]:
-    """The keys of a file by their dotted names, as the dataclasses have them."""
+    """Yield the keys of a file by their dotted names, as in the dataclasses."""
     hints = get_type_hints(kind, include_extras=True)
     for f in fields(kind):
         hint = hints[f.name]
@@ -63,7 +63,7 @@ def keys(kind: type, before: str = "") -> Iterator[str]:
 
 
 def rows(text: str) -> set[str]:
-    """The first column of the tables of a text."""
+    """Return the first column of the tables of a text."""
     return set(re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE))
 
 
@@ -96,7 +96,7 @@ def test_every_option_of_a_scoring_policy_is_documented(options):
 
 @pytest.mark.parametrize("options", [RelaunchOptions, HandoffOptions, CriuOptions])
 def test_every_option_of_a_strategy_is_documented(options):
-    """Of those that come with rosrm, in its own table."""
+    """Each shipped strategy has a table with all its options."""
     text = section(page("configuration.md"), "Options of the strategies")
     name = options.__name__.removesuffix("Options").lower()
     table = text[text.index(f"| `{name}` | default |") :].split("\n\n")[0]
@@ -219,7 +219,7 @@ def test_every_field_of_a_spec_that_a_policy_may_read_is_documented():
     assert {name for name in SPEC_FIELDS if f"`{name}`" not in text} == set()
 
 
-#: A commit is done at once and stays: it takes no time and has no way back.
+#: A commit takes no time and cannot be undone.
 _OF_NO_USE = {(plan.Commit, "timeout"), (plan.Commit, "undo")}
 
 
@@ -272,5 +272,5 @@ def test_every_field_of_the_json_is_documented(title, kinds):
     )
     for kind in kinds:
         for f in fields(kind):
-            if f.name != "description":  # of a host: its fields stand beside the others
+            if f.name != "description":  # fields of a host are documented beside the others
                 assert f"`{f.name}`" in found[0], f"{kind.__name__}.{f.name}"

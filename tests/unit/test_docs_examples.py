@@ -1,4 +1,4 @@
-"""What the pages show is right: files load, links lead somewhere, commands and names exist."""
+"""Examples in the documentation: files load, links resolve, commands and names exist."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def name_of(page: Path) -> str:
 
 
 def blocks(page: Path, language: str) -> Iterator[tuple[str, str, str]]:
-    """The mark before each fenced block of a language, its title and its text."""
+    """Yield mark, title and text of each fenced block of a language."""
     for mark, found, info, text in _FENCE.findall(page.read_text(encoding="utf-8")):
         if found == language:
             title = re.search(r'title="([^"]+)"', info)
@@ -60,7 +60,7 @@ def registry() -> Registry:
 
 @pytest.mark.parametrize(("title", "text"), FILES)
 def test_every_file_that_is_shown_is_right(title, text, tmp_path, monkeypatch, registry):
-    """By `rosrm config check FILE`, without its kind: keys or name tell it."""
+    """`rosrm config check FILE` accepts it, and finds its kind from keys or name."""
     file = tmp_path / title
     file.write_text(text, encoding="utf-8")
     monkeypatch.setattr(Registry, "discover", lambda: registry)
@@ -70,7 +70,7 @@ def test_every_file_that_is_shown_is_right(title, text, tmp_path, monkeypatch, r
 
 
 def test_no_two_pages_have_clusters_of_one_name():
-    """They would find each other's processes in the journal, which lies below the name."""
+    """Their processes would mix in the journal, whose path is below the name."""
     pages = {}
     for page in PAGES:
         for _, title, text in blocks(page, "yaml"):
@@ -82,7 +82,7 @@ def test_no_two_pages_have_clusters_of_one_name():
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_yaml_block_says_what_it_is(page):
-    """By a title, which is loaded here, or by a mark, for which another test loads it."""
+    """A title means that it is loaded here; a mark names another test that loads it."""
     unmarked = [text for mark, title, text in blocks(page, "yaml") if not (mark or title)]
     assert not unmarked
 
@@ -107,7 +107,7 @@ def test_a_program_is_shown_as_it_is(mark, text):
 
 
 def links(page: Path) -> Iterator[str]:
-    """The relative links of a page, code left out."""
+    """Yield the relative links of a page, code left out."""
     text = _FENCE.sub("", page.read_text(encoding="utf-8"))
     for target in _LINK.findall(re.sub(r"`[^`\n]*`", "`code`", text)):
         if not re.match(r"[a-z]+:", target):
@@ -115,7 +115,7 @@ def links(page: Path) -> Iterator[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors of the headings of a page, as GitHub makes them."""
+    """Return the anchors of the headings of a page, as GitHub makes them."""
     text = _FENCE.sub("", page.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
@@ -148,7 +148,7 @@ def test_every_file_of_the_documentation_is_reached_from_its_index():
 
 
 def shown_commands(page: Path) -> Iterator[list[str]]:
-    """The words of each `rosrm` command line in the console blocks of a page."""
+    """Yield the arguments of each `rosrm` command line in the console blocks of a page."""
     for _, _, text in blocks(page, "console"):
         for line in re.findall(r"^[\w-]*\$ (?:\w+=\S+ )*rosrm ([^#|\n]+)", text, re.MULTILINE):
             yield line.split()
@@ -173,7 +173,7 @@ def test_every_command_that_is_shown_exists(page):
 
 
 def test_every_page_with_commands_is_run_or_says_why_not():
-    """The lists in `tests/pages.py` are all there is."""
+    """The lists in `tests/pages.py` contain every page."""
     run = {*pages.RUN, pages.RUN_IN_LAB}
     assert run.isdisjoint(pages.NOT_RUN)
     assert all(pages.NOT_RUN.values())
@@ -182,7 +182,7 @@ def test_every_page_with_commands_is_run_or_says_why_not():
 
 @pytest.mark.parametrize("page", [*pages.RUN, pages.RUN_IN_LAB])
 def test_every_block_that_is_not_run_says_why(page):
-    """And of every page that is run, something is."""
+    """At least one block of each page that is run must be run."""
     typed = [block for block in pages.blocks(page) if block.language == "console"]
     assert all(block.about for block in typed if block.mark)
     assert any(block.mark != "not run" for block in typed)
@@ -233,7 +233,7 @@ def test_the_protocol_page_has_every_name():
 
 
 def test_the_protocol_page_says_how_a_host_gets_its_name():
-    """Done by the page's own words, its example comes out as it is shown, and as rosrm has it."""
+    """The steps in the page turn its example into the shown name, which is rosrm's name."""
     text = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8")
     example = re.search(r"`(robot-1)` becomes `(\w+)`", text)
     assert "`_` and the CRC-32 (as in zlib; 8 hex digits) of the name in UTF-8" in text
@@ -245,7 +245,7 @@ def test_the_security_policy_has_every_name_and_no_other():
     root = ET.parse(DOCS / "how-to" / "rosrm.policy.xml").getroot()
     topics = {one.text for one in root.iter("topic")} - {"/parameter_events"}
     services = {one.text for one in root.iter("service")}
-    assert topics == TOPICS | {"handoff/*"}  # each handoff has a channel of its own
+    assert topics == TOPICS | {"handoff/*"}  # each handoff has its own channel
     assert {re.sub(r"^host/[^/]+/", "", service) for service in services} == NAMES - TOPICS
     for service in services:
         assert service.startswith("host/") == (service.rsplit("/", 1)[-1] in OF_A_HOST)

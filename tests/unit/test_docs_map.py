@@ -1,4 +1,4 @@
-"""The map of the code in the documentation: what it names is there, and no package is missing."""
+"""Code map in the documentation: its names exist, and no package is missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAP = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 
 
 def tree(number: int) -> list[set[str]]:
-    """The names of a drawn tree of folders, by group."""
+    """Return the names of a drawn tree of folders, by group."""
     drawn = re.findall(r"^```text\n(.*?)^```", MAP, re.MULTILINE | re.DOTALL)[number]
     return [set(re.findall(r"^(\w+)(?:/|\.py) ", group, re.MULTILINE))
             for group in drawn.split("\n\n")]  # fmt: skip
@@ -31,7 +31,7 @@ def folders(path: str) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_source_file_that_is_named_exists(page: Path) -> None:
-    """As `rosrm/....py` or `plugins/....py`, with all its folders."""
+    """Paths are `rosrm/....py` or `plugins/....py`, with all their folders."""
     text = page.read_text(encoding="utf-8")
     named = re.findall(r"(?<![\w/.])(?:rosrm|plugins)/[\w/]+\.py\b", text)
     named += re.findall(r"`((?:rosrm|plugins)/[\w/]+/)`", text)
@@ -40,7 +40,7 @@ def test_every_source_file_that_is_named_exists(page: Path) -> None:
 
 @pytest.mark.parametrize("way", ["a reading", "a submission", "a migration"])
 def test_each_step_of_a_way_names_one_file(way: str) -> None:
-    """In order: a path, and what happens there."""
+    """Each step has a path and the action there, in order."""
     section = re.split(r"^## ", MAP.partition(f"## The way of {way}\n")[2], flags=re.MULTILINE)[0]
     steps = re.findall(r"^(\d+)\. (.*)$", section, re.MULTILINE)
     assert [int(number) for number, _ in steps] == [*range(1, len(steps) + 1)]
@@ -62,5 +62,5 @@ def test_the_packages_of_the_map_are_those_of_the_layers() -> None:
 
 
 def test_the_map_has_every_folder_of_the_masters_core() -> None:
-    """The other tree of the page."""
+    """The second tree of the page has these folders."""
     assert set().union(*tree(1)) == folders("rosrm/core/master")

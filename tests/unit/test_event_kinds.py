@@ -1,4 +1,4 @@
-"""The kinds of events: their reference page, and that each of them is recorded."""
+"""Kinds of events: their reference page, and their use in the code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SOURCES = Path(__file__).parents[2] / "rosrm"
 
 
 def test_the_reference_page_has_the_table_of_the_kinds() -> None:
-    """`python scripts/event_table.py` writes it; every kind has a meaning."""
+    """`python scripts/event_table.py` writes the table; every kind has a meaning."""
     assert PAGE.read_text() == with_table(PAGE.read_text())
     assert all(kind.meaning for kind in EventKind)
 
@@ -29,7 +29,7 @@ def test_every_kind_is_recorded_somewhere() -> None:
 
 
 def test_a_kind_is_its_text() -> None:
-    """In JSON, in messages and in comparisons it is what it was before; it is no free text."""
+    """JSON, messages and comparisons use the text of the kind; arbitrary text is no kind."""
     assert f"{EventKind.HOST_LOST}" == "host_lost" == EventKind.HOST_LOST
     assert {"host_lost": 1}[EventKind.HOST_LOST] == 1
     assert EventKind.read("host_lost") is EventKind.HOST_LOST

@@ -1,4 +1,4 @@
-"""The SQLite journal: what was answered is there after any death; a fault says what to do."""
+"""SQLite journal: acknowledged writes survive any death; an error names the remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def fill(path, count=3) -> None:
 
 
 def run(code: str, path, **options) -> subprocess.Popen:
-    """A process that uses the journal."""
+    """Start a process that uses the journal."""
     code = textwrap.dedent(code)
     return subprocess.Popen(
         [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True, **options
@@ -59,7 +59,7 @@ WRITER = """
 
 @pytest.mark.parametrize("after", [1, 7, 150, 1200])
 def test_sigkill_loses_nothing_that_was_answered(path, after) -> None:
-    """Whatever `write` returned from is there, whole; of what it did not, all of it or nothing."""
+    """Every acknowledged write is complete; an unacknowledged one is complete or absent."""
     writer = run(WRITER, path)
     for _ in range(after):
         answered = int(writer.stdout.readline())
@@ -81,7 +81,7 @@ def test_sigkill_loses_nothing_that_was_answered(path, after) -> None:
 
 
 def test_a_group_is_whole_or_not_at_all(path) -> None:
-    """A group with something that cannot be kept changes nothing, and the next one goes on."""
+    """A group with an invalid value changes nothing, and the next group is written."""
     journal = SqliteJournal(path)
     journal.write([Record("a")], [Intent("host", "h", {"n": 1})], 0.0)
     with pytest.raises(TypeError, match="no JSON"):
@@ -128,7 +128,7 @@ def spoil_index(path):
     "spoil", [spoil_header, spoil_middle, spoil_end, spoil_value, spoil_all, spoil_index]
 )
 def test_a_damaged_file_is_refused(path, spoil) -> None:
-    """With its path and what to do; it is not repaired, overwritten or taken for an empty one."""
+    """The error has its path and the remedy; the file is not changed or taken for an empty one."""
     fill(path, 200)
     spoil(path)
     before = path.read_bytes()
@@ -142,13 +142,14 @@ def test_a_damaged_file_is_refused(path, spoil) -> None:
 
 
 def test_a_damaged_log_costs_what_is_behind_the_damage(path) -> None:
-    """SQLite says nothing of it: the number of the newest record tells, to whoever knew it."""
+    """SQLite raises no error; only the number of the newest record reveals the loss."""
     writer = run(WRITER, path)
     for _ in range(20):
         answered = int(writer.stdout.readline())
     writer.kill()
     writer.wait(30)
-    answered += sum(line.endswith("\n") for line in writer.stdout)  # on a busy machine it wrote on
+    # a busy machine may have let the writer continue
+    answered += sum(line.endswith("\n") for line in writer.stdout)
     writer.stdout.close()
     log = path.with_name("journal.sqlite-wal")
     raw = bytearray(log.read_bytes())
@@ -163,7 +164,7 @@ def test_a_damaged_log_costs_what_is_behind_the_damage(path) -> None:
 
 
 def test_a_log_that_can_be_none_is_said(path) -> None:
-    """Something else lies in its place: where to look is in the message."""
+    """The log's path is occupied, and the message names it."""
     fill(path)
     path.with_name("journal.sqlite-wal").mkdir()
     with pytest.raises(JournalError, match="-wal"):
@@ -172,7 +173,7 @@ def test_a_log_that_can_be_none_is_said(path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a file system")
 def test_a_file_system_that_is_read_only_is_said(tmp_path) -> None:
-    """With what to look at; it is no damage."""
+    """The message has the path and the remedy, and claims no damage."""
     disk = tmp_path / "disk"
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "tmpfs", disk], check=False).returncode:
@@ -187,7 +188,7 @@ def test_a_file_system_that_is_read_only_is_said(tmp_path) -> None:
 
 
 def test_another_version_is_refused(path) -> None:
-    """A file of a later rosrm is not misread."""
+    """A file of a later version of rosrm is not misread."""
     fill(path)
     with sqlite3.connect(path) as database:
         database.execute("PRAGMA user_version = 99")
@@ -196,7 +197,7 @@ def test_another_version_is_refused(path) -> None:
 
 
 def test_a_stranger_s_database_is_refused(path) -> None:
-    """Somebody else's SQLite file is not made ours."""
+    """The file of another program is not changed."""
     path.parent.mkdir()
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE record (something INTEGER)")
@@ -205,7 +206,7 @@ def test_a_stranger_s_database_is_refused(path) -> None:
 
 
 def test_a_locked_file_is_refused(path) -> None:
-    """Somebody else writes to it: said within seconds, with whom to look for."""
+    """The error comes within seconds, and names the way to find the other writer."""
     fill(path)
     holder = sqlite3.connect(path, isolation_level=None)
     holder.execute("BEGIN EXCLUSIVE")
@@ -215,7 +216,7 @@ def test_a_locked_file_is_refused(path) -> None:
 
 
 def test_a_full_disk_is_said(path) -> None:
-    """What was answered before stays; the message says what is full and what to do."""
+    """Acknowledged writes stay; the message has the full disk and the remedy."""
     code = """
         import json, resource, sys
         from pathlib import Path
@@ -249,9 +250,9 @@ def test_a_full_disk_is_said(path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
 def test_a_full_file_system_is_said(tmp_path) -> None:
-    """The same on a file system without room, by its name; where room is made, it goes on.
+    """The error has the file system, and writes succeed again once there is room.
 
-    The group that could not be written is written then, as it is, and its numbers have no gap.
+    The group that failed is then written unchanged, and its numbers have no gap.
     """
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -288,14 +289,14 @@ def test_a_full_file_system_is_said(tmp_path) -> None:
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_that_cannot_be_written_is_said(tmp_path) -> None:
-    """With the path."""
+    """The error has the path."""
     tmp_path.chmod(0o500)
     with pytest.raises(JournalError, match=r"journal\.sqlite"):
         SqliteJournal(tmp_path / "state" / "journal.sqlite")
 
 
 def test_a_path_that_can_be_none_is_said(tmp_path) -> None:
-    """A file where the folder should be, or a folder where the file should be."""
+    """The path is a file in place of the folder, or a folder in place of the file."""
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.sqlite").mkdir()
     for path in (tmp_path / "file" / "journal.sqlite", tmp_path / "folder.sqlite"):
@@ -304,7 +305,7 @@ def test_a_path_that_can_be_none_is_said(tmp_path) -> None:
 
 
 def test_old_events_are_pruned(path) -> None:
-    """The newest are kept, and the count goes on after a restart."""
+    """The newest events are kept, and their numbers continue after a restart."""
     journal = SqliteJournal(path, keep_events=50)
     for _ in range(25):
         journal.write([Record("n")] * 100, [], 0.0)
@@ -318,7 +319,7 @@ def test_old_events_are_pruned(path) -> None:
 
 
 def test_damaged_facts_of_an_event_hide_no_other(path) -> None:
-    """They are for people, who are told."""
+    """Facts are information for users only, and the event shows the damage."""
     fill(path)
     with sqlite3.connect(path) as database:
         database.execute("UPDATE record SET facts = '{' WHERE sequence = 2")
@@ -328,7 +329,7 @@ def test_damaged_facts_of_an_event_hide_no_other(path) -> None:
 
 
 def test_pruning_that_fails_fails_no_write(path) -> None:
-    """What was asked for is written; a second attempt at it would write it twice."""
+    """The write itself succeeded, and a retry would write it twice."""
     journal = SqliteJournal(path, keep_events=0)
     journal._database.execute(
         "CREATE TRIGGER t BEFORE DELETE ON record BEGIN SELECT raise(ABORT, 'disk is full'); END"

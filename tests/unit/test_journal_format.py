@@ -1,4 +1,4 @@
-"""The journal's format: a master reads what an older one has written (tests/data/journal)."""
+"""Journal format: a master reads the journal of an older one (tests/data/journal)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INTENTS = {tuple(row["intent"][:2]): row["intent"][2] for row in ROWS if "intent
 #: Unix time of the restart: 5 s after the newest row.
 WALL, NOW = 1.7e9 + 149.6, 1000.0
 
-#: Each process of the fixture: its phase after the restore, and the number of its owner.
+#: Phase after the restore and owner's number of each process of the fixture.
 PHASES = {
     "assigned": ("unreachable", 67),
     "backoff": ("unreachable", 6),
@@ -63,16 +63,16 @@ PHASES = {
     "unwanted": ("cancelled", 0),
 }
 
-#: Fields of a process that a restored master writes in another way.
+#: Fields of a process that a restored master writes differently.
 _OTHER_WHEN_RESTORED = {
-    "move_stop_first": {"host", "instances"},  # its source has ended, as the migration says
-    "move_stuck": {"phase", "since"},  # the step is tried again
+    "move_stop_first": {"host", "instances"},  # its source has ended, as recorded in the migration
+    "move_stuck": {"phase", "since"},  # the step is retried
 }
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A journal with the tables and rows of the fixture, written without rosrm."""
+    """Create a journal with the tables and rows of the fixture, written without rosrm."""
     path = tmp_path / "journal.sqlite"
     with sqlite3.connect(path) as database:
         database.executescript((DATA / "schema.sql").read_text())
@@ -86,7 +86,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def state(path: Path) -> MasterState:
-    """The state of a master that was restored from the fixture."""
+    """Return the state of a master that was restored from the fixture."""
     state = MasterState(CoreSettings(), "eq1", Eq1(), {}, epoch=4)
     state.wall = WALL
     journal = SqliteJournal(path)
@@ -96,7 +96,7 @@ def state(path: Path) -> MasterState:
 
 
 def written(state: MasterState) -> dict[tuple[str, str], Any]:
-    """The newest intents that the state has emitted."""
+    """Return the newest intents that the state has emitted."""
     intents = [one for one in state.take() if isinstance(one, Intent)]
     return {
         (one.table, one.key): json.loads(json.dumps(one.value, default=dict)) for one in intents
@@ -104,7 +104,7 @@ def written(state: MasterState) -> dict[tuple[str, str], Any]:
 
 
 def test_a_new_journal_has_the_tables_of_the_fixture(tmp_path: Path, path: Path) -> None:
-    """Names, columns, index and version: without a new version number nothing of it changes."""
+    """Names, columns, index and version change only with a new version number."""
     SqliteJournal(tmp_path / "new.sqlite").close()
     schemas = []
     for file in (path, tmp_path / "new.sqlite"):
@@ -116,7 +116,7 @@ def test_a_new_journal_has_the_tables_of_the_fixture(tmp_path: Path, path: Path)
 
 
 def test_records_of_an_older_master_are_read_as_they_were_written(path: Path) -> None:
-    """Every field of every record."""
+    """Every field of every record is equal."""
     journal = SqliteJournal(path)
     read = [
         [
@@ -148,13 +148,13 @@ def test_every_process_is_written_back_as_it_was_read(state: MasterState, name: 
     changed = {field: (before[field], value) for field, value in again.items()
                if before[field] != value}  # fmt: skip
     if process.phase not in WAITING:
-        changed.pop("reason", None)  # of the restored master: what it waits for now
+        changed.pop("reason", None)  # reason of the restored master for the present wait
     assert set(changed) == _OTHER_WHEN_RESTORED.get(name, set())
 
 
 @pytest.mark.parametrize("name", [key for table, key in INTENTS if table == "migration"])
 def test_every_migration_is_taken_up_where_it_was(state: MasterState, name: str) -> None:
-    """Plan, step in hand, way back, results, ends: it is written back as it was read."""
+    """Plan, present step, undo, results and ends are written back as they were read."""
     state.take()
     run = state.runs[name]
     state.save_run(run)
@@ -171,7 +171,7 @@ def test_every_migration_is_taken_up_where_it_was(state: MasterState, name: str)
 
 
 def test_hosts_numbers_and_everything_else_are_as_they_were(state: MasterState) -> None:
-    """Flags of hosts, learned needs, removed names, unwanted images, numbers, what is awaited."""
+    """Host flags, learned needs, removed names, unwanted images and awaited hosts are restored."""
     hosts = [(h.name, h.host_id, h.cordoned, h.draining) for h in state.hosts.hosts]
     assert hosts == [
         ("shelf", 1, False, False), ("shelf_off", 2, False, False), ("plain", 3, False, False),

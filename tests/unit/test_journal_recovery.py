@@ -1,4 +1,4 @@
-"""What is left of a damaged journal: kept, put right, and the damaged file is not thrown away."""
+"""Recovery of a damaged journal: readable data is kept, and so is the damaged file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def path(tmp_path):
 
 
 def pages_of(path, name: str) -> list[int]:
-    """Leaf pages of a table, as far as they can be told: those that hold rows of it."""
+    """Return the pages that hold rows of a table, as far as they can be recognised."""
     marks = {"intent": b'{"order": ', "record": b"assigned"}
     raw = path.read_bytes()
     return [
@@ -51,7 +51,7 @@ def spoil(path, at: int) -> None:
 
 @pytest.mark.parametrize("which", [0, 1, -1])
 def test_what_can_be_read_goes_on(path, which) -> None:
-    """One page of intents is damaged: the others are there, in both directions from it."""
+    """With one damaged page of intents the others are restored, in both directions from it."""
     spoil(path, pages_of(path, "intent")[which])
     damaged = path.read_bytes()
     with pytest.raises(JournalError, match="--recover"):
@@ -73,7 +73,7 @@ def test_what_can_be_read_goes_on(path, which) -> None:
 
 
 def test_of_a_file_that_was_cut_short_the_rest_goes_on(path) -> None:
-    """SQLite alone would read nothing of it; how much there is depends on which pages are left."""
+    """SQLite alone would read nothing of it; the amount depends on the remaining pages."""
     raw = path.read_bytes()
     path.write_bytes(raw[: len(raw) * 3 // 4])
     recover(path)
@@ -83,7 +83,7 @@ def test_of_a_file_that_was_cut_short_the_rest_goes_on(path) -> None:
 
 
 def test_damaged_events_cost_no_intent(path) -> None:
-    """They are for people."""
+    """Events are information for users only."""
     spoil(path, pages_of(path, "record")[1])
     recover(path)
     journal = SqliteJournal(path)
@@ -94,7 +94,7 @@ def test_damaged_events_cost_no_intent(path) -> None:
 
 
 def test_what_is_left_is_put_right(path) -> None:
-    """Hosts that processes are on are expected, and no number is given twice."""
+    """Hosts of processes are expected, and no number is used twice."""
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM intent WHERE tbl IN ('host', 'cluster')")
     spoil(path, pages_of(path, "record")[0])
@@ -108,7 +108,7 @@ def test_what_is_left_is_put_right(path) -> None:
 
 
 def test_numbers_go_on_above_all_that_events_know(path) -> None:
-    """Supervisors refuse numbers that they have seen the end of, however few live now."""
+    """Supervisors refuse numbers whose end they have seen, however few instances live now."""
     journal = SqliteJournal(path)
     ended = Record("ended", "p000", facts={"number": 70_000, "pid": 1})
     moved = Record("moved", "p000", facts={"source": 3, "destination": 90_000})
@@ -123,14 +123,14 @@ def test_numbers_go_on_above_all_that_events_know(path) -> None:
 
 
 class Killed(BaseException):
-    """As by SIGKILL, as far as a test can: nothing of ours is to handle it."""
+    """Fake SIGKILL: no code of rosrm may handle it."""
 
 
 @pytest.mark.parametrize("step", range(5))
 def test_killed_at_any_step_the_journal_is_the_damaged_one_or_the_new_one(
     path, monkeypatch, step
 ) -> None:
-    """Never none, which the next start would take for a new cluster; and it can be tried again."""
+    """A missing journal would start a new cluster; after the kill the recovery can be repeated."""
     spoil(path, pages_of(path, "intent")[1])
     damaged = path.read_bytes()
     steps = iter(range(100))
@@ -160,7 +160,7 @@ def test_killed_at_any_step_the_journal_is_the_damaged_one_or_the_new_one(
 
 
 def test_all_hosts_are_heard_before_work_is_given(path) -> None:
-    """A recovered journal counts as one whose machine fell: its `boot` is none."""
+    """A recovered journal counts as after a power loss: its `boot` is empty."""
     spoil(path, pages_of(path, "intent")[1])
     recover(path)
     journal = SqliteJournal(path)
@@ -169,7 +169,7 @@ def test_all_hosts_are_heard_before_work_is_given(path) -> None:
 
 
 def test_a_whole_journal_is_left_alone(path) -> None:
-    """Somebody put `--recover` into a start script."""
+    """`--recover` may stand in a start script."""
     before = path.read_bytes()
     with pytest.raises(JournalError, match="is not damaged: start without"):
         recover(path)
@@ -185,6 +185,6 @@ def test_where_nothing_can_be_read_nothing_is_changed(path) -> None:
 
 
 def test_no_journal_is_said(tmp_path) -> None:
-    """With the path."""
+    """The error has the path."""
     with pytest.raises(JournalError, match=str(tmp_path / "journal.sqlite")):
         recover(tmp_path / "journal.sqlite")

@@ -1,4 +1,4 @@
-"""Files of kept states: whole, torn, damaged, older, newer; whoever writes, and however it ends."""
+"""Snapshot files: whole, torn, damaged, older and newer ones, after any end of their writer."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CONTENTS = st.lists(st.binary(max_size=200), min_size=1, max_size=4)
 
 @given(contents=CONTENTS, sequence=st.integers(0, 2**64 - 1), name=st.text(max_size=20))
 def test_what_is_written_is_read(contents, sequence, name):
-    """Name, instance, sequence and every block, bit by bit."""
+    """Name, instance, sequence and every block are equal, bit by bit."""
     parts = blocks(*contents)
     data = snapshots.encoded_head(name, 3, sequence, parts) + b"".join(contents)
     read = snapshots.decoded(data)
@@ -49,7 +49,7 @@ def test_what_is_written_is_read(contents, sequence, name):
 
 @given(contents=CONTENTS, data=st.data())
 def test_no_change_goes_unseen(contents, data):
-    """One byte of another value, anywhere, and a file that ends too soon."""
+    """One changed byte anywhere, or a file that ends too early, is detected."""
     parts = blocks(*contents)
     whole = snapshots.encoded_head("counter", 3, 5, parts) + b"".join(contents)
     at = data.draw(st.integers(0, len(whole) - 1))
@@ -67,7 +67,7 @@ def test_what_is_no_state_is_said_so(garbage):
 
 
 def test_the_newest_counts(tmp_path):
-    """By instance first, then by sequence; the slots are used in turn."""
+    """The newest is by instance first, then by sequence; the slots are used in turn."""
     for sequence in (1, 2, 3):
         write(tmp_path, sequence, b"a%d" % sequence)
     assert newest(tmp_path) == ((7, 3), (b"a3",))
@@ -77,7 +77,7 @@ def test_the_newest_counts(tmp_path):
 
 
 def test_a_newer_instance_is_never_overwritten(tmp_path):
-    """An old one that still runs is told so, and changes nothing."""
+    """The write of an old instance that still runs returns False and changes nothing."""
     old = SlotWriter(tmp_path, "counter", 7)
     assert old.write(1, blocks(b"old"))
     write(tmp_path, 10, b"new", instance=8)
@@ -88,7 +88,7 @@ def test_a_newer_instance_is_never_overwritten(tmp_path):
 
 
 class Killed(BaseException):
-    """The process is no more."""
+    """Stand for the death of the process."""
 
 
 @settings(deadline=None, max_examples=200)
@@ -97,7 +97,7 @@ class Killed(BaseException):
     bytes_left=st.integers(0, 12_000),
 )
 def test_killed_at_any_byte_a_whole_state_is_left(tmp_path_factory, sizes, bytes_left):
-    """The state of the last write that has ended, or the one that was being written."""
+    """The snapshot is that of the last complete write, or the one being written."""
     directory = tmp_path_factory.mktemp("k")
     left = bytes_left
     real = os.pwritev
@@ -128,12 +128,12 @@ def test_killed_at_any_byte_a_whole_state_is_left(tmp_path_factory, sizes, bytes
         (_, sequence), (first, second) = found
         assert sequence in (done, done + 1)
         assert (first, second) == (bytes([sequence]) * sizes[sequence - 1], b"x")
-        write(directory, 100, b"next")  # and its next start goes on from there
+        write(directory, 100, b"next")  # the next start continues from that snapshot
         assert newest(directory) == ((7, 100), (b"next",))
 
 
 def test_a_damaged_newest_leaves_the_older_one_and_is_named(tmp_path):
-    """And the next write goes over the damaged one, not over the last whole state."""
+    """The next write replaces the damaged snapshot, not the last whole one."""
     write(tmp_path, 1, b"first")
     write(tmp_path, 2, b"second")
     damaged = tmp_path / snapshots.SLOTS[1]
@@ -149,7 +149,7 @@ def test_a_damaged_newest_leaves_the_older_one_and_is_named(tmp_path):
 
 
 def test_a_full_disk_leaves_the_newest_state(tmp_path, monkeypatch):
-    """It is an OSError for who writes; what was there is there, and later it is written again."""
+    """The writer gets an OSError; the old snapshot stays, and later writes succeed again."""
     writer = SlotWriter(tmp_path, "counter", 7)
     writer.write(1, blocks(b"first"))
     real = os.pwritev
@@ -168,7 +168,7 @@ def test_a_full_disk_leaves_the_newest_state(tmp_path, monkeypatch):
 
 
 def test_files_are_the_owners_alone_and_do_not_stay_large(tmp_path):
-    """Whatever the umask; a state that has become small gives its room back."""
+    """This holds under any umask; a snapshot that has become small frees its room."""
     directory = tmp_path / "counter"
     old = os.umask(0)
     try:
@@ -184,7 +184,7 @@ def test_files_are_the_owners_alone_and_do_not_stay_large(tmp_path):
 
 
 def test_a_copy_from_another_host_counts_like_a_state_of_ones_own(tmp_path):
-    """Until a newer instance has written one."""
+    """The replica counts until a newer instance has written a snapshot."""
     there, here = tmp_path / "there", tmp_path / "here"
     write(there, 5, b"state")
     found = snapshots.newest_content(there)
@@ -196,7 +196,7 @@ def test_a_copy_from_another_host_counts_like_a_state_of_ones_own(tmp_path):
 
 
 def test_dropped_are_the_states_of_older_instances_alone(tmp_path):
-    """What a newer one keeps stays; when nothing is left, the directory is gone."""
+    """Snapshots of newer instances stay; an empty directory is removed."""
     directory = tmp_path / "counter"
     write(directory, 5, b"old")
     write(directory, 1, b"new", instance=9)
@@ -207,7 +207,7 @@ def test_dropped_are_the_states_of_older_instances_alone(tmp_path):
 
 
 def test_a_writer_whose_files_were_deleted_goes_on_in_new_ones(tmp_path):
-    """What an instance before it kept is dropped while it runs."""
+    """The snapshot of a former instance may be dropped while the new one runs."""
     directory = tmp_path / "counter"
     write(directory, 5, b"old", instance=7)
     writer = SlotWriter(directory, "counter", 9)
@@ -222,7 +222,7 @@ def test_a_writer_whose_files_were_deleted_goes_on_in_new_ones(tmp_path):
 
 
 def test_links_are_not_followed(tmp_path):
-    """Who may write into the directory may not have another file written."""
+    """Write access to the directory must not allow writes to another file."""
     victim = tmp_path / "victim"
     victim.write_bytes(b"precious")
     directory = tmp_path / "counter"

@@ -1,4 +1,4 @@
-"""What is installed is pinned, and what is pinned is allowed."""
+"""Package pins: every installed package is pinned, and every pin is allowed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def applies(requirement: Requirement, python: str) -> bool:
 
 
 def pins(python: str) -> dict[str, Version]:
-    """The exact version of each constrained package on one Python."""
+    """Return the exact version of each constrained package on one Python."""
     found: dict[str, Version] = {}
     for line in (ROOT / "constraints.txt").read_text().splitlines():
         text = line.partition("#")[0].strip()
@@ -109,7 +109,7 @@ def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(proj
 def test_the_readme_installs_all_that_runs() -> None:
     """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned.
 
-    The tools `rosrm-lab` and `rosrm-simulate` are left to who wants them.
+    The tools `rosrm-lab` and `rosrm-simulate` are optional.
     """
     (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
     optional = (Path(), Path("examples"), Path("tools/lab"), Path("tools/simulate"))

@@ -1,4 +1,4 @@
-"""The public names: what `import rosrm` offers, what it costs, and who keeps to it."""
+"""Public names: content of `import rosrm`, its cost, and users of private names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.pages import PYTHON, ROOT, blocks, run_examples
 
 #: Modules with public names of their own.
 PUBLIC = ("rosrm.node", "rosrm.testing")
-#: Programs of this repository that need more, and what.
+#: Programs of this repository that need more names.
 MORE = {
     "plugins/migration/rosrm_migration/handoff.py": {"rosrm.ros.slave.publisher_watch"},
     "examples/rosrm_examples/demo_job.py": {"rosrm.config.settings"},
@@ -102,7 +102,7 @@ def test_importing_rosrm_loads_nothing_but_the_version():
 
 
 def test_the_help_needs_no_ros_and_begins_with_the_groups_of_names(monkeypatch):
-    """As in an environment with rosrm alone."""
+    """An environment may have rosrm alone."""
     for module in ("rclpy", "rosrm_msgs"):
         monkeypatch.setitem(sys.modules, module, None)
     text = pydoc.render_doc(rosrm, renderer=pydoc.plaintext)

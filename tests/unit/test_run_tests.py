@@ -1,4 +1,4 @@
-"""The runner of `make test` on small folders of tests: failed, flaky and last failed ones."""
+"""Runner of `make test` with small folders of tests: failed, flaky and last failed ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PASSES = "def test_passes(): pass\n"
 
 @pytest.fixture
 def run_tests(tmp_path, monkeypatch, capfd):
-    """Writes files below tests/ and runs them; returns the exit status and the lines printed."""
+    """Write files below tests/ and run them; return the exit status and the printed lines."""
     spec = importlib.util.spec_from_file_location("run_tests", RUNNER)
     runner = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "run_tests", runner)
@@ -39,7 +39,8 @@ def run_tests(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(runner, "RESULTS", tmp_path / "build/test-results")
     monkeypatch.setattr(runner, "WORKERS", {"ros": ["-n", "2", "--dist", "loadfile"]})
     (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --import-mode=importlib -p xdist\n")
-    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # they take longer than the tests
+    # plugins take longer to load than the tests run
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
 
     def run(files: dict[str, str], *arguments: str) -> tuple[int, list[str]]:
         for name, content in files.items():
@@ -54,7 +55,7 @@ def run_tests(tmp_path, monkeypatch, capfd):
 
 
 def failures(number: int) -> str:
-    """Tests of which each fails the first time alone."""
+    """Return tests that each fail the first time only."""
     return FLAKY.replace('["a b", "c[d]"]', f"range({number})")
 
 
@@ -91,7 +92,7 @@ def test_flaky_tests_are_counted_by_name_over_the_runs(run_tests, tmp_path):
 
 
 def test_more_than_two_flaky_tests_fail_the_run(run_tests):
-    """Over all folders; they count as failed, as the exit status says."""
+    """They count over all folders, and as failed in the exit status."""
     files = {"integration/test_a.py": failures(2), "ros/test_b.py": failures(1) + PASSES}
     status, lines = run_tests(files)
     assert (status, lines[-1]) == (1, "1 passed, 3 failed, 0 skipped")
@@ -109,13 +110,13 @@ def test_a_test_without_real_time_gets_no_second_chance(run_tests, layer):
 
 
 def test_many_failures_get_no_second_chance(run_tests):
-    """They have a common cause; to run all of them one by one would take long."""
+    """They have a common cause, and single runs would take long."""
     status, lines = run_tests({"ros/test_a.py": failures(11)})
     assert (status, lines[-1]) == (1, "0 passed, 11 failed, 0 skipped")
 
 
 def test_what_failed_last_is_run_alone(run_tests):
-    """`--lf` leaves out the folders where nothing failed, and the tests that passed."""
+    """`--lf` leaves out folders without failures and tests that passed."""
     files = {
         "unit/test_a.py": PASSES, "contract/test_b.py": FAILS + PASSES,
         "ros/test_c.py": FAILS + PASSES, "ros/test_d.py": PASSES,

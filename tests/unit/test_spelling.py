@@ -1,4 +1,4 @@
-"""Words in messages."""
+"""Numbers and times in messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rosrm.wording import counted, standing_for
 
 @pytest.mark.parametrize(("number", "text"), [(0, "no hosts"), (1, "1 host"), (2, "2 hosts")])
 def test_a_number_with_its_noun(number: int, text: str) -> None:
-    """A message about nothing does not count it."""
+    """A count of zero reads "no"."""
     assert counted(number, "host") == text
 
 
@@ -23,5 +23,5 @@ def test_a_number_with_its_noun(number: int, text: str) -> None:
     ],
 )
 def test_a_state_with_its_time(state: str, text: str) -> None:
-    """What has ended has an end, and anything else a duration."""
+    """A terminal state has an end, any other state a duration."""
     assert standing_for(state, "2 min") == text

@@ -1,4 +1,4 @@
-"""The faults of the chaos benchmark are drawn by the seed alone."""
+"""Fault injector of the chaos benchmark: its faults depend on the seed alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_the_same_seed_draws_the_same_faults():
 
 
 def test_faults_are_numbered_and_each_has_a_target_of_its_own():
-    """Two at once on one target would undo each other; every kind comes up, and can be done."""
+    """Two at once on one target would undo each other; every kind occurs, and can be done."""
     rounds = drawn(3, 500)
     faults = [fault for one in rounds for fault in one.faults]
     assert [fault.number for fault in faults] == list(range(1, len(faults) + 1))
@@ -33,7 +33,7 @@ def test_faults_are_numbered_and_each_has_a_target_of_its_own():
 
 
 def test_every_kind_can_be_done():
-    """The harness has a way to do each."""
+    """The harness implements each kind."""
     from benchmarks.chaos.harm import Harmer
 
     assert [kind for kind in KINDS if not hasattr(Harmer, f"_{kind}")] == []

@@ -1,4 +1,4 @@
-"""What the oracle of the chaos benchmark holds against rosrm, and what it lets pass."""
+"""Oracle of the chaos benchmark: violations and allowances."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py", "excuses.py"]
 
 @pytest.mark.parametrize("name", JUDGES)
 def test_the_oracle_knows_nothing_of_rosrm(name):
-    """Neither by itself nor through what it imports."""
+    """Neither the oracle nor its imports import rosrm."""
     for node in ast.walk(ast.parse((FOLDER / name).read_text())):
         if isinstance(node, ast.Import | ast.ImportFrom):
             modules = [alias.name for alias in node.names]
@@ -51,7 +51,7 @@ OFF = Harm("host_off", 20.0, 25.0, frozenset({"host1"}), kills=True, hides=True)
 
 
 def test_nobody_may_end_to_whom_nothing_was_done():
-    """A process that was killed, or whose host lost its power, may."""
+    """Only a killed process, or one on a host that lost its power, may end."""
     plain = Promise()
     assert kinds(plain, [FIRST, SECOND], []) == (["touched"], {})
     assert kinds(plain, [FIRST, SECOND], [KILLED]) == ([], {})
@@ -63,7 +63,7 @@ def test_nobody_may_end_to_whom_nothing_was_done():
 
 
 def test_two_active_owners_only_while_they_were_parted():
-    """And one second after; with `isolation: stop` never."""
+    """The allowance covers one second after the partition; with `isolation: stop` there is none."""
     longer, beside = run(last=24.0), run("a#2", "host2", 16.0, 30.0)
     elsewhere = Promise(elsewhere=True)
     assert kinds(elsewhere, [run(last=19.5), beside], [CUT]) == ([], {"partitioned": 1})
@@ -81,7 +81,7 @@ def test_two_active_owners_only_while_they_were_parted():
 
 
 def test_a_host_that_comes_up_late_is_given_its_second_from_then_on():
-    """It has reached the master at the latest when it begins a job."""
+    """The host has reached the master at the latest when it begins a job."""
     late, beside = run(last=40.5), run("a#2", "host2", 16.0, 50.0)
     elsewhere = Promise(elsewhere=True)
     assert judge_service("a", elsewhere, [late, beside], [CUT]).violations != []
@@ -89,7 +89,7 @@ def test_a_host_that_comes_up_late_is_given_its_second_from_then_on():
 
 
 def test_an_overloaded_machine_explains_what_nothing_else_does():
-    """It does not make a host that was cut off later than it was."""
+    """An overload does not delay the cut of a host."""
     late, beside = run(last=29.0), run("a#2", "host2", 16.0, 30.0)
     overload = Harm(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True)
     elsewhere = Promise(elsewhere=True)
@@ -98,7 +98,7 @@ def test_an_overloaded_machine_explains_what_nothing_else_does():
 
 
 def test_who_comes_back_for_a_moment_does_not_end_the_owner():
-    """A host that was lost has its power again, and starts what has a successor by now."""
+    """A lost host has its power again, and starts a process that has a successor by now."""
     old, owner = run(last=20.0), run("a#2", "host2", 24.0, 40.0)
     back = run("a#1", "host1", 25.5, 25.6, pid=9)
     assert chain([old, owner, back]) == [old, back, owner]
@@ -118,7 +118,7 @@ SHORT = Harm("host_cut", 19.6, 19.9, frozenset({"host1"}), hides=True)
 
 
 def test_a_silence_too_short_to_lose_a_host_or_to_be_fenced_excuses_nothing():
-    """Two seconds may lose a host; for `isolation: stop`, 0.8 s: less than its fence may take."""
+    """Two seconds may lose a host; for `isolation: stop`, 0.8 s is less than its fence may take."""
     elsewhere, isolated = Promise(elsewhere=True), Promise(elsewhere=True, isolated=True)
 
     def cut(seconds):
@@ -131,7 +131,7 @@ def test_a_silence_too_short_to_lose_a_host_or_to_be_fenced_excuses_nothing():
 
 
 def test_silences_add_up_and_a_part_that_starts_again_is_silent_until_it_is_up():
-    """Two that overlap count once, and what comes after the end of a run counts for nothing."""
+    """Overlapping silences count once, and time after the end of a run does not count."""
     elsewhere, everywhere = Promise(elsewhere=True), frozenset({"*"})
     long = Harm("host_cut", 17.0, 18.8, frozenset({"host1"}), hides=True)
     beside = replace(long, kind="master_stop", hosts=everywhere, ended=18.5)
@@ -145,7 +145,7 @@ def test_silences_add_up_and_a_part_that_starts_again_is_silent_until_it_is_up()
 
 
 def test_a_slave_that_is_stopped_lets_its_host_fence_sooner_than_the_host_is_lost():
-    """And a supervisor that was killed ends nothing."""
+    """A killed supervisor ends nothing."""
     elsewhere = Promise(elsewhere=True)
     slave = Harm("slave_stop", 18.5, 20.0, frozenset({"host1"}), hides=True, deafens=True)
     assert kinds(elsewhere, [FIRST, SECOND], [slave])[0] == []
@@ -153,7 +153,10 @@ def test_a_slave_that_is_stopped_lets_its_host_fence_sooner_than_the_host_is_los
 
 
 def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
-    """A second of it may be repeated; on another host it may begin anew, unless it is copied."""
+    """A second of it may be repeated.
+
+    Without a replica, a start on another host is from nothing.
+    """
     kept, copied = Promise(stateful=True, kept=True), Promise(stateful=True, kept=True, copied=5)
 
     def after(promise, first, host, *harms):
@@ -181,7 +184,7 @@ def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
 
 
 def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
-    """From the cut on, and no more: ten cycles a second."""
+    """Missing cycles count from the cut on, at ten a second."""
     guarded = Promise(stateful=True, standby=True, elsewhere=True)
     alone = run(first=10.0, last=19.5, numbers=(1, 96))  # cut off from 12.0 on
 
@@ -193,7 +196,7 @@ def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
 
 
 def test_a_state_that_came_to_no_other_host_in_time_is_lost():
-    """The process was young, or the host that had the copy was struck as well."""
+    """The process was young, or the host of the replica was struck as well."""
     copied = Promise(stateful=True, kept=True, copied=5, elsewhere=True)
     anew = run("a#2", "host2", 23.0, 30.0, (1, 50))
     other = Harm("host_off", 19.0, 25.0, frozenset({"host3"}), kills=True, hides=True)
@@ -216,7 +219,7 @@ def test_a_state_that_came_to_no_other_host_in_time_is_lost():
 
 
 def test_a_standby_bears_one_fault_and_the_copy_another():
-    """What is stopped wherever the master is not heard loses both at once when the master is."""
+    """With `isolation: stop`, a silent master costs both the primary and its standby."""
     guarded = Promise(stateful=True, standby=True, elsewhere=True, kept=True, copied=5)
     isolated = Promise(
         stateful=True, standby=True, elsewhere=True, isolated=True, kept=True, copied=5
@@ -249,7 +252,7 @@ def test_who_waits_in_line_keeps_its_place():
 
 
 def test_lines_become_runs_as_they_grow(tmp_path):
-    """Half a line is taken when it is whole; who restarted under the same name is another run."""
+    """Half a line waits for its rest; a restart under the same name is another run."""
     file, outputs = tmp_path / "a", Outputs(tmp_path)
     assert outputs.read("a") == []
     file.write_text("1.0 a#1 host1 5 0.9 born 0\n1.1 a#1 host1 5 0.9 active 1\n1.2 a#1 ho")

@@ -1,4 +1,4 @@
-"""What `benchmarks.criu` makes of the moves that were heard."""
+"""Evaluation of measured moves in `benchmarks.criu`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from benchmarks.criu import Outcome, beside, shared, table
 
 
 def hop(**changes):
-    """One move as the desk tells it."""
+    """Return one move as the desk reports it."""
     parts = {
         "criu_checkpoint": {"prepare": 0.1, "leave": 0.05, "dump": 0.2, "offer": 0.1},
         "criu_fetch": {"transfer": 0.3},
@@ -22,7 +22,7 @@ def hop(**changes):
 
 
 def test_the_parts_of_a_move_are_those_of_its_executors():
-    """The offer belongs to the transfer; what a node says of itself is within its joining."""
+    """The offer belongs to the transfer; times reported by a node are within its join."""
     figures = Outcome([hop(), hop(silence=2.5)]).figures()
     assert figures["transfer_p50_s"] == 0.4
     assert figures["rejoin_p50_s"] == 0.5
@@ -31,7 +31,7 @@ def test_the_parts_of_a_move_are_those_of_its_executors():
 
 
 def test_a_move_that_failed_counts_as_that_alone():
-    """Its silence is no blackout of a move."""
+    """The silence of a failed move is no blackout."""
     outcome = Outcome([hop(), hop(end="stayed", why="the disk is full", silence=9.0, parts={})])
     assert outcome.failures == ["the disk is full"]
     assert outcome.silences() == [1.5]
@@ -39,20 +39,20 @@ def test_a_move_that_failed_counts_as_that_alone():
 
 
 def test_a_heap_that_was_ever_another_one_is_not_the_same():
-    """Nor is one that nobody has read."""
+    """A heap without any checksum does not count as the same either."""
     assert not Outcome([hop(), hop(checksums=[8])]).heap_ok
     assert not Outcome([hop(checksums=[])]).heap_ok
 
 
 def test_most_moves_are_of_the_first_heap():
-    """As many in all as were asked for, if that is enough for one of each."""
+    """The total is as requested, if that is enough for one move of each heap."""
     assert shared(50, [10.0, 100.0, 500.0]) == [30, 10, 10]
     assert shared(4, [10.0]) == [4]
     assert shared(1, [10.0, 100.0]) == [1, 1]
 
 
 def test_the_table_has_all_strategies():
-    """With what each of them loses."""
+    """The table has the loss of each strategy."""
     others = {
         "relaunch": beside([hop(strategy="relaunch", began_anew=True)], "relaunch"),
         "handoff": beside([hop(strategy="handoff")], "handoff"),

@@ -1,4 +1,4 @@
-"""The figures' own parts that need no cluster."""
+"""Parts of the paper's figures that need no cluster."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def test_pieces_are_shared_out_so_that_the_longest_is_short(scans, pieces):
     ],
 )
 def test_drives_that_cannot_be_cut_are_refused(drives, said):
-    """Before any host is made."""
+    """The refusal comes before any host is made."""
     with pytest.raises(DriveError, match=said):
         pieces_of(drives, 3)
 
 
 def test_the_job_is_one_that_rosrm_takes(tmp_path):
-    """As a work file, and with a name for each piece."""
+    """The work file loads, and each piece has a name."""
     pieces = pieces_of(("street:24",), 3)
     assert [piece.number for piece in pieces] == [1, 2, 3]
     work = {"processes": [piece.entry(tmp_path, tmp_path) for piece in pieces]}
@@ -69,7 +69,7 @@ def test_the_job_is_one_that_rosrm_takes(tmp_path):
 
 
 def test_the_hosts_settings_are_the_papers(tmp_path):
-    """Memory up to 80 %, CPU and disk without a limit, 10 Hz."""
+    """Memory has a limit of 80 %, CPU and disk have none, at 10 Hz."""
     (tmp_path / "host.yaml").write_text(json.dumps(host_settings("host1")))
     settings = load_host(tmp_path / "host.yaml")
     assert dict(settings.limits) == {"memory": MEMORY_LIMIT, "cpu": 1.0, "disk": 1.0}
@@ -77,7 +77,7 @@ def test_the_hosts_settings_are_the_papers(tmp_path):
 
 
 def test_fig6_overfills_the_hosts_with_8_to_80_mb():
-    """By the same sizes in every run."""
+    """The sizes are the same in every run."""
     chosen = fig6.sizes(GIB)
     assert chosen == fig6.sizes(GIB)
     assert min(chosen) >= 8
@@ -89,7 +89,7 @@ def test_fig6_overfills_the_hosts_with_8_to_80_mb():
 
 
 def test_fig6_does_not_hold_when_hosts_could_take_more():
-    """Something waits although there is room."""
+    """A process waits although there is room."""
     hosts = {f"host{n}": HostLook(0.3, 0.0, 1e9, accepting=True) for n in (1, 2, 3)}
     trace = Trace(looks=[Look(0.0, hosts, {"a": "queued"})])
     wrong, _ = fig6.judge(trace, {"a": 1e7})
@@ -97,7 +97,7 @@ def test_fig6_does_not_hold_when_hosts_could_take_more():
 
 
 def test_fig6_does_not_hold_when_its_replay_decides_differently():
-    """Nor when the record holds no decision at all."""
+    """A record without any decision does not hold either."""
     alike = {"replayed_decisions": 60, "replayed_differently": 0}
     assert fig6.replayed_otherwise(alike) == []
     (wrong,) = fig6.replayed_otherwise({**alike, "replayed_differently": 1})
@@ -116,7 +116,7 @@ def test_fig8_holds_for_a_line_only():
 
 
 def test_fig8_holds_for_a_proportion_only():
-    """A line that misses the origin says that the first slave holds something else."""
+    """A line that misses the origin shows that the first slave holds something else."""
     trace = Trace(looks=[Look(0.0, {}, {"a": "queued"})])
     (wrong,) = fig8.judge(trace, [28, 36, 44], Line(8.0, 20.0, 1.0))[0]
     assert wrong.startswith("not in proportion: R2 of the line through the origin")
@@ -124,7 +124,7 @@ def test_fig8_holds_for_a_proportion_only():
 
 @pytest.mark.parametrize(("top", "holds"), [(0.84, True), (0.9, False)])
 def test_fig8_counts_one_process_beyond_the_limit(top, holds):
-    """More than one, and the number of processes held says nothing of the limit."""
+    """With more than one, the number of processes does not show the limit."""
     host = HostLook(top, 0.0, 1e9, accepting=False)
     trace = Trace(looks=[Look(0.0, {"host1": host}, {"a": "queued"})])
     wrong, _ = fig8.judge(trace, [8, 16], Line(8.0, 0.0, 1.0))
@@ -149,13 +149,13 @@ KEPT_UP = {
     ],
 )
 def test_fig9_counts_only_where_the_master_kept_up(changes, said):
-    """A point is worth nothing where half of the readings were not made, or not taken in."""
+    """A point is dropped where half of the readings were not made, or not received."""
     wrong = fig9.not_kept_up({**KEPT_UP, **changes})
     assert wrong == [] if said is None else (len(wrong) == 1 and said in wrong[0])
 
 
 def test_fig9_holds_below_the_papers_slope_only():
-    """And only while all slaves are within one cycle."""
+    """All slaves must be within one cycle, too."""
     points = [{**KEPT_UP, "ms": 20.0}]
     wrong, figures = fig9.judge(points, points, Line(0.02, 0.0, 1.0))
     assert (wrong, figures["slope_us"]) == ([], 20.0)
@@ -185,19 +185,19 @@ def test_table3_is_judged_by_the_medians():
 
 
 def test_table3_does_not_hold_when_pieces_share_a_host():
-    """Then it was not one piece a host."""
+    """The measurement is then not of one piece per host."""
     seconds = {"one_host": [100.0], "ideal": [10.0], "rosrm": [10.0]}
     assert "shared a host" in table3.judge(seconds, spent(2, 0), 10)[0][0]
 
 
 def test_table3_does_not_hold_when_ten_hosts_are_hardly_faster_than_one():
-    """They were not at work together then."""
+    """The hosts did not work in parallel then."""
     seconds = {"one_host": [30.0], "ideal": [10.0], "rosrm": [10.0]}
     assert "10 hosts are only 3.0 times as fast" in table3.judge(seconds, spent(1, 1), 10)[0][0]
 
 
 def test_what_is_said_of_the_size_is_of_this_run():
-    """Of the hosts that were made, and of how fast it went."""
+    """The text has the hosts that were made, and the speed of the run."""
     plans = uniform(3, memory=256 * MIB, cpu=0.5)
     assert alike(plans) == "3 of 256 MiB and 0.5 cores each on one machine"
     usual, small = fig10.scaled()["time"], fig10.scaled(3.0)["time"]
@@ -207,7 +207,7 @@ def test_what_is_said_of_the_size_is_of_this_run():
     assert small.endswith("16.5 MB a second, and come at 0, 11, 25 s")
 
 
-# --- what goes wrong ------------------------------------------------------------------------------
+# --- failures -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def test_what_is_said_of_the_size_is_of_this_run():
 def test_a_figure_that_fails_leaves_its_logs_and_no_old_numbers(
     error, tmp_path, monkeypatch, capsys
 ):
-    """One line of what went wrong, one of where the logs are; what was measured before is gone."""
+    """The output has one line for the error and one for the logs; old numbers are removed."""
     folders = []
 
     def fail(options):
@@ -244,7 +244,7 @@ def test_a_figure_that_fails_leaves_its_logs_and_no_old_numbers(
 
 
 def test_a_figure_that_is_measured_says_its_size_and_leaves_no_folder(tmp_path, monkeypatch):
-    """A small one is known by its numbers."""
+    """The numbers mark a small run."""
     result = Result([], {"slope_us": 1.0}, {"hosts": "few"}, lambda path: path.touch())
     monkeypatch.setattr(fig9, "measure", lambda _: result)
     monkeypatch.setattr(paper, "raise_signals", lambda: None)
@@ -258,7 +258,7 @@ def test_a_figure_that_is_measured_says_its_size_and_leaves_no_folder(tmp_path, 
 
 @pytest.mark.parametrize("ends", ["before it is asked", "when it is asked"])
 def test_a_desk_that_has_ended_is_told_with_its_last_words(ends, tmp_path):
-    """By exit code and log, before or after a question is written."""
+    """The message has its exit code and log, before or after a question is written."""
     log = tmp_path / "desk.log"
     wait = "read line; " if ends == "when it is asked" else ""
     script = f"echo '{{}}'; {wait}echo no master >&2; exit 3"
@@ -281,7 +281,7 @@ def test_a_desk_that_has_ended_is_told_with_its_last_words(ends, tmp_path):
 
 
 def test_every_form_of_picture_is_drawn(tmp_path):
-    """A host that is not there yet leaves a gap, no error."""
+    """A host that has not joined yet leaves a gap, no error."""
     host = HostLook(0.3, 0.0, 1e9, accepting=True)
     trace = Trace(
         looks=[Look(0.0, {"host1": host}, {}), Look(1.0, {"host1": host, "host2": host}, {})],
@@ -305,7 +305,7 @@ def test_every_form_of_picture_is_drawn(tmp_path):
     ],
 )
 def test_bad_arguments_are_refused(words, said, tmp_path):
-    """In argparse's way, with status 2."""
+    """The error is argparse's, with status 2."""
     ended = subprocess.run(
         [sys.executable, "-m", "benchmarks.paper", *words, "--out", str(tmp_path / "out")],
         check=False,
@@ -332,7 +332,7 @@ def fig8_report(**changes):
 
 
 def test_the_page_gets_what_was_measured_and_keeps_the_rest(tmp_path):
-    """Written twice it is the same; a figure that was not measured now stays as it is."""
+    """A second update changes nothing; a figure that was not measured now stays unchanged."""
     page = tmp_path / "page.md"
     marked = "".join(f"<!-- {name} -->\nold\n<!-- /{name} -->\n" for name in FIGURES)
     page.write_text(f"before\n{marked}end\n")
@@ -351,13 +351,13 @@ def test_the_page_gets_what_was_measured_and_keeps_the_rest(tmp_path):
 
 
 def test_a_claim_that_does_not_hold_is_said(tmp_path):
-    """With the reasons."""
+    """The page has the reasons."""
     said = section("fig8", fig8_report(claim_holds=False, against_it=["R2 is low"]), "p.png")
     assert "**The claim does not hold:** R2 is low" in said
 
 
 def test_a_page_without_the_marks_is_refused(tmp_path):
-    """What was measured must not get lost silently."""
+    """An update without marks would lose measurements silently."""
     (tmp_path / "page.md").write_text("nothing")
     (tmp_path / "fig8.json").write_text(json.dumps(fig8_report()))
     with pytest.raises(RosrmError, match="no marks '<!-- fig6 -->'"):
@@ -365,7 +365,7 @@ def test_a_page_without_the_marks_is_refused(tmp_path):
 
 
 def test_the_documentation_has_a_place_for_each_figure():
-    """And a picture's marks for nothing else."""
+    """A picture's marks are for figures only."""
     marks = re.findall(
         r"^<!-- (/?\w+) -->$", (ROOT / "docs/evaluation.md").read_text(), re.MULTILINE
     )

@@ -1,4 +1,4 @@
-"""What counts for and against the paper's claims is judged rightly."""
+"""Evaluation of the paper's claims: evidence for and against them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def look_at(elapsed, usages, states=None, accepting=True):
 
 
 def filled(sizes, choose):
-    """A run in which processes of some bytes go where `choose` says, by the hosts' usages."""
+    """Return a run in which `choose` places processes of some bytes by the hosts' usages."""
     usages = dict.fromkeys(("host1", "host2", "host3"), BASE)
     trace = Trace(looks=[look_at(0.0, usages)])
     for number, size in enumerate(sizes):
@@ -58,7 +58,7 @@ sizes = st.lists(st.integers(8_000_000, 80_000_000), min_size=1, max_size=30)
 
 @given(sizes)
 def test_placing_on_the_emptiest_is_found_right_and_balanced(chosen):
-    """The bound of Fig. 6: hosts are never apart by more than the largest process."""
+    """The bound of Fig. 6: hosts never differ by more than the largest process."""
     trace = filled(chosen, emptiest)
     assert not_to_emptiest(trace, needs_of(chosen)) == []
     assert widest_gap(trace, trace.hosts) <= max(chosen) / CAPACITY + 1e-9
@@ -66,13 +66,13 @@ def test_placing_on_the_emptiest_is_found_right_and_balanced(chosen):
 
 @given(sizes.filter(lambda chosen: len(chosen) > 1 and chosen[0] / CAPACITY > 2 * NOISE))
 def test_placing_on_the_fullest_is_found_wrong(chosen):
-    """All on one host: each but the first is named."""
+    """With all on one host, each process but the first is named."""
     wrong = not_to_emptiest(filled(chosen, fullest), needs_of(chosen))
     assert len(wrong) == len(chosen) - 1
 
 
 def test_an_assignment_that_is_given_again_counts_once():
-    """The second word about a process moves what it holds, and does not double it."""
+    """A second assignment of a process moves its memory, and does not double it."""
     usages = {"host1": BASE, "host2": BASE}
     trace = Trace(looks=[look_at(0.0, usages)])
     trace.events = [
@@ -86,7 +86,7 @@ def test_an_assignment_that_is_given_again_counts_once():
 
 
 def test_a_host_that_joins_is_judged_from_when_it_is_seen():
-    """Before, nobody could have gone there."""
+    """A process placed earlier could not have gone to that host."""
     trace = Trace(looks=[look_at(0.0, {"host1": 0.5})])
     trace.looks.append(look_at(2.0, {"host1": 0.5, "host2": BASE}))
     trace.events = [
@@ -102,7 +102,7 @@ def test_a_host_that_joins_is_judged_from_when_it_is_seen():
     st.lists(st.integers(0, 10_000), min_size=2, max_size=20, unique=True),
 )  # fmt: skip
 def test_points_on_a_line_give_the_line(slope, intercept, x):
-    """And all of their variance is explained, unless there is none."""
+    """The line explains all of the variance, unless there is none."""
     fit = line(x, [slope * one + intercept for one in x])
     assert fit.slope == pytest.approx(slope, abs=1e-6, rel=1e-6)
     assert fit.intercept == pytest.approx(intercept, abs=1e-3, rel=1e-6)
@@ -111,7 +111,7 @@ def test_points_on_a_line_give_the_line(slope, intercept, x):
 
 
 def test_scattered_points_do_not_pass_for_a_line():
-    """A host that holds half as many is below what Fig. 8 demands."""
+    """A host that holds half as many is below the bound of Fig. 8."""
     assert line(range(1, 11), [8, 16, 24, 32, 40, 48, 56, 64, 72, 76]).r2 < 0.999
     assert line(range(1, 11), [8 * n for n in range(1, 11)]).r2 == 1.0
 
@@ -126,7 +126,7 @@ def test_a_proportion_goes_through_the_origin(slope, x):
 
 
 def test_one_point_is_no_line():
-    """The error says what was given."""
+    """The error has the given points."""
     with pytest.raises(ValueError, match="two points"):
         line([3, 3], [1, 2])
 
@@ -139,7 +139,7 @@ def test_room_counts_what_is_in_flight():
 
 
 def test_who_passed_the_limit_is_named_with_the_peak():
-    """Within the noise nobody did."""
+    """Within the noise, no host counts as over the limit."""
     trace = Trace(looks=[look_at(t, {"host1": u, "host2": 0.8}) for t, u in enumerate((0.7, 0.85))])
     assert over(trace, 0.8) == {"host1": 0.85}
 
@@ -159,13 +159,13 @@ MOVE = Move("p", "host1", "host2", 1.0, 1.5, size=0.3 * CAPACITY)
     ],
 )
 def test_a_move_is_judged_by_what_was_seen_right_before(usages, word):
-    """Its source at the limit, its destination the emptiest of those with room."""
+    """The source is at its limit, and the destination is the emptiest host with room."""
     wrong = wrong_move(look_at(0.9, usages), MOVE, limit=0.8, headroom=0.05)
     assert wrong == "" if not word else word in wrong
 
 
 def test_an_emptier_host_without_room_is_no_reproach():
-    """Largest margin means: of those where it fits."""
+    """The largest margin counts among hosts where the process fits."""
     look = look_at(0.9, {"host1": 0.81, "host2": 0.4})
     small = HostLook(0.1, 0.0, 0.2 * CAPACITY, accepting=True)
     look = Look(look.elapsed, {**look.hosts, "host3": small}, {})
@@ -173,7 +173,7 @@ def test_an_emptier_host_without_room_is_no_reproach():
 
 
 def test_moves_are_read_from_the_record():
-    """Begun and reached belong together; the size is what was last seen before."""
+    """Begin and end of a move belong together; the size is the last one seen before."""
     facts = {"from": "host1", "to": "host2"}
     trace = Trace(
         looks=[Look(0.9, {}, {}, {"p": 7.0}), Look(1.2, {}, {}, {"p": 9.0})],

@@ -1,4 +1,4 @@
-"""Begin and end of the benchmarks: missing programs, errors and signals."""
+"""Start and end of the benchmarks: missing programs, errors and signals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[3]
 #: Programs that a benchmark starts and ends.
 CHILDREN = {"simulated_slaves", "criu_desk", "handoff_nodes"}
 
-#: A benchmark that is sent a signal in the middle.
+#: Benchmark that receives a signal in the middle.
 SIGNALLED = """
 import contextlib, os, signal, sys
 from benchmarks.stopping import run
@@ -75,7 +75,7 @@ def test_every_benchmark_is_ended_so(program):
 
 @pytest.mark.parametrize("program", needs.COMMANDS)
 def test_chaos_names_a_missing_program_before_it_begins(monkeypatch, tmp_path, program):
-    """Also `nft`, which the first fault of a network needs, and no earlier one."""
+    """`nft` is checked too, though only the first network fault needs it."""
     found = shutil.which
     monkeypatch.setattr(needs, "check_rights", lambda: None)
     monkeypatch.setattr(
@@ -90,7 +90,7 @@ def test_chaos_names_a_missing_program_before_it_begins(monkeypatch, tmp_path, p
 
 
 def test_a_clock_is_given_to_a_part_and_not_to_what_enters_its_host(monkeypatch, tmp_path):
-    """Without libfaketime the command stays as it is."""
+    """Without libfaketime the command does not change."""
     monkeypatch.setattr(clocks, "library", lambda: Path("/lib/faketime.so"))
     command = clocks.with_clock(tmp_path, "master", ["rosrm", "master"])
     assert (command[0], command[-2:]) == ("env", ["rosrm", "master"])

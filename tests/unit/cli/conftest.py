@@ -1,4 +1,4 @@
-"""The command line against a client that only pretends to be connected."""
+"""Fixtures: the command line with a fake client."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ STORY = {
 
 @dataclass
 class FakeClient:
-    """A connection that answers like a master and notes what it was asked."""
+    """Fake connection that answers like a master and records its requests."""
 
     hosts: list = field(default_factory=lambda: list(HOSTS))
     processes: list = field(default_factory=lambda: list(PROCESSES))
@@ -166,7 +166,7 @@ class FakeClient:
 
 @pytest.fixture
 def client(monkeypatch):
-    """The connection of every command; it keeps the settings that it was reached with."""
+    """Replace the connection of every command; the fake keeps its settings."""
     fake = FakeClient()
 
     def connect(settings):
@@ -179,7 +179,7 @@ def client(monkeypatch):
 
 @pytest.fixture
 def rosrm():
-    """Run one command line; both streams and the exit code come back."""
+    """Run one command line; return both streams and the exit code."""
 
     def run(*words, columns=None):
         runner = CliRunner(env={"COLUMNS": columns, "NO_COLOR": "1", "TERM": "dumb"})

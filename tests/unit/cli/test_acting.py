@@ -1,4 +1,4 @@
-"""Commands that change something, and what they say when they cannot."""
+"""Commands that change something, and their error messages."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, a
 def test_wait_says_how_a_checkpoint_a_restore_or_a_move_ended(
     rosrm, client, monkeypatch, action, kind, message, code
 ):
-    """By the first such event after it was asked for; an older one says nothing of it."""
+    """The first such event after the request counts; an older one does not."""
     client.events = [event(1, kind, "a", message="of another time")]
     client.processes = [process("a", "stuck", reason="alpha is lost")]
 
@@ -90,7 +90,7 @@ def test_wait_says_how_a_checkpoint_a_restore_or_a_move_ended(
     [([process("a", "finished", kind="job")], "a has finished"), ([], "a is no longer listed")],
 )
 def test_wait_ends_when_nothing_is_left_to_migrate(rosrm, client, rows, said):
-    """End the waiting with exit code 1 when the process is over or was removed."""
+    """Exit with 1 when the process has ended or was removed."""
     client.processes = rows
     result = rosrm("migrate", "a", "--wait")
     assert (result.code, result.err) == (1, f"rosrm: no longer waiting: {said}\n")
@@ -165,7 +165,7 @@ def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
 
 
 def test_submit_wait_ends_when_a_service_has_ended(rosrm, client, work):
-    """Nothing starts it again, and a service is to run."""
+    """The service does not restart, though it is meant to run."""
     client.processes = [process("a", "finished", kind="job"), process("b", "finished")]
     result = rosrm("submit", work, "--wait")
     assert (result.code, result.out.splitlines()[-1]) == (1, "2 finished")
@@ -174,7 +174,7 @@ def test_submit_wait_ends_when_a_service_has_ended(rosrm, client, work):
 
 
 def test_submit_wait_ends_when_all_that_is_left_is_set_aside(rosrm, client, work, monkeypatch):
-    """Once it has been for a moment: at the start of a cluster hosts are still registering."""
+    """The wait lasts a moment longer, because hosts still register at the start of a cluster."""
     looks = iter((1.0, 6.0))
 
     def later(seconds=0.0):
@@ -208,7 +208,7 @@ def test_ctrl_c_in_a_wait_says_that_the_processes_stay(rosrm, client, work, monk
 
 
 def test_submit_takes_several_files_and_the_standard_input(rosrm, client, work, monkeypatch):
-    """As one submission: all processes are taken, or none."""
+    """All files form one submission: all processes are accepted, or none."""
     other = SimpleNamespace(buffer=io.BytesIO(b"processes: [{name: c, command: x}]"))
     monkeypatch.setattr("rosrm.config.documents.sys", SimpleNamespace(stdin=other))
     assert rosrm("submit", work, "-").code == 0
@@ -259,7 +259,7 @@ def test_cancel_wait_ends_when_all_have_ended(rosrm, client, monkeypatch):
 
 
 def test_cancel_wait_says_once_what_has_become_of_each(rosrm, client):
-    """Neither each process nor the sum again, where the reply has the end of all of them."""
+    """The summary is not repeated if the reply has the end of each process."""
     client.processes = [process("a", "cancelled"), process("b", "cancelled")]
     client.cancel = lambda names: f"{len(names)} processes cancelled"
     result = rosrm("cancel", "a", "b", "--wait")
@@ -287,7 +287,7 @@ def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, monkeypa
 
 @pytest.mark.parametrize(("left", "code"), [([], 0), ([process("driver")], 1)])
 def test_drain_wait_ends_when_the_host_is_drained(rosrm, client, monkeypatch, left, code):
-    """Exit code 1 where a process has stayed, because turning the host off would end it."""
+    """Exit with 1 if a process has stayed, because turning the host off would end it."""
     client.hosts, client.processes = [host("alpha", draining=True)], [process("talker")]
 
     def later(seconds):

@@ -85,7 +85,7 @@ WORK = "processes: [{name: a, command: x}]"
 
 
 def test_the_check_of_a_simulation_names_its_distribution(rosrm, file, monkeypatch):
-    """Without `rosrm-simulate` the keys tell the kind, and the error names what is missing."""
+    """Without `rosrm-simulate` the keys tell the kind, and the error names the package."""
     monkeypatch.setattr(installed, "installed_plugins", lambda group: [])
     path = file(f"seed: 1\n{SIMULATION}")
 
@@ -108,7 +108,7 @@ def test_the_check_of_a_simulation_names_its_distribution(rosrm, file, monkeypat
     ],
 )
 def test_a_file_of_another_kind_is_named_once(rosrm, file, command, text, said):
-    """Not key by key."""
+    """The error does not list each key."""
     result = rosrm(*command, file(text))
     assert result.code == 2
     assert said in result.err
@@ -132,7 +132,7 @@ def test_every_wrong_file_is_said_and_nothing_else_is_lost(rosrm, file):
 
 
 def test_plugins_that_cannot_be_made_are_found(rosrm, file, monkeypatch):
-    """All of a cluster's, with the place of their definition, before a master starts."""
+    """The check makes all plugins of a cluster; errors name their place in the file."""
 
     def fails(options):
         raise KeyError("weight")
@@ -191,7 +191,7 @@ def test_what_may_be_a_mistake_is_a_warning(rosrm, tmp_path, text, warning):
 
 
 def test_warnings_are_given_along_with_errors(rosrm, file):
-    """All that is wrong at once."""
+    """The output lists all problems at once."""
     text = "defaults: {needs: {cpus: 1}}\nprocesses: [{name: a, comand: x}]"
     result = rosrm("config", "check", file(text))
     assert result.code == 2
@@ -206,7 +206,7 @@ def test_an_unknown_kind_is_refused_with_those_there_are(rosrm, file):
 
 
 def test_a_resource_in_needs_is_compared_with_all_that_probes_read(rosrm, file, monkeypatch):
-    """By the name of the resource, and not of the probe that reads it."""
+    """The name of the resource counts, not that of its probe."""
     use_probes(monkeypatch, ProbeOffer("thermal", fails, resources=("temperature",)))
     text = "processes: [{name: a, command: x, needs: {temprature: 1}}]"
     result = rosrm("config", "check", file(text))
@@ -223,7 +223,7 @@ def is_absent(options, context):
 
 
 def use_probes(monkeypatch, *offers):
-    """Install these probes and nothing else."""
+    """Install only these probes."""
 
     @hookimpl
     def register_probes():
@@ -236,7 +236,7 @@ def use_probes(monkeypatch, *offers):
 def test_probes_that_cannot_be_made_are_found_and_absent_ones_are_none_of_them(
     rosrm, file, monkeypatch
 ):
-    """Only what says so is absent here: the file may be for a host that has the hardware."""
+    """Only probes that report absence are absent: the file may be for a host with the hardware."""
     made = FakeProbe(fine=0.5)
     use_probes(
         monkeypatch, ProbeOffer("fine", lambda options, context: made),

@@ -1,4 +1,4 @@
-"""The command itself: version, help, speed, Ctrl-C."""
+"""Command line as a whole: version, help, speed, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_verb_of_another_tool_names_the_command_that_does_as_much(rosrm, verb,
 
 
 def commands():
-    """Every command, with the words that call it."""
+    """Yield every command, with the arguments that select it."""
     group = typer.main.get_command(app)
     for name in group.list_commands(None):
         one = group.get_command(None, name)
@@ -183,7 +183,7 @@ main()
     ],
 )  # fmt: skip
 def test_a_command_whose_standard_streams_are_closed_ends_without_a_traceback(words, closed, code):
-    """What a closed stream would have had is lost; the exit code is as ever."""
+    """Output for a closed stream is lost; the exit code does not change."""
     command = [sys.executable, "-c", ASKING, *words.split(), "--domain", "0"]
     done = subprocess.run(
         ["sh", "-c", f'exec "$0" "$@" {closed}', *command], capture_output=True, text=True,
@@ -193,7 +193,7 @@ def test_a_command_whose_standard_streams_are_closed_ends_without_a_traceback(wo
 
 
 def test_no_file_takes_the_number_of_a_closed_standard_stream():
-    """What a library writes to standard output goes nowhere, and not into that file."""
+    """Output of a library to standard output is dropped, and not written into that file."""
     code = (
         "import os, sys\n"
         "from rosrm.cli import commands\n"

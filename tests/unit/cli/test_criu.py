@@ -1,4 +1,4 @@
-"""`rosrm criu check`: what it says line by line, as JSON, and by its exit code."""
+"""`rosrm criu check`: text output, JSON and exit code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.criu_kit import HOST_FACTS
 
 @pytest.fixture
 def here(monkeypatch):
-    """Pretend that this is what is found here."""
+    """Replace the result of the check on this host."""
 
     def pretend(reason="", version="4.2.1", missing=""):
         def find(prefix):
@@ -46,7 +46,7 @@ def test_one_that_works_is_told_line_by_line(rosrm, here):
 
 
 def test_without_the_libraries_of_a_transfer_no_image_can_be_sent(rosrm, here, monkeypatch):
-    """A host where CRIU works is no host to move to or from without them."""
+    """A host with CRIU but without these libraries is neither source nor destination of a move."""
     here()
     monkeypatch.setattr("rosrm_criu.transfer.missing", lambda: "aiohttp is not installed: pip ...")
     result = rosrm("criu", "check")

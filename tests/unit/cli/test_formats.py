@@ -1,4 +1,4 @@
-"""Numbers for people."""
+"""Formats of numbers in output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that other distributions bring by the entry-point group `rosrm.commands`."""
+"""Commands of other distributions by the entry-point group `rosrm.commands`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 
 from rosrm.cli import commands
 
-#: A module with a function, a group, and objects that are no commands.
+#: Module with a function, a group, and objects that are no commands.
 MODULE = '''
 import typer
 

@@ -1,4 +1,4 @@
-"""The options of `rosrm lab`, and bad input."""
+"""Options of `rosrm lab`, and invalid input."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ LIMITS = {"memory": "1GiB", "cpu": "0.5", "disk": "2GiB"}
 
 @pytest.fixture
 def without_rights(monkeypatch):
-    """As an ordinary user."""
+    """Drop the rights of root."""
     monkeypatch.setattr(needs, "CAPABILITIES", {"CAP_SYS_TEST": (63, "for this test")})
 
 
 def test_hosts_alike():
-    """The words of the issue's own example."""
+    """The example of the issue gives equal hosts."""
     assert planned(2, LIMITS, []) == [
         HostPlan("host1", GIB, 0.5, 2 * GIB),
         HostPlan("host2", GIB, 0.5, 2 * GIB),
@@ -26,7 +26,7 @@ def test_hosts_alike():
 
 
 def test_a_host_of_its_own_and_one_that_differs():
-    """What is not said is as for the others; `none` lifts a limit."""
+    """A missing value is as for the other hosts; `none` lifts a limit."""
     hosts = planned(2, LIMITS, ["desk:memory=none,cpu=none", "host2:cpu=2"])
     assert hosts[1] == HostPlan("host2", GIB, 2.0, 2 * GIB)
     assert hosts[2] == HostPlan("desk", None, None, 2 * GIB)
@@ -34,7 +34,7 @@ def test_a_host_of_its_own_and_one_that_differs():
 
 
 def test_numbers_are_base_units():
-    """Bytes and cores, as in the files."""
+    """Plain numbers are bytes and cores, as in the files."""
     limits = {"memory": "67108864", "cpu": "0.5 cores", "disk": "33554432"}
     assert planned(1, limits, []) == [HostPlan("host1", 64 * MIB, 0.5, 32 * MIB)]
 
@@ -53,7 +53,7 @@ def test_numbers_are_base_units():
     ],
 )
 def test_what_is_wrong_is_said_with_its_place(changes, more, said):
-    """And what is allowed."""
+    """The error also has the allowed values."""
     with pytest.raises(ConfigError) as raised:
         planned(1, {**LIMITS, **changes}, more)
     assert said in str(raised.value)
@@ -61,7 +61,7 @@ def test_what_is_wrong_is_said_with_its_place(changes, more, said):
 
 @pytest.mark.parametrize("number", [-1, 0, 251])
 def test_a_wrong_number_is_refused(number):
-    """None at all is right only with --host."""
+    """Zero hosts are allowed only with --host."""
     with pytest.raises(ConfigError, match="allowed are 1 to 250"):
         planned(number, LIMITS, [])
     assert planned(0, LIMITS, ["desk"])
@@ -69,13 +69,13 @@ def test_a_wrong_number_is_refused(number):
 
 @pytest.mark.parametrize(("text", "value"), [("1%", 0.01), ("0.01", 0.01), ("100%", 1.0), ("0", 0)])
 def test_a_share_is_percent_or_a_fraction(text, value):
-    """Both are usual."""
+    """Users write shares in both forms."""
     assert fraction(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize("text", ["1", "5", "x", "%", "101%", "1.5", "-1%", "nan"])
 def test_what_is_no_share_is_refused(text):
-    """A bare 1 may be meant as 1 % or as all."""
+    """A bare 1 may mean 1 % or the whole."""
     with pytest.raises(ConfigError):
         fraction(text)
 
@@ -96,7 +96,7 @@ def test_what_is_no_share_is_refused(text):
     ],
 )
 def test_without_root_the_right_is_named_and_slices_are_offered(rosrm, without_rights, words):
-    """One message, no traceback, exit code 1."""
+    """The output is one message without a traceback, and the exit code is 1."""
     result = rosrm("lab", *words)
     assert result.code == 1
     assert result.err.startswith("rosrm: a lab needs rights that are missing: CAP_SYS_TEST")
@@ -115,17 +115,17 @@ def test_without_root_the_right_is_named_and_slices_are_offered(rosrm, without_r
     ],
 )
 def test_bad_input_is_refused_before_anything_is_looked_at(rosrm, without_rights, words, said):
-    """Exit code 2: nothing was done."""
+    """The exit code is 2: nothing was done."""
     result = rosrm("lab", *words)
     assert result.code == 2
     assert said in result.err
 
 
-# --- what is shown ----------------------------------------------------------------------------
+# --- output -----------------------------------------------------------------------------------
 
 
 class OneHost:
-    """A lab that was made with `--memory 1GiB`; its host was cut before it was switched off."""
+    """Lab made with `--memory 1GiB`, whose host was cut off before it was switched off."""
 
     def boot(self, host):
         assert host == "host1"
@@ -150,7 +150,7 @@ def test_a_size_is_shown_in_the_units_that_it_was_given_in(rosrm, one_host):
 
 
 def test_all_processes_of_a_host_are_not_called_the_runs_of_rosrm(rosrm, one_host):
-    """`rosrm hosts` counts those that rosrm runs, under RUNS."""
+    """`rosrm hosts` counts the processes run by rosrm under RUNS."""
     header = rosrm("lab", "status", "--lab", "lab").out.splitlines()[0]
     assert "PROCESSES" in header
     assert "RUNS" not in header

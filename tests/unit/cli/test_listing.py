@@ -1,4 +1,4 @@
-"""Commands that show something: tables that read at 80 columns, and stable JSON."""
+"""Commands that show something: tables for 80 columns, and stable JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_status_json_counts_states(rosrm, client):
 
 
 def test_status_names_the_plugins_that_fail(rosrm, client):
-    """With the host and the last error; the others are not named."""
+    """The output has the host and the last error, and no working plugins."""
     client.plugins = [
         PluginRow("scoring", "affine", "mine 1.0", "failing", "score: KeyError: 'x' (a.py:3)"),
         PluginRow("probe", "lidar", "", "failing", "no such sensor", "shelf"),
@@ -129,7 +129,7 @@ def test_a_stale_or_missing_reading_is_marked(rosrm, client):
 
 
 def test_old_readings_of_a_process_are_marked(rosrm, client):
-    """In the table by `?`, in JSON by `stale`."""
+    """The table marks them by `?`, JSON by `stale`."""
     client.processes = [process("p", "unreachable", pid=9, stale=True, reason="alpha is lost")]
     out = rosrm("ps").out
     assert "?0.50" in out
@@ -188,7 +188,7 @@ def test_events_are_shown_oldest_first(rosrm, client):
 
 
 def test_events_follow_outlives_a_master_that_is_away_for_a_while(rosrm, client, monkeypatch):
-    """And continues with what was recorded after the newest event that was shown."""
+    """The output continues after the newest event shown before."""
 
     def later(seconds):
         if client.fails is not None:
@@ -411,7 +411,7 @@ def test_top_outlives_a_master_that_is_away_for_a_while(rosrm, client, monkeypat
 
 
 def test_top_ends_each_picture_with_a_line_end_and_takes_a_unit(rosrm, client, monkeypatch):
-    """A prompt stands below the picture, not behind it."""
+    """The prompt appears below the picture."""
     slept = []
     monkeypatch.setattr("time.sleep", slept.append)
     result = rosrm("top", "--period", "1500ms", "-n", 2)

@@ -1,4 +1,4 @@
-"""The live table is a pure function of a snapshot."""
+"""Live table as a pure function of a snapshot of the cluster."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_it_keeps_to_the_width_of_the_terminal(width):
 
 
 def test_a_title_is_broken_between_states():
-    """At 80 columns a number stands beside its state."""
+    """At 80 columns a number stays beside its state."""
     states = ("running", "starting", "set_aside", "queued", "failed", "cancelled", "finished")
     rows = [process(f"{state}{i}", state) for state in states for i in range(4)]
     first, second, *_ = drawn(Snapshot("laboratory", 650.0, 1, HOSTS, rows)).splitlines()
@@ -54,7 +54,7 @@ LONG = "no host may take it: shelf: it lacks the label camera=front; desk: it la
 
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_a_long_reason_is_cut_and_names_stay_whole(width):
-    """Every name and state stands there whole, one line a process, whatever a reason says."""
+    """Each process has one line with its whole name and state, whatever its reason is."""
     names = ["camera_driver_front", "sleeper", "mapkeeper"]
     rows = [
         process("camera_driver_front", "set_aside", "", reason=LONG),
@@ -71,7 +71,7 @@ def test_a_long_reason_is_cut_and_names_stay_whole(width):
 
 
 def test_reasons_that_are_cut_show_where_they_differ():
-    """The beginning that they share, or that the state says already, makes room for the rest."""
+    """A common beginning, or one that repeats the state, is cut first."""
     lacks = "no host may take it: shelf: it lacks the label"
     rows = [
         process("camera_driver_front", reason="restarted 3 times after exit code 1"),
@@ -100,7 +100,7 @@ def test_the_master_begins_reasons_as_the_table_knows():
 
 @pytest.mark.parametrize("width", [50, 60, 80, 120])
 def test_bars_keep_their_numbers(width):
-    """A bar becomes shorter before a resource leaves; its percentage is never cut."""
+    """A bar becomes shorter before a resource is left out; its percentage is never cut."""
     robots = [host(f"robot-{i}", resources=[resource(n) for n in ("memory", "cpu", "disk")])
               for i in range(2)]  # fmt: skip
     lines = drawn(Snapshot("lab", 1.0, 1, robots, []), width).splitlines()
@@ -110,7 +110,7 @@ def test_bars_keep_their_numbers(width):
 
 
 def test_processes_have_a_head_cpu_and_a_reason():
-    """As `rosrm ps` has; a process that moves says where to and why."""
+    """The columns are those of `rosrm ps`; a moving process shows destination and reason."""
     lines = drawn(Snapshot("lab", 1.0, 1, HOSTS, [process("a", migrations=2)])).splitlines()
     (head,) = [line for line in lines if line.startswith("NAME")]
     assert head.split() == ["NAME", "STATE", "HOST", "SINCE", "CPU", "MEMORY", "WHY"]
@@ -127,7 +127,7 @@ def test_processes_have_a_head_cpu_and_a_reason():
     ],
 )  # fmt: skip
 def test_sorting(sort, order):
-    """By state as a rule; by use the greatest first."""
+    """The default order is by state; by usage the greatest comes first."""
     rows = [
         process("idle", cpu=0.2, memory=200),
         process("busy", cpu=0.9, memory=100),

@@ -1,4 +1,4 @@
-"""`rosrm logs`: finds the slaves that hold the logs, copies them, and follows the processes.
+"""`rosrm logs`: search of the slaves that hold the logs, copy and follow.
 
 The slaves are folders here, read by the slave's own reader.
 """
@@ -29,7 +29,7 @@ NOON = 1_700_000_000.0
 
 
 class Slaves:
-    """Logs of instances below a folder; `live` are those that have not ended."""
+    """Logs of instances below a folder; `live` has the instances that have not ended."""
 
     def __init__(self, folder):
         self.folder, self.live = folder, set()
@@ -40,13 +40,13 @@ class Slaves:
         return path
 
     def start(self, on, number, name="talker", *, at=NOON):
-        """A program is started; it has written nothing."""
+        """Start a program without output."""
         path = self.path(on, number, name)
         path.touch()
         log_index.add(str(path), Mark(at, self.end(path), 77))
 
     def write(self, on, number, content, name="talker", *, at=NOON):
-        """A program writes, and the supervisor looks."""
+        """Write output of a program, and let the supervisor look."""
         path = self.path(on, number, name)
         if not path.exists():
             self.start(on, number, name, at=at)
@@ -70,7 +70,7 @@ class Slaves:
 
 @pytest.fixture
 def slaves(client, tmp_path):
-    """Logs by host and instance; the client reads from them."""
+    """Provide logs by host and instance; the client reads from them."""
     made = Slaves(tmp_path)
     client.hosts = [host("alpha"), host("beta")]
 
@@ -102,7 +102,7 @@ def test_rotated_files_are_part_of_it(rosrm, client, slaves):
 
 
 def test_what_was_dropped_is_said_with_its_size(rosrm, client, slaves):
-    """At the beginning, where files were removed, and between two files."""
+    """Gaps are at the beginning, in place of removed files, and between two files."""
     slaves.write("alpha", 1, b"x" * 2000 + b"\n")
     slaves.rotate("alpha", 1, keep=1)
     slaves.write("alpha", 1, b"y" * 999 + b"\nkept\n")
@@ -113,7 +113,7 @@ def test_what_was_dropped_is_said_with_its_size(rosrm, client, slaves):
 
 
 def test_restarts_and_former_instances_stand_apart(rosrm, client, slaves):
-    """In the order of their numbers, also on other hosts, with a line before each other start."""
+    """Instances follow by number, over all hosts, with a line before each further start."""
     client.events = [event(1, host="beta"), event(2, host="alpha")]
     slaves.write("beta", 1, b"on beta\n")
     slaves.write("alpha", 2, b"oh no\n")
@@ -153,7 +153,7 @@ def test_tail_counts_lines_over_rotations_and_instances(rosrm, client, slaves):
 
 @pytest.mark.parametrize("lines", [1, 2, 5])
 def test_tail_counts_no_line_that_is_written_while_the_log_is_read(rosrm, client, slaves, lines):
-    """A process may write more lines between two reads than are asked for."""
+    """A process may write more lines between two reads than were requested."""
     slaves.write("alpha", 1, b"".join(b"%d\n" % number for number in range(10)))
     there = client.read_log
 
@@ -174,7 +174,7 @@ def test_a_host_to_read_from_has_to_exist(rosrm, client, slaves):
 
 
 def test_since_begins_at_a_time(rosrm, client, slaves):
-    """Within an instance, and without the instances before."""
+    """The bound applies within an instance, and leaves out earlier instances."""
     now = time.time()
     slaves.write("alpha", 1, b"hours ago\n", at=now - 9000)
     slaves.write("alpha", 2, b"an hour ago\n", at=now - 3600)
@@ -234,7 +234,7 @@ def test_lines_without_a_time_stay_where_they_are_in_their_log(rosrm, client, sl
     ]  # fmt: skip
 
 
-# --- nothing ----------------------------------------------------------------------------------
+# --- missing logs -----------------------------------------------------------------------------
 
 
 def test_a_program_that_was_never_started_is_said_with_its_reason(rosrm, client, slaves):
@@ -266,7 +266,7 @@ def test_a_process_that_waits_or_is_unknown_is_said(rosrm, client, slaves):
 
 @pytest.mark.parametrize("state", ["lost", "suspect", "left", "detached"])
 def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
-    """The answer comes from the master's knowledge, at once, in the name of the host."""
+    """The answer comes at once from the master's state, and names the host."""
     client.hosts = [host("alpha", state)]
     client.processes = [process("talker", "unreachable", reason="alpha is lost")]
     result = rosrm("logs", "talker")
@@ -302,7 +302,7 @@ def test_one_name_that_fails_does_not_keep_the_others(rosrm, client, slaves):
 
 
 def test_a_host_that_does_not_answer_is_asked_once(rosrm, client, slaves):
-    """Report each log that is there alone, and show those of other hosts at once."""
+    """Report each log that is only there, and show those of other hosts at once."""
     client.processes = [process(name, host="alpha") for name in ("one", "two")]
     client.processes.append(process("ear", host="beta", number=3))
     client.events = [event(1, process="ear", host="alpha")]
@@ -327,7 +327,7 @@ def test_a_host_that_does_not_answer_is_asked_once(rosrm, client, slaves):
 
 
 def test_a_lost_host_holds_up_no_other_log(rosrm, client, slaves, monkeypatch):
-    """With -f too: the report comes before the other logs are followed."""
+    """With -f, too, the report comes before the other logs are followed."""
     client.hosts = [host("alpha", "lost"), host("beta")]
     client.processes = [process("talker", "unreachable"), process("ear", host="beta", number=2)]
     slaves.write("beta", 2, b"heard\n", "ear")
@@ -348,7 +348,7 @@ def test_a_lost_host_holds_up_no_other_log(rosrm, client, slaves, monkeypatch):
     assert ("read_log", "alpha") not in client.asked
 
 
-# --- on and on --------------------------------------------------------------------------------
+# --- follow -----------------------------------------------------------------------------------
 
 
 def test_follow_shows_what_is_added_over_a_rotation(rosrm, client, slaves, monkeypatch):
@@ -460,7 +460,7 @@ def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, monkey
     assert (result.code, result.err) == (3, "rosrm: talker: no slave answers on alpha\n")
 
 
-# --- in a program -----------------------------------------------------------------------------
+# --- use from a program -----------------------------------------------------------------------
 
 
 def test_the_client_yields_what_was_written_with_host_and_instance(client, slaves):

@@ -1,4 +1,4 @@
-"""Where a command looks for the master, and what it says where there is no ROS."""
+"""Connection of commands to the master: domain, early join, and errors without ROS."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, ela
 
 
 def test_each_command_that_asks_the_master_joins_ros_early():
-    """Those with a domain, but for master and slave, which become other programs."""
+    """All commands with a domain join early, except master and slave, which exec other programs."""
     tree = get_command(app).commands
     asking = {
         name for name, command in tree.items()
@@ -75,7 +75,7 @@ def test_each_command_that_asks_the_master_joins_ros_early():
 
 @pytest.fixture
 def joined(monkeypatch):
-    """Fates of the participants that were made early."""
+    """Record creation and close of participants that were made early."""
     became = []
 
     class Participant:
@@ -107,13 +107,13 @@ def joined(monkeypatch):
     ],
 )
 def test_ros_is_joined_early_only_where_it_is_sure_how(joined, line, environment, joins):
-    """An option or a file may say that ROS is joined otherwise, or not at all."""
+    """An option or a file may change the join, or make it unnecessary."""
     early.join(line, environment)
     assert joined == ["made"] * joins
 
 
 def test_a_participant_is_handed_over_or_closed(joined):
-    """To one connection with the same settings; else its end closes it."""
+    """A connection with the same settings takes it; otherwise it is closed at its end."""
     early.join(["ps"], {})
     assert early.take(RosSettings(domain=7)) is None
     early.drop()
@@ -126,7 +126,7 @@ def test_a_participant_is_handed_over_or_closed(joined):
 
 
 def test_a_fault_of_ros_is_left_to_the_connection(monkeypatch):
-    """The connection meets the fault again and reports it."""
+    """The connection meets the error again and reports it."""
     monkeypatch.setitem(sys.modules, "rosrm.ros.participant", None)
     early.join(["ps"], {})
     assert early.take(RosSettings()) is None
@@ -134,7 +134,7 @@ def test_a_fault_of_ros_is_left_to_the_connection(monkeypatch):
 
 @pytest.mark.parametrize("server", ["", "desk:11811"])
 def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, server):
-    """And the time is that since the user began to wait."""
+    """The time counts from the beginning of the user's wait."""
     settings = RosSettings(domain=3, discovery_server=server)
     closed = []
     participant = SimpleNamespace(settings=settings, close=lambda: closed.append(True))
@@ -178,7 +178,7 @@ def test_without_ros_a_command_says_how_to_get_it(monkeypatch):
 
 @pytest.mark.parametrize("word", ["abc", "300", "-1", "1.5"])
 def test_a_domain_of_the_environment_is_checked_before_ros_is_joined(monkeypatch, rosrm, word):
-    """For all commands, with the same bounds as --domain, which displaces the variable."""
+    """The bounds of --domain, which overrides the variable, hold for all commands."""
     monkeypatch.setenv("ROS_DOMAIN_ID", word)
     for command in ("ps", "master", "slave"):
         early.join([command], {})

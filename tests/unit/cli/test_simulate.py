@@ -56,7 +56,7 @@ def test_a_workload_is_compared_with_its_variants(rosrm, workload):
 
 @pytest.mark.parametrize(("width", "tables_shown"), [(80, 2), (160, 1)])
 def test_the_table_reads_on_a_narrow_terminal(rosrm, workload, monkeypatch, width, tables_shown):
-    """Nothing of a number or of a name is cut: there are two tables below each other."""
+    """The table is split into two, so that no number and no name is cut."""
     monkeypatch.setattr(tables, "console", lambda: Console(width=width))
     result = rosrm("simulate", workload, "--variant", "migration: {automatic: false}")
     lines = result.out.splitlines()
@@ -141,7 +141,7 @@ def test_the_json_of_a_record_says_what_was_replayed_and_how_it_agrees(rosrm, re
 
 
 def test_until_ends_the_recorded_run_as_well(rosrm, record):
-    """Both rows, and how they agree, are of the same time."""
+    """Both rows and their agreement cover the same time."""
     report = json.loads(rosrm("simulate", record, "--until", "2500ms", "--json").out)
     assert [list(run["placements"]) for run in report["runs"]] == [["p0", "p1", "p2"]] * 2
     assert [run["finished"] for run in report["runs"]] == [0, 0]
@@ -151,7 +151,7 @@ def test_until_ends_the_recorded_run_as_well(rosrm, record):
 
 
 def test_a_replay_that_decides_otherwise_is_said(rosrm, tmp_path, content):
-    """The header says another policy than the one that decided."""
+    """The header names another policy than the one that decided."""
     from io import BytesIO
 
     from rosrm.recording.frames import FrameKind, frame, frames, opening

@@ -1,4 +1,4 @@
-"""`rosrm master` and `rosrm slave` check everything, say what starts, and become the runtime."""
+"""`rosrm master` and `rosrm slave`: checks, start message and exec of the runtime."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ OURS = SimpleNamespace(
 
 @pytest.fixture
 def becomes(monkeypatch, tmp_path):
-    """What this process would have become, instead of becoming it."""
+    """Record the runtime and settings of the exec, instead of the exec."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     seen = []
     monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=OURS))
@@ -96,7 +96,7 @@ def test_a_wrong_file_or_unknown_plugin_starts_nothing(rosrm, becomes, tmp_path)
 
 
 def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch):
-    """What the runtime begins with is on a descriptor that outlives the exec."""
+    """The settings are on a descriptor that outlives the exec."""
     seen = {}
 
     def execv(program, words):
@@ -146,7 +146,7 @@ def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes,
     ],
 )
 def test_beside_a_running_one_nothing_starts(rosrm, becomes, words, remedy):
-    """The refusal is all that is printed."""
+    """Only the refusal is printed."""
     settings = ClusterConfig() if words == ["master"] else HostConfig()
     (settings.state / "supervisor").mkdir(parents=True)
     with only_one(settings.state, words[0], code="", remedy=""):

@@ -1,4 +1,4 @@
-"""The client in a program: what it takes, and how its waits and iterators end."""
+"""Client in a program: accepted arguments, waits and iterators."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def notes():
 
 @pytest.fixture
 def client(master, notes, monkeypatch):
-    """A client whose looks follow each other at once."""
+    """Return a client whose looks follow each other at once."""
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     with Client(connection=master, notify=notes.append) as client:
         yield client
@@ -28,7 +28,7 @@ def client(master, notes, monkeypatch):
 
 
 def test_submit_takes_files_mappings_and_specs(client, master, tmp_path):
-    """One or several, in their order, as one submission."""
+    """One or several arguments, in their order, form one submission."""
     path = tmp_path / "work.yaml"
     path.write_text("processes: [{name: a, command: x}, {name: b, command: x}]", encoding="utf-8")
     mapping = {"name": "c", "command": ["x"], "needs": {"memory": "1GiB"}}
@@ -75,7 +75,7 @@ def test_an_unknown_name_is_refused_with_the_nearest(client, master):
 
 
 def test_events_follow_until_their_time_out(client, master, monkeypatch):
-    """Each event once; a master that is silent for a while is asked again."""
+    """Each event comes once; a master that is silent for a while gets another request."""
     looks = iter([None, NoMaster("no answer."), event(3), None])
 
     def later(seconds):
@@ -103,7 +103,7 @@ def test_a_silent_master_is_noted_once(client, master, notes):
 
 
 def test_a_wait_says_why_it_is_not_done(client, master):
-    """By names: still pending, failed, no longer listed."""
+    """The error names processes that are pending, failed or no longer listed."""
     master.processes = [process("a", "starting"), process("b", "failed"), process("c")]
     seen = []
     result = client.wait(["a", "b", "c", "d"], timeout=0.05, on_change=seen.append)

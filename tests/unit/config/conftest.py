@@ -1,4 +1,4 @@
-"""A file with a text in it, and what a loader says of one that it refuses."""
+"""Fixtures: a configuration file with a text, and the error of a loader that refuses it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def file(tmp_path):
 
 @pytest.fixture
 def refusal(file):
-    """What a loader says of a text that it refuses, without the folder's name."""
+    """Return a loader's error message for a text, without the folder's name."""
 
     def load(loader, text: str, *more) -> str:
         path = file(text)

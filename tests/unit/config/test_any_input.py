@@ -1,4 +1,4 @@
-"""Whatever stands in a file, a loader answers with a value or with one `ConfigError`."""
+"""Loaders on arbitrary input: the result is a value or one `ConfigError`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`cluster.yaml`: every setting is read, and every fault has its place."""
+"""`cluster.yaml`: every setting is read, and every error has its place."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from rosrm.extensions.units import Fraction, ResourceName, Seconds
 
 @dataclass(frozen=True)
 class Steady:
-    """One form of an option."""
+    """One variant of an option."""
 
     value: float = 1.0
 
 
 @dataclass(frozen=True)
 class Rising:
-    """The other form."""
+    """Another variant."""
 
     slope: float = 1.0
 
@@ -50,7 +50,7 @@ class Weights:
 
 
 class Made:
-    """The policy that the offer makes."""
+    """Policy that the offer makes."""
 
     def __init__(self, options):
         self.score = options
@@ -184,7 +184,7 @@ def test_a_lease_outlasts_the_suspicion(refusal):
     ],
 )
 def test_a_quiet_slave_is_not_taken_for_a_silent_one(refusal, text, place, period, suspect):
-    """It is heard once in a beat period, and a message may be lost."""
+    """An idle slave sends one message per beat period, and one message may be lost."""
     assert refusal(load_cluster, text) == (
         f"f.yaml:{place}: control.beat_period ({period} s) must be at most a third of "
         f"liveness.suspect ({suspect} s): a slave without changes reports once in a beat "
@@ -242,7 +242,7 @@ def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, regi
     ],
 )
 def test_a_fault_in_an_option_of_several_types_is_reported_once(refusal, registry, curve, fault):
-    """With its path in the file, and the keys of all types."""
+    """The error has its path in the file and the keys of all types."""
     said = refusal(
         load_cluster, f"scoring: {{policy: curved, options: {{curve: {curve}}}}}", registry
     )
@@ -290,7 +290,7 @@ class ByResource:
     ],
 )
 def test_a_resource_that_no_probe_reads_is_refused(refusal, text, said):
-    """In options that are marked to name resources, and where needs are assumed."""
+    """Both options marked to name resources and assumed needs are checked."""
 
     @hookimpl
     def register_probes():

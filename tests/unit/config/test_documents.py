@@ -1,4 +1,4 @@
-"""YAML with places: what is unreadable is refused with line and column."""
+"""YAML with places: unreadable text is refused with line and column."""
 
 from __future__ import annotations
 

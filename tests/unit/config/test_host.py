@@ -1,4 +1,4 @@
-"""`host.yaml`: every setting is read, and every fault has its place."""
+"""`host.yaml`: every setting is read, and every error has its place."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ FDS = ProbeOffer("fds", lambda options, context: options)
 
 @pytest.fixture
 def with_fds():
-    """A probe that is installed and not read by default."""
+    """Install a probe that is not read by default."""
 
     @hookimpl
     def register_probes():
@@ -157,14 +157,14 @@ def test_a_resource_that_no_probe_reads_is_refused_with_the_nearest(refusal, wit
 
 
 def test_a_limit_of_a_probe_that_is_not_chosen_is_refused(refusal, file, with_fds):
-    """Nothing would ever be compared with it."""
+    """Its limit would never apply."""
     said = refusal(load_host, "limits: {fds: 0.9}", with_fds)
     assert "limits: 'fds' is read by the probe 'fds', which is not among `probes`" in said
     assert load_host(file("limits: {fds: 0.9}\nprobes: [fds]"), with_fds).limits["fds"] == 0.9
 
 
 def test_a_limit_of_a_probe_that_may_be_absent_on_the_host_is_taken(file):
-    """Nothing is made: it is known by the offer what it would read."""
+    """The probe is not created: its offer names the resources that it would read."""
 
     def absent(options, context):
         raise SkipPlugin("no driver")

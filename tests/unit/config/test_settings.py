@@ -1,4 +1,4 @@
-"""The settings that the runtimes get: lean to import, and JSON both ways."""
+"""Settings of the runtimes: few imports, and JSON in both directions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rosrm.model.codec import from_plain, to_plain
 
 
 def test_settings_and_registry_import_without_pydantic_yaml_or_typer():
-    """A slave's memory budget has no room for what only files and terminals need."""
+    """The memory budget of a slave excludes modules that only files and terminals need."""
     code = (
         "import sys, rosrm.config.settings, rosrm.extensions.registry, rosrm.model.spec_json;"
         "print(*sorted({'pydantic', 'yaml', 'typer', 'rich', 'rclpy'} & set(sys.modules)))"
@@ -39,7 +39,7 @@ class Inner:
 
 @dataclass(frozen=True)
 class Outer:
-    """Every form that options may have."""
+    """Options of every supported type."""
 
     text: str = ""
     ratio: float = 0.0

@@ -1,4 +1,4 @@
-"""`work.yaml`: processes in the words of ROS 2 launch, and every fault with its place."""
+"""`work.yaml`: processes in the terms of ROS 2 launch, and every error with its place."""
 
 from __future__ import annotations
 
@@ -237,7 +237,7 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
     ],
 )
 def test_what_several_keys_break_is_said_along_with_a_wrong_key(refusal, entry, said):
-    """All that is wrong at once, not one stage of the check after the other."""
+    """The message lists all errors at once, not one stage of the check after the other."""
     registry = Registry.of(
         ours=SimpleNamespace(register_migration_strategies=register_migration_strategies)
     )
@@ -307,7 +307,7 @@ def test_a_relative_program_or_directory_is_beside_the_file(
     ],
 )
 def test_what_a_shell_would_read_is_pointed_out(refusal, text, found):
-    """No shell reads a command, so that it would be passed on as it is written."""
+    """No shell reads a command, so shell syntax would be passed on literally."""
     for key in ("command", "arguments"):
         program = "module: m, " if key == "arguments" else ""
         said = refusal(load_work, f"processes: [{{name: a, {program}{key}: '{text}'}}]")
@@ -428,7 +428,10 @@ def register_patient_strategy():
 
 
 def test_only_the_options_that_a_process_gives_go_over_those_of_the_cluster(file):
-    """In base units; for the others the cluster's word holds, not the plugin's default."""
+    """Values are in base units.
+
+    Missing options keep the cluster's values, not the plugin's defaults.
+    """
     registry = Registry.of(
         ours=SimpleNamespace(register_migration_strategies=register_patient_strategy)
     )

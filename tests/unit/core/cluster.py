@@ -1,10 +1,11 @@
-"""A cluster on a table: the master's core, the slaves' cores, and machines that a test plays with.
+"""Simulated cluster for unit tests: the reducers of the master and the slaves, without I/O.
 
-`Cluster` holds time and the wires. In a test of one story the wires are prompt: whatever is said is
-heard at once and in order (`Cluster.settle`). The state machine test takes the same wires in hand,
-and delays, loses, repeats and mixes up what travels.
+`Cluster` holds time and the wires. A test of one story uses prompt wires: every message arrives at
+once and in order (`Cluster.settle`). The state machine test controls the same wires itself: it
+delays, loses, repeats and reorders messages.
 
-`Machine` is the truth of one host: the processes that really run there, whatever anybody believes.
+`Machine` holds the truth of one host: the processes that run there, whatever master and slave
+believe.
 """
 
 from __future__ import annotations
@@ -80,16 +81,16 @@ __all__ = [
 ]
 
 
-# --- things to begin with ---------------------------------------------------------------------
+# --- fixtures ---------------------------------------------------------------------------------
 
 
 def job(name: str, **fields: Any) -> ProcessSpec:
-    """A process that runs to completion."""
+    """Return the spec of a process that runs to completion."""
     return process(name, kind=Kind.JOB, **fields)
 
 
 def process(name: str, memory: float = 0.0, **fields: Any) -> ProcessSpec:
-    """A process; `memory` declares its need in MiB."""
+    """Return the spec of a process; `memory` declares its needs in MiB."""
     if memory:
         fields["needs"] = {"memory": memory * MIB, "cpu": 0.0}
     fields.setdefault("command", ("run", "it"))
@@ -97,18 +98,18 @@ def process(name: str, memory: float = 0.0, **fields: Any) -> ProcessSpec:
 
 
 def node(name: str, **fields: Any) -> ProcessSpec:
-    """A ROS node: it is ready once it is seen in the graph."""
+    """Return the spec of a ROS node, which is ready once the graph shows it."""
     fields.setdefault("readiness", Readiness(timeout=20.0))
     return process(name, ros=True, **fields)
 
 
 def movable(name: str, *, overlap: bool = True, **fields: Any) -> ProcessSpec:
-    """A process that may be moved by the strategy `relaunch` of this module."""
+    """Return the spec of a process that moves by the strategy `relaunch` of this module."""
     return process(name, migration=MigrationPolicy("relaunch", overlap=overlap), **fields)
 
 
 class Eq1:
-    """The paper's score with one weight for memory and one for CPU."""
+    """Score of the paper with one weight for memory and one for CPU."""
 
     def __init__(self, memory: float = 1.0, cpu: float = 0.0) -> None:
         self.weights = {"memory": memory, "cpu": cpu}
@@ -119,7 +120,7 @@ class Eq1:
 
 
 class StartFirstOrStopFirst:
-    """As the shipped `relaunch`: start first, or stop first where two are not allowed."""
+    """Migration strategy like `relaunch`: start first, or stop first without overlap."""
 
     def __init__(self, timeout: float = 10.0) -> None:
         self.timeout = timeout
@@ -137,7 +138,7 @@ class StartFirstOrStopFirst:
 
 
 class HandOver:
-    """As the shipped `handoff`."""
+    """Migration strategy like the shipped `handoff`."""
 
     def __init__(self, timeout: float = 10.0) -> None:
         self.timeout = timeout
@@ -190,11 +191,11 @@ def declared_by(strategies: Mapping[str, Any]) -> Declared:
 class Cluster:
     """A master's core with machines around it.
 
-    Attributes:
+    now: seconds.
         now: seconds.
         records: everything that was recorded.
-        intents: what is durable: table -> key -> value, as JSON has it.
-        replies: by request.
+        intents: durable tables, as in the journal: table -> key -> value, as JSON has it.
+        replies: replies of the master, by request number.
         carried: every command that was carried out.
     """
 
@@ -242,12 +243,12 @@ class Cluster:
     # --- events --------------------------------------------------------------------------
 
     def decide(self, event: happened.Event) -> list[Command]:
-        """The core takes an event in; nothing of the outcome is carried out."""
+        """Pass an event to the reducer and return its commands, without carrying them out."""
         self.state.wall = self.wall
         return step(self.state, event, self.now)
 
     def tell(self, event: happened.Event) -> list[Command]:
-        """The core takes an event in; the outcome is made durable and carried out."""
+        """Pass an event to the reducer, make its commands durable and carry them out."""
         commands = self.decide(event)
         self.journal(commands)
         self.carry_out(commands)
@@ -304,7 +305,7 @@ class Cluster:
     # --- machines ------------------------------------------------------------------------
 
     def add(self, machine: Machine | str) -> Machine:
-        """A slave comes up, registers, sends a reading and asks for work."""
+        """Start a slave, which registers, sends a reading and requests work."""
         machine = Machine(machine) if isinstance(machine, str) else machine
         self.machines[machine.name] = machine
         machine.incarnation = machine.incarnation or 1 + len(self.machines)
@@ -314,7 +315,7 @@ class Cluster:
     def register(
         self, machine: Machine, kept: tuple[KeptState, ...] = (), *, journal_seen: int = 0
     ) -> Reply:
-        """A slave registers; taken in, it sends a reading and asks for work."""
+        """Register a slave; once accepted, it sends a reading and requests work."""
         machine.begin_to_register()
         reply = self.ask(
             happened.HostRegistered, machine.description(), machine.slave.statuses(),
@@ -338,7 +339,7 @@ class Cluster:
             )
 
     def read(self, *machines: Machine, **wrong: Any) -> None:
-        """Readings of these machines (of all that are connected) reach the master as one batch."""
+        """Send the readings of these (default: all connected) machines as one batch."""
         among = machines or self.machines.values()
         heard = [machine for machine in among if machine.connected and machine.host_id]
         if heard:
@@ -368,7 +369,7 @@ class Cluster:
     # --- requests ------------------------------------------------------------------------
 
     def ask(self, kind: Any, *fields: Any, settle: bool = True) -> Reply:
-        """Somebody asks for something; the answer."""
+        """Send a request to the master and return the reply."""
         self._requests += 1
         request = self._requests
         self.tell(kind(request, *fields))
@@ -398,7 +399,7 @@ class Cluster:
         return self.ask(happened.HostStateRequested, host, action)
 
     def leave(self, machine: Machine) -> Reply:
-        """A slave says that it stops, then ends all that it runs."""
+        """Stop a slave: it announces its departure and ends all its processes."""
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
         for instance in list(machine.programs):
             machine.tell(reducer.StopOrdered(instance), self.now)
@@ -406,14 +407,14 @@ class Cluster:
         return reply
 
     def detach(self, machine: Machine) -> Reply:
-        """A slave is stopped and leaves running what it runs; no slave is there after that."""
+        """Stop a slave that leaves its processes running; the host then has no slave."""
         kept = machine.begun()
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, kept)
         machine.connected = False
         return reply
 
     def attach(self, machine: Machine) -> Reply:
-        """The slave of a host is started again."""
+        """Start the slave of a host again."""
         machine.connected = True
         machine.restart_slave(self.now)
         reply = self.register(machine)
@@ -423,7 +424,7 @@ class Cluster:
     # --- time and wires ------------------------------------------------------------------
 
     def settle(self) -> None:
-        """Everything that is on its way arrives, until nothing more is said."""
+        """Deliver all messages until no part sends another one."""
         for _ in range(200):
             said = [self._deliver(machine) for machine in self.machines.values()]
             if not any([*said, self._nodes_talk()]):
@@ -442,7 +443,7 @@ class Cluster:
         return busy
 
     def _nodes_talk(self) -> bool:
-        """All that was said of handoffs arrives."""
+        """Deliver all handoff messages that are on their way."""
         arrivals = self.air.waiting()
         for arrive in arrivals[:1]:
             arrive()
@@ -452,7 +453,7 @@ class Cluster:
         return bool(arrivals or heard)
 
     def wait(self, seconds: float, *, tick: float = 0.1) -> None:
-        """Time passes: readings and usages come, deadlines are looked at."""
+        """Let time pass: readings and usages arrive, and the reducer checks its deadlines."""
         for _ in range(round(seconds / tick)):
             self.now += tick
             self.read()
@@ -467,14 +468,14 @@ class Cluster:
             self.settle()
 
     def restart_master(self) -> None:
-        """The master is killed and comes up from its journal; the slaves register again."""
+        """Kill the master, restore it from its journal and register the slaves again."""
         self.kill_master()
         for machine in self.machines.values():
             if machine.connected and machine.host_id:
                 self.register(machine)
 
     def kill_master(self) -> None:
-        """The master is killed and comes up from its journal; it has heard nobody yet."""
+        """Kill the master and restore it from its journal; no slave has registered yet."""
         for machine in self.machines.values():
             machine.polled.clear()
             machine.ordered.clear()
@@ -482,13 +483,13 @@ class Cluster:
         self.state = self._new_state(self.state.epoch + 1)
         restore(self.state, lambda table: self.intents[table], self.now)
 
-    # --- what is to be seen --------------------------------------------------------------
+    # --- observations --------------------------------------------------------------------
 
     def phase(self, name: str) -> str:
         return self[name].phase.value
 
     def where(self, name: str) -> list[str]:
-        """Hosts on which instances of a process really run."""
+        """Return the hosts on which instances of a process really run."""
         return [
             machine.name
             for machine in self.machines.values()
@@ -497,13 +498,13 @@ class Cluster:
         ]
 
     def node(self, host: str, name: str = "p") -> Node:
-        """The newest node of a process on a host."""
+        """Return the newest node of a process on a host."""
         machine = self.machines[host]
         list(self.air.nodes())
         return machine.programs[machine.find(name)].node
 
     def active(self, name: str = "p") -> list[str]:
-        """Hosts on which a node of a process really is active."""
+        """Return the hosts on which a node of the process really is active."""
         return [
             machine.name
             for machine, node in self.air.nodes()
@@ -511,18 +512,18 @@ class Cluster:
         ]
 
     def counts(self) -> dict[str, int]:
-        """Processes that really run, by host."""
+        """Return the number of processes that really run, by host."""
         return {name: len(machine.programs) for name, machine in self.machines.items()}
 
     def queue(self) -> list[str]:
         return list(self.state.queue)
 
     def told(self, kind: str) -> list[str]:
-        """Messages of the records of a kind."""
+        """Return the messages of the records of a kind."""
         return [record.message for record in self.records if record.kind == kind]
 
     def assigned(self) -> list[str]:
-        """Names in the order in which they were assigned."""
+        """Return process names in the order of their assignment."""
         return [record.process for record in self.records if record.kind == "assigned"]
 
     def explain(self, name: str) -> dict[str, Any]:

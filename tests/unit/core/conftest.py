@@ -1,4 +1,4 @@
-"""How long the state machine test plays: `ROSRM_PLAY=long` for minutes, to shake bugs out."""
+"""Hypothesis profiles of the state machine tests: `ROSRM_PLAY=long` runs for minutes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 from hypothesis import HealthCheck, settings
 
 _COMMON = {"deadline": None, "suppress_health_check": list(HealthCheck)}
-# The short one plays the same each time: what fails in it was broken by the change in hand.
+# The short profile is deterministic: a failure in it comes from the current change.
 settings.register_profile(
     "short", max_examples=60, stateful_step_count=50, derandomize=True, **_COMMON
 )

@@ -1,4 +1,4 @@
-"""One host on a table: what really runs there, its slave, and the wires to and from it."""
+"""Simulated host for unit tests: its running processes, its slave, and the wires to the master."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ GIB = 2.0**30
 
 @dataclass
 class Program:
-    """One instance that really runs.
+    """Instance that really runs.
 
     Attributes:
-        node: its present run, if it is a node that can be moved with its state.
-        restart: what the supervisor does when it ends.
+        node: present run of the node, if it can be moved with its state.
+        restart: restart policy that the supervisor applies when the instance ends.
     """
 
     assignment: Assignment
@@ -47,22 +47,22 @@ class Program:
 
 @dataclass
 class Machine:
-    """One host: what runs there, its slave, and the wires from and to it.
+    """Simulated host: its running processes, its slave, and the wires from and to the master.
 
     Attributes:
-        programs: what really runs, by instance; outlives the slave.
-        ends: of instances that the supervisor remembers.
+        programs: instances that really run; outlives the slave.
+        ends: statuses of ended instances that the supervisor remembers.
         refuses: process name to the reason why it cannot be started here.
-        stubborn: process names that do not end when they are told to.
-        quirks: of the nodes of a process here, by its name; see `Node`.
+        stubborn: process names that do not end when ordered to stop.
+        quirks: of the nodes of a process here, by process name; see `Node`.
         busy: usage of each resource without our processes, fraction.
         shown: base units that each process uses, by name; shows in readings and usages.
-        polled: assignments that wait for the slave's next request, in the master's hands.
+        polled: assignments at the master that wait for the slave's next request.
         ordered: orders on their way to the slave.
         said: status batches on their way to the master.
-        kept: the newest state of each process that lies here, by its name.
-        ships: hosts that are given the states of a process here, by its name.
-        connected: the wires work.
+        kept: newest snapshot or replica of each process on this host, by process name.
+        ships: hosts that receive replicas of a process on this host, by process name.
+        connected: True while the wires work.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Machine:
                 ResourceDescription("cpu", "core", self.cpu),
             )
 
-    # --- what it says --------------------------------------------------------------------
+    # --- messages to the master ----------------------------------------------------------
 
     def description(self) -> HostDescription:
         return HostDescription(
@@ -117,12 +117,12 @@ class Machine:
         )  # fmt: skip
 
     def begin_to_register(self) -> None:
-        """A new run of the slave takes no order that was meant for the former."""
+        """Start a registration: a new run of the slave drops orders meant for the former run."""
         if self.fresh:
             self.ordered.clear()
 
     def usage(self) -> dict[str, float]:
-        """Fraction of each resource, our running processes included."""
+        """Return the usage of each resource as a fraction, our running processes included."""
         usage = dict(self.busy)
         for program in self.programs.values():
             for resource in self.resources:
@@ -134,14 +134,14 @@ class Machine:
         return self.limits.get(resource, 1.0)
 
     def accepts(self) -> bool:
-        """Under all its limits, as the slave judges it."""
+        """Return True if the slave judges the host to be under all its limits."""
         usage = self.usage()
         return self.takes and all(
             usage.get(one.name, 0.0) < self.limit(one.name) for one in self.resources
         )
 
     def usages(self) -> happened.UsagesReceived:
-        """What each of its instances uses."""
+        """Return the event with the usage of each instance."""
         held = list(self.programs)
         used = [self.shown[one.process] for one in held]
         return happened.UsagesReceived(
@@ -185,13 +185,13 @@ class Machine:
                 self.ends.pop(instance, None)
 
     def tell(self, event: reducer.Event, now: float) -> None:
-        """Something happens to the slave."""
+        """Pass an event to the slave's reducer and carry out its commands."""
         self._report(reducer.step(self.slave, event, now), now)
 
     def _supervisor_says(self, status: InstanceStatus, now: float) -> None:
         self.tell(reducer.SupervisorReported((status,)), now)
 
-    # --- what it does --------------------------------------------------------------------
+    # --- commands of the slave -----------------------------------------------------------
 
     def _launch(self, assignment: Assignment, now: float) -> None:
         instance = assignment.instance
@@ -241,11 +241,11 @@ class Machine:
         self._supervisor_says(status, now)
 
     def find(self, name: str) -> InstanceId:
-        """The newest running instance of a process."""
+        """Return the newest running instance of a process."""
         return max(one for one in self.programs if one.process == name)
 
     def finish(self, name: str, now: float, *, code: int = 0, run_time: float = 10.0) -> None:
-        """A process ends by itself, and is started again if its policy says so."""
+        """End a process with an exit code; its restart policy may start it again."""
         when = self.programs[self.find(name)].restart.when
         if when == "always" or (when == "on-failure" and code):
             self._restart(self.find(name), now)
@@ -254,16 +254,16 @@ class Machine:
         self._end(self.find(name), state, now, code=code, run_time=run_time)
 
     def let_go(self, name: str, now: float) -> None:
-        """A stubborn process ends at last."""
+        """End a stubborn process."""
         self.stubborn.discard(name)
         self._end(self.find(name), InstanceState.EXITED, now, signal=9)
 
     def seen_in_graph(self, name: str, now: float) -> None:
-        """The node of the newest instance comes up."""
+        """Show the node of the newest instance in the ROS graph."""
         self.tell(reducer.SeenInGraph(self.find(name)), now)
 
     def obey(self, order: Order, now: float) -> happened.OrderAnswered:
-        """The slave takes an order."""
+        """Pass an order to the slave and return the answer."""
         if order.action == "execute":
             try:
                 result = self.executors[order.executor](order.arguments)
@@ -302,14 +302,14 @@ class Machine:
             del self.kept[name]
 
     def keep_state(self, instance: InstanceId) -> KeptState:
-        """A node of ours keeps a newer state than before."""
+        """Publish a snapshot that is newer than the one before."""
         before = self.kept.get(instance.process)
         cycles = before.sequence if before is not None and before.instance == instance else 0
         self.kept[instance.process] = KeptState(instance, cycles + 1, 100)
         return self.kept[instance.process]
 
     def take_state(self, state: KeptState) -> None:
-        """Another host ships one here: the newest is kept."""
+        """Receive a replica from another host; the slave keeps only the newest."""
         own = self.kept.get(state.instance.process)
         age = (state.instance.number, state.sequence)
         if own is None or (own.instance.number, own.sequence) < age:
@@ -325,13 +325,13 @@ class Machine:
         return happened.OrderAnswered(order.order, not code, code, settled.refusal)
 
     def fetch(self, now: float) -> None:
-        """The slave's open request is answered with what waits for it."""
+        """Answer the slave's open request with the assignments that wait for it."""
         batch, self.polled = self.polled, []
         if batch:
             self.tell(reducer.AssignmentsReceived(tuple(batch)), now)
 
     def replace_supervisor(self, now: float) -> None:
-        """The supervisor is killed; the next one takes over what runs, and remembers what ended."""
+        """Kill the supervisor; the next one adopts what runs and remembers what ended."""
         fenced = {one for one, it in self.programs.items() if it.assignment.fence is not None}
         statuses = (*self.ends.values(), *self._running())
         self.tell(reducer.SupervisorReplaced(statuses, {}, frozenset(fenced)), now)
@@ -343,17 +343,17 @@ class Machine:
         ]
 
     def begun(self) -> tuple[InstanceStatus, ...]:
-        """All instances, without those that wait for their start."""
+        """Return the statuses of all instances, except of those that wait for their start."""
         waiting = self.slave.waiting
         return tuple(one for one in self.slave.statuses() if one.instance not in waiting)
 
     def stop_unheard(self, now: float) -> None:
-        """The slave is stopped while no master hears it: it ends all that it runs."""
+        """Stop the slave while no master hears it; it ends all its processes."""
         for instance in list(self.programs):
             self._end(instance, InstanceState.WITHDRAWN, now, signal=2)
 
     def restart_slave(self, now: float) -> None:
-        """The slave is killed and comes up again; what runs, runs on."""
+        """Kill the slave and start it again; its processes keep running."""
         self.incarnation += 1000
         self.fresh = True
         self.sequence = self.batches = 0

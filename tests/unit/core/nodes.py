@@ -1,7 +1,7 @@
-"""Nodes on a table: what one that keeps to the handoff protocol does, and the topics between them.
+"""Simulated nodes that follow the handoff protocol, and the topics between them.
 
 A `Node` belongs to one run of a program. It is active unless it was started as a shadow or has
-fallen silent, whatever the master believes. Its quirks are what it does wrong.
+fallen silent, whatever the master believes. Its quirks are its violations of the protocol.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class Node:
     """One run of a node.
 
     Attributes:
-        shadow: it begins in silence, as the shadow of a handoff does, and what is restored.
+        shadow: True if the node starts silent, as the shadow of a handoff or as a restored node.
         quirks: shared with its machine, so that they may change while it runs.
         handoff: number of the destination of the handoff that it takes part in; 0: none.
-        heard: of the other node in this handoff.
-        said: in this handoff; who comes late hears all of it.
-        configs, reports: on their way to it.
+        heard: reports received from the other node in this handoff.
+        said: reports sent in this handoff; a late subscriber receives all of them.
+        configs, reports: messages on their way to this node.
     """
 
     instance: InstanceId
@@ -65,7 +65,7 @@ class Node:
             self.air.spread(self, report)
 
     def take_config(self) -> None:
-        """The master says something of a handoff that names this node."""
+        """Receive the next message of the master about a handoff that names this node."""
         config = self.configs.popleft()
         if "deaf" in self.quirks:
             return
@@ -79,7 +79,7 @@ class Node:
         (self._as_source if config.source == number else self._as_destination)(config.phase)
 
     def take_report(self) -> None:
-        """The other node says something in the channel."""
+        """Receive the next report of the other node in the channel."""
         report = self.reports.popleft()
         if "deaf" in self.quirks or report.destination != self.handoff:
             return
@@ -157,7 +157,7 @@ class Node:
         self.say(ReportPhase.ACTIVE)
 
     def wake(self) -> None:
-        """The promise of all this: no other is, at this very moment."""
+        """Become active; the protocol guarantees that no other node is active at this moment."""
         self.active = True
         if self.air is not None and self.instance.number not in self.air.left:
             others = [
@@ -169,12 +169,12 @@ class Node:
 
 
 class Air:
-    """The topics of handoffs between the master and all nodes: latched, reliable, in order.
+    """Topics of handoffs between the master and all nodes: latched, reliable, in order.
 
     Attributes:
-        latched: what the present master has said.
-        channels: those to which it is subscribed.
-        to_master: reports on their way to it, with the machine from which they come.
+        latched: messages that the present master has published.
+        channels: channels to which the master is subscribed.
+        to_master: reports on their way to the master, with the machine that sent them.
         left: instances that were given up with their lost hosts, and may be active there.
     """
 
@@ -186,7 +186,7 @@ class Air:
         self.left: set[int] = set()
 
     def nodes(self) -> Iterator[tuple[Machine, Node]]:
-        """Every node that runs; one that has come up meanwhile joins."""
+        """Yield every running node with its machine; a new node joins the topics first."""
         for machine in self._machines():
             for program in machine.programs.values():
                 if program.node.air is None:
@@ -197,7 +197,7 @@ class Air:
                 yield machine, program.node
 
     def publish(self, config: PublishStateConfig) -> None:
-        """The master speaks, and listens until it is DONE."""
+        """Publish a message of the master; subscribe to the channel until the handoff is DONE."""
         channel = (config.process, config.destination)
         if config.phase is HandoffPhase.DONE:
             self.channels.discard(channel)
@@ -212,7 +212,7 @@ class Air:
         self.latched.append(config)
 
     def spread(self, speaker: Node, report: HandoffReported) -> None:
-        """A node speaks in the channel."""
+        """Publish a report of a node in its channel."""
         for machine, node in self.nodes():
             if node is speaker:
                 if (report.process, report.destination) in self.channels:
@@ -221,13 +221,13 @@ class Air:
                 node.reports.append(report)
 
     def open(self, listener: Node) -> None:
-        """A node comes into a channel, and hears what was said there."""
+        """Subscribe a node to its channel; it receives all earlier reports."""
         for _, node in self.nodes():
             if node is not listener and _together(node, listener):
                 listener.reports.extend(node.said)
 
     def others(self, node: Node) -> list[Node]:
-        """The other nodes of a process that run where this one can reach them."""
+        """Return the other nodes of a process that run and are reachable from this node."""
         name = node.instance.process
         return [
             one for machine, one in self.nodes()
@@ -235,7 +235,7 @@ class Air:
         ]  # fmt: skip
 
     def master_is_gone(self) -> None:
-        """What it has said and nobody has heard is lost."""
+        """Drop the master's topics with all messages that were not received yet."""
         self.latched.clear()
         self.channels.clear()
         self.to_master.clear()
@@ -243,7 +243,7 @@ class Air:
             node.configs.clear()
 
     def waiting(self) -> list[Callable[[], None]]:
-        """Whatever of all that is on its way to the nodes can arrive next."""
+        """Return a call for each message to a node that can arrive next."""
         arrivals: list[Callable[[], None]] = []
         for machine, node in self.nodes():
             if machine.connected and node.configs:
@@ -256,7 +256,7 @@ class Air:
         return all(machine.connected for machine, other in self.nodes() if _together(node, other))
 
     def next_reports(self) -> list[int]:
-        """Which of the reports to the master can arrive next: the first of each speaker."""
+        """Return the reports that can reach the master next: the first of each node."""
         first: dict[int, int] = {}
         for at, (machine, report) in enumerate(self.to_master):
             if machine.connected:

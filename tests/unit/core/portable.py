@@ -1,4 +1,4 @@
-"""Hosts whose slaves have the executors of `criu`: nodes stand still, go on and join on a table."""
+"""Simulated hosts whose slaves have the executors of `criu`: dump, fetch, restore, join."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _ALIKE = {name: "yes" if name == "all_users" else "4.2" for name in FACTS}
 
 
 def by_criu(seconds: float = 2.0) -> Criu:
-    """The shipped strategy; each part of a move has so long."""
+    """Return the shipped strategy with this time-out for each part of a move."""
     names = ("start", "leave", "dump", "transfer", "restore", "join")
     return Criu(CriuOptions(**{f"{name}_timeout": seconds for name in names}))
 
 
 class Everywhere:
-    """As `criu` on hosts of which nobody has to be asked first."""
+    """Strategy like `criu`, for hosts whose capability needs no probe."""
 
     def __init__(self, seconds: float) -> None:
         self.propose = by_criu(seconds).propose
@@ -34,14 +34,14 @@ class Everywhere:
 
 @dataclass
 class Portable(Machine):
-    """A machine that takes part in moves by `criu`.
+    """Simulated host that takes part in moves by `criu`.
 
     Attributes:
-        asked: names of the executors, in order.
-        befalls: by the name of an executor, what happens once, just before it does its work.
-        mute: names of executors whose next answer nobody hears.
-        slow: names of executors whose answers lie in `answers` until a test tells them.
-        stand_still: instances that were dumped, with the attempt for which they were.
+        asked: names of the executors, in the order of the calls.
+        befalls: by executor name, a call that runs once, just before the executor's work.
+        mute: executor names whose next answer is lost.
+        slow: executor names whose answers stay in `answers` until a test delivers them.
+        stand_still: dumped (frozen) instances, with the attempt number of their dump.
     """
 
     asked: list[str] = field(default_factory=list)
@@ -62,21 +62,22 @@ class Portable(Machine):
         }  # fmt: skip
 
     def obey(self, order: Order, now: float) -> happened.OrderAnswered:
-        """As any order; an answer that nobody hears is none."""
+        """Carry out an order; a lost answer becomes a time-out."""
         self._now = now
         self.asked += [order.executor] if order.executor else []
         self.befalls.pop(order.executor, lambda: None)()
         answer = super().obey(order, now)
         if order.executor in self.slow:
             self.answers.append(answer)
-            return happened.OrderAnswered(0, accepted=True)  # of no order: nothing is said yet
+            # answer to no order: none has arrived yet
+            return happened.OrderAnswered(0, accepted=True)
         if self.connected and order.executor not in self.mute:
             return answer
         self.mute.discard(order.executor)
         return happened.OrderAnswered(order.order, accepted=False, code="timeout")
 
     def lose_power(self, now: float) -> None:
-        """Everything here ends at once, and nobody hears of it; another slave comes up later."""
+        """End everything on the host without any report; another slave starts later."""
         self.connected = False
         self.programs.clear()
         self.ends.clear()
@@ -84,7 +85,7 @@ class Portable(Machine):
         self.restart_slave(now)
 
     def restart_slave(self, now: float) -> None:
-        """As any slave; which attempts were given up only the former one knew."""
+        """Restart the slave; the list of abandoned attempts is lost with the former slave."""
         super().restart_slave(now)
         self._turned_back.clear()
 
@@ -130,6 +131,6 @@ class Portable(Machine):
         node = self._node(arguments, "destination")
         if node is None:
             return {"fault": "it has ended"}
-        if node.instance.number not in self.stand_still:  # else it is on its way again
+        if node.instance.number not in self.stand_still:  # otherwise the instance runs again
             node.wake()
         return {}

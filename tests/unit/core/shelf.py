@@ -1,4 +1,4 @@
-"""A host that takes images of its processes, and a strategy that plans it, as `criu` does."""
+"""Simulated host that takes checkpoint images, and a strategy that plans them like `criu`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rosrm.model.values import Assignment, InstanceState, RestartPolicy
 from tests.unit.core.cluster import Cluster, StartFirstOrStopFirst
 from tests.unit.core.machine import Machine
 
-#: Seconds that each step is given.
+#: Time-out of each step, seconds.
 PATIENCE = 5.0
 
 
 class Freezer(StartFirstOrStopFirst):
-    """Moves as `relaunch`, and takes images."""
+    """Strategy that moves like `relaunch` and takes checkpoint images."""
 
     ability = "can_freeze"
 
@@ -54,7 +54,7 @@ class Freezer(StartFirstOrStopFirst):
 
 
 class Holding(Machine):
-    """A machine on which nothing is restored without an image that was laid out for it."""
+    """Simulated host that restores an instance only from an image prepared for it."""
 
     taken: dict[int, int]
 
@@ -66,18 +66,18 @@ class Holding(Machine):
 
 
 class Shelf:
-    """A machine with these executors, and its images.
+    """Simulated host with these executors and its checkpoint images.
 
     Attributes:
-        images: numbers of the instances of which there is an image.
-        taken: images that are being restored: the number of the instance to be, to that of which
-            it is.
-        frozen: instances that stand still.
-        alive: restored instances that go on with their memory.
-        trouble: by the name of an executor, why it fails.
-        mute: names of executors that do what they are asked, and fail then.
-        passing: each fails once.
-        asked: names of the executors, in order.
+        images: numbers of the instances that have an image.
+        taken: images that are being restored: number of the new instance -> number of the instance
+            in the image.
+        frozen: frozen instances.
+        alive: restored instances that kept their memory.
+        trouble: executor name -> reason why it fails.
+        mute: executor names that do their work and then report a failure.
+        passing: executor names that fail once.
+        asked: names of the executors, in the order of the calls.
     """
 
     def __init__(self, name: str, **fields: Any) -> None:
@@ -145,7 +145,7 @@ class Shelf:
         if destination in self.alive:
             return {"active": True}
         for instance in list(self.machine.programs):
-            if instance.number == destination:  # what holds it ends with its failure
+            if instance.number == destination:  # the shim of this instance ends with its failure
                 self.machine.finish(instance.process, self.cluster.now, code=125)
         if destination in self.taken:
             self.images.add(self.taken.pop(destination))
@@ -155,7 +155,7 @@ class Shelf:
         self.images.difference_update(arguments["numbers"])
 
     def play(self, *others: Machine | str, **settings: Any) -> Cluster:
-        """A cluster whose first host this is."""
+        """Return a cluster whose first host is this one."""
         self.cluster = Cluster(self.machine, *others, strategies={"freezer": Freezer()}, **settings)
         self.cluster.wait(0.5)
         return self.cluster

@@ -1,4 +1,4 @@
-"""Strategies that do not work on every host: who is asked, what follows, what executors answer."""
+"""Capabilities of strategies: probes of hosts, the resulting placement, and executor results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.unit.core.machine import Machine
 
 
 class Freezing:
-    """Takes an image of the source, and goes on from it: as `criu` does."""
+    """Strategy that restores an image of the source at the destination, like `criu`."""
 
     ability = "can_freeze"
 
@@ -39,12 +39,12 @@ class Freezing:
 
 
 def late(_plugin: object, _call: object) -> Any:
-    """Stand for the deadline of a plugin call that has passed."""
+    """Stand for a plugin call that exceeded its deadline."""
     raise TimeoutError("late")
 
 
 class Host:
-    """A machine with the executors of `Freezing`, which remembers what they were asked."""
+    """Simulated host with the executors of `Freezing`; records their arguments."""
 
     def __init__(self, name: str, version: str = "4.2", **fields: Any) -> None:
         self.asked: list[tuple[str, Mapping[str, Any]]] = []
@@ -71,7 +71,7 @@ class Host:
 
 
 def frozen(*hosts: Host | Machine) -> Cluster:
-    """A process that moves by `Freezing`, on the first of these hosts."""
+    """Return a cluster with a process that moves by `Freezing`, on the first of these hosts."""
     machines = [host.machine if isinstance(host, Host) else host for host in hosts]
     cluster = Cluster(*machines, strategies={"freezing": Freezing()})
     cluster.submit(process("p", migration=MigrationPolicy("freezing")))
@@ -85,7 +85,7 @@ def busy(name: str, version: str = "4.2") -> Host:
 
 
 def test_each_host_is_asked_once_after_its_registration():
-    """And again when its slave is another one."""
+    """The master probes each host once per run of its slave."""
     host = Host("a")
     cluster = frozen(host)
     cluster.wait(60.0)
@@ -100,7 +100,7 @@ def test_each_host_is_asked_once_after_its_registration():
 
 
 def test_a_process_moves_to_a_host_of_the_same_ability():
-    """The image's place is told to who fetches it, and the new instance starts from the image."""
+    """The destination gets the image's location from the master, and restores from that image."""
     here, there = Host("a"), busy("b")
     cluster = frozen(here, there)
     number = cluster["p"].owner
@@ -116,7 +116,7 @@ def test_a_process_moves_to_a_host_of_the_same_ability():
 
 
 def test_where_it_does_not_work_nothing_goes():
-    """With the host's own reason, in the answer to who asked."""
+    """The reply names the host's own reason."""
     there = busy("b")
     there.ability = RuntimeError("CRIU 3.17 is too old")
     cluster = frozen(Host("a"), there)
@@ -131,7 +131,7 @@ def test_where_it_does_not_work_nothing_goes():
 
 
 def test_hosts_that_do_not_match_are_no_destination():
-    """By the strategy's own comparison."""
+    """The strategy's own comparison of capabilities decides."""
     cluster = frozen(Host("a"), busy("b", "4.1"), busy("c"))
     reply = cluster.migrate("p", "b")
     assert "it has version 4.1" in reply.message
@@ -141,7 +141,7 @@ def test_hosts_that_do_not_match_are_no_destination():
 
 
 def test_a_host_without_the_plugin_is_no_destination():
-    """It is not even asked."""
+    """The master does not even probe that host."""
     cluster = frozen(Host("a"), Machine("b", busy={"memory": 0.5}))
     assert "is not installed there" in cluster.migrate("p", "b").message
 
@@ -156,7 +156,7 @@ def test_hosts_without_the_plugin_are_named_together():
 
 
 def test_a_strategy_that_fails_to_name_its_ability_is_asked_again():
-    """One late call of its plugin must not keep it off every host until their slaves restart."""
+    """One late plugin call must not exclude the strategy from every host until a slave restarts."""
     host, cluster = Host("a"), Cluster(strategies={"freezing": Freezing()})
     limit, cluster.state.plugins.limit = cluster.state.plugins.limit, late
     cluster.add(host.machine)
@@ -168,7 +168,7 @@ def test_a_strategy_that_fails_to_name_its_ability_is_asked_again():
 
 
 def test_what_an_executor_answered_outlives_the_master():
-    """A later step needs it, whichever run of the master gives that."""
+    """A later step needs the executor's result, whichever run of the master orders that step."""
     here, there = Host("a"), busy("b")
     cluster = frozen(here, there)
     there.machine.connected = False

@@ -1,4 +1,4 @@
-"""Checkpoint and restore: what owns the name when, what is refused, and that nothing is lost."""
+"""Checkpoint and restore: ownership of the name, refusals, and no loss of memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.unit.core.shelf import PATIENCE, Freezer, Shelf
 
 
 def playing(spec: ProcessSpec | None = None, **fields: Any) -> tuple[Shelf, Cluster]:
-    """P runs on a, which takes images."""
+    """Return a cluster where p runs on a, which takes images."""
     shelf = Shelf("a", **fields)
     cluster = shelf.play()
     cluster.submit(spec or process("p"))
@@ -32,7 +32,7 @@ def playing(spec: ProcessSpec | None = None, **fields: Any) -> tuple[Shelf, Clus
 
 
 def checkpointed(spec: ProcessSpec | None = None, **fields: Any) -> tuple[Shelf, Cluster]:
-    """P is checkpointed on a."""
+    """Return a cluster where p is checkpointed on a."""
     shelf, cluster = playing(spec, **fields)
     reply = cluster.checkpoint("p")
     assert (reply.accepted, reply.message) == (True, "p: it is being checkpointed on a")
@@ -43,11 +43,11 @@ def row(cluster: Cluster, name: str = "p") -> dict[str, Any]:
     return cluster.explain(name)
 
 
-# --- there and back ---------------------------------------------------------------------------
+# --- checkpoint and restore -------------------------------------------------------------------
 
 
 def test_a_checkpoint_ends_the_process_and_leaves_its_image() -> None:
-    """The name is not free, nothing runs, the host has its room back, and the row says where."""
+    """The image keeps the name taken, its host has its room back, and the row names that host."""
     shelf, cluster = checkpointed()
     assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("checkpointed", [], {1})
     assert cluster["p"].owner == 0
@@ -62,7 +62,7 @@ def test_a_checkpoint_ends_the_process_and_leaves_its_image() -> None:
 
 
 def test_a_restore_goes_on_from_the_image() -> None:
-    """As a new instance with the process's own restart policy; the image is used up."""
+    """The restored instance is new, has the process's restart policy, and uses up the image."""
     policy = RestartPolicy("on-failure", delay=0.1)
     shelf, cluster = checkpointed(process("p", restart=policy))
     assert cluster.restore("p").message == "p: it is being restored on a"
@@ -79,7 +79,7 @@ def test_a_restore_goes_on_from_the_image() -> None:
 
 
 def test_a_process_keeps_the_name_of_its_node_through_an_image() -> None:
-    """One that came by a handoff runs under an alias."""
+    """A process that moved by a handoff keeps running under its alias."""
     shelf, cluster = playing()
     cluster.state.instances[cluster["p"].owner].node_name = "p_7"
     cluster.checkpoint("p")
@@ -90,7 +90,7 @@ def test_a_process_keeps_the_name_of_its_node_through_an_image() -> None:
 
 
 def test_a_restored_process_that_ends_before_its_plan_does_follows_its_policy() -> None:
-    """Its image is used up: there is no way back, and it ends as any process does."""
+    """The image is used up, so the process ends by its policy, like any other."""
     shelf, cluster = checkpointed(process("p", restart=RestartPolicy("never")))
     restored = shelf.machine.executors["await"]
 
@@ -111,7 +111,7 @@ def test_a_restored_process_that_ends_before_its_plan_does_follows_its_policy() 
 
 
 def test_what_cannot_be_dumped_runs_on_and_the_reason_is_said() -> None:
-    """With the restart policy that it had."""
+    """The process keeps its restart policy, and the record names the reason."""
     policy = RestartPolicy("always")
     shelf, cluster = playing(process("p", restart=policy))
     shelf.trouble["freeze"] = "file descriptor 7 is a pipe"
@@ -147,7 +147,7 @@ def test_a_restore_that_fails_leaves_the_image_where_it_was(step: str) -> None:
 
 
 def test_a_slave_that_refuses_the_start_leaves_the_image() -> None:
-    """As where CRIU has gone meanwhile."""
+    """A host may lose CRIU between checkpoint and restore; the image survives the refused start."""
     shelf, cluster = checkpointed()
     shelf.machine.refuses["p"] = "there is no CRIU here"
     cluster.restore("p")
@@ -157,7 +157,10 @@ def test_a_slave_that_refuses_the_start_leaves_the_image() -> None:
 
 
 def test_a_process_that_was_restored_is_not_put_back() -> None:
-    """Nobody heard that it was: an older image would tell its peers what they have heard."""
+    """A process keeps running if the answer to its restore was lost.
+
+    An older image would repeat messages that its peers have received.
+    """
     shelf, cluster = checkpointed()
     shelf.mute.add("await")
     cluster.restore("p")
@@ -169,7 +172,7 @@ def test_a_process_that_was_restored_is_not_put_back() -> None:
 
 
 def test_a_cancelled_restore_that_has_succeeded_is_stopped() -> None:
-    """It turns back, finds the process alive, goes forward, and is cancelled then."""
+    """The plan undoes, finds the process alive, goes forward, and is cancelled then."""
     shelf, cluster = checkpointed()
     restored = shelf.machine.executors["await"]
 
@@ -191,7 +194,7 @@ def test_a_cancelled_restore_that_has_succeeded_is_stopped() -> None:
 
 
 def test_what_cannot_be_checkpointed_is_refused_with_its_reason() -> None:
-    """Nothing has changed then."""
+    """A refused checkpoint changes nothing."""
     shelf = Shelf("a")
     cluster = shelf.play()
     cluster.submit(
@@ -222,7 +225,7 @@ def test_what_cannot_be_checkpointed_is_refused_with_its_reason() -> None:
 
 
 def test_while_one_is_under_way_there_is_no_other() -> None:
-    """Neither a second checkpoint, nor a restore, nor a restart."""
+    """A plan in progress refuses a second checkpoint, a restore and a restart."""
     shelf, cluster = playing()
     shelf.machine.connected = False
     cluster.checkpoint("p")
@@ -232,7 +235,7 @@ def test_while_one_is_under_way_there_is_no_other() -> None:
 
 
 def test_without_a_strategy_that_takes_images_there_is_no_checkpoint() -> None:
-    """What to do is said."""
+    """The refusal names the strategy to use."""
     cluster = Cluster("a")
     cluster.submit(movable("p"))
     said = cluster.checkpoint("p").message
@@ -240,7 +243,7 @@ def test_without_a_strategy_that_takes_images_there_is_no_checkpoint() -> None:
 
 
 def test_a_host_that_is_not_able_takes_no_image() -> None:
-    """With its own reason."""
+    """The refusal names the host's own reason."""
     shelf = Shelf("a")
     shelf.trouble["can_freeze"] = "CRIU 3.17 is too old"
     cluster = shelf.play()
@@ -251,7 +254,7 @@ def test_a_host_that_is_not_able_takes_no_image() -> None:
 
 
 def test_the_own_strategy_goes_before_the_first_that_is_selected() -> None:
-    """A process that moves by another one that takes images is checkpointed by that."""
+    """A process's own strategy takes its image, even if another selected strategy comes first."""
     shelf = Shelf("a")
     shelf.cluster = cluster = Cluster(
         shelf.machine, strategies={"first": Freezer(), "own": Freezer()}
@@ -264,14 +267,14 @@ def test_the_own_strategy_goes_before_the_first_that_is_selected() -> None:
 
 
 class Refusing(Freezer):
-    """Makes no image of anything."""
+    """Strategy that refuses every process."""
 
     def checkpoint(self, move: Move) -> Plan:
         raise ValueError(f"{move.spec.name} holds a camera")
 
 
 def test_a_strategy_may_refuse_a_process() -> None:
-    """It says why."""
+    """The reply contains the strategy's reason."""
     shelf = Shelf("a")
     cluster = Cluster(shelf.machine, strategies={"freezer": Refusing()})
     cluster.wait(0.5)
@@ -281,7 +284,7 @@ def test_a_strategy_may_refuse_a_process() -> None:
 
 
 def test_a_host_that_is_closed_or_away_restores_nothing() -> None:
-    """An image lies where it lies; whoever asks is told what is the matter."""
+    """The reply names why the host of the image cannot restore it now."""
     shelf, cluster = checkpointed()
     cluster.set_host("a", "cordon")
     assert "where its image is, and does not fit there now: it is cordoned" in (
@@ -304,7 +307,10 @@ def test_a_host_that_is_closed_or_away_restores_nothing() -> None:
 
 
 def test_a_restore_needs_the_room_that_the_process_used() -> None:
-    """What it was seen to use, not what somebody declared: else its host would go over."""
+    """A restore needs the measured usage, not the declared needs.
+
+    Otherwise its host would exceed its limit.
+    """
     shelf, cluster = playing()
     shelf.machine.shown["p"] = {"memory": 6 * GIB}
     cluster.wait(0.3)
@@ -323,7 +329,7 @@ def test_a_restore_needs_the_room_that_the_process_used() -> None:
 
 
 def test_a_drained_host_says_that_images_stay() -> None:
-    """They are restored where they lie."""
+    """A drained host keeps its images, which can only be restored there."""
     _, cluster = checkpointed()
     cluster.set_host("a", "drain")
     cluster.wait(0.5)
@@ -332,7 +338,7 @@ def test_a_drained_host_says_that_images_stay() -> None:
 
 
 def test_the_record_of_a_checkpoint_names_its_requester() -> None:
-    """As the cause of the plan."""
+    """The record names the requester as the cause of the plan."""
     _, cluster = playing()
     cluster.ask(happened.CheckpointRequested, "p", "anna@desk:42")
     (message,) = cluster.told("checkpoint_begun")
@@ -341,7 +347,7 @@ def test_the_record_of_a_checkpoint_names_its_requester() -> None:
 
 @pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])
 def test_a_checkpointed_process_outlives_the_loss_of_its_host(then: Any) -> None:
-    """Whatever its policy: its image is there."""
+    """The image is on the host, so no `host_loss` policy ends the process."""
     shelf = Shelf("a")
     cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
     cluster.submit(process("p", host_loss=HostLossPolicy(then)))
@@ -356,7 +362,7 @@ def test_a_checkpointed_process_outlives_the_loss_of_its_host(then: Any) -> None
 
 @pytest.mark.parametrize("end", ["cancel", "restart"])
 def test_an_image_that_nobody_wants_is_removed(end: str) -> None:
-    """`restart` begins the process anew."""
+    """`cancel` and `restart` remove the image; `restart` starts a new instance."""
     shelf, cluster = checkpointed()
     assert getattr(cluster, end)("p").accepted
     cluster.wait(1.0)
@@ -369,7 +375,7 @@ def test_an_image_that_nobody_wants_is_removed(end: str) -> None:
 
 
 def test_an_unwanted_image_is_removed_once_its_host_is_heard() -> None:
-    """Also by the next master."""
+    """The next master removes it, too."""
     shelf, cluster = checkpointed()
     shelf.machine.connected = False
     cluster.wait(2.0)
@@ -384,7 +390,7 @@ def test_an_unwanted_image_is_removed_once_its_host_is_heard() -> None:
 
 
 def test_a_removal_that_fails_is_tried_again() -> None:
-    """And said each time."""
+    """Each failed attempt is recorded."""
     shelf, cluster = checkpointed()
     shelf.trouble["drop"] = "read-only file system"
     cluster.cancel("p")
@@ -396,7 +402,7 @@ def test_a_removal_that_fails_is_tried_again() -> None:
 
 
 def test_a_checkpoint_that_is_cancelled_ends_the_process() -> None:
-    """Before the commit it turns back, and the process is stopped as any other."""
+    """Before the commit the plan is undone, and the process is stopped like any other."""
     shelf, cluster = playing()
     freeze = shelf.machine.executors["freeze"]
 
@@ -411,7 +417,7 @@ def test_a_checkpoint_that_is_cancelled_ends_the_process() -> None:
 
 
 def test_a_source_that_cannot_be_ended_yet_is_waited_for() -> None:
-    """After the commit there is no way back; cancelled then, its image goes too."""
+    """After the commit there is no undo; a cancelled process loses its image too."""
     shelf, cluster = playing()
     shelf.trouble["kill"] = "the host is slow"
     cluster.checkpoint("p")
@@ -423,7 +429,7 @@ def test_a_source_that_cannot_be_ended_yet_is_waited_for() -> None:
 
 
 def test_a_former_instance_that_comes_back_beside_its_image_is_killed() -> None:
-    """It must never run again."""
+    """The master fences the former instance, so that it never runs beside its image."""
     shelf, cluster = playing()
     shelf.machine.stubborn.add("p")
     shelf.trouble["kill"] = "no answer"
@@ -441,7 +447,7 @@ def test_a_former_instance_that_comes_back_beside_its_image_is_killed() -> None:
 
 @pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])
 def test_a_host_that_is_lost_before_the_source_has_ended_takes_nothing_with_it(then: Any) -> None:
-    """The image owns the name by then; the source is ended when its host is heard again."""
+    """The image owns the name by then; the source is ended when its host rejoins."""
     shelf = Shelf("a")
     cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
     cluster.submit(process("p", host_loss=HostLossPolicy(then)))
@@ -459,7 +465,7 @@ def test_a_host_that_is_lost_before_the_source_has_ended_takes_nothing_with_it(t
 
 @pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])
 def test_a_host_that_is_lost_in_a_restore_decides_when_it_is_back(then: Any) -> None:
-    """What went on there goes on; nothing is begun elsewhere meanwhile."""
+    """The restored process keeps running; no other host starts it before the rejoin."""
     shelf = Shelf("a")
     cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
     cluster.submit(process("p", host_loss=HostLossPolicy(then)))
@@ -468,7 +474,7 @@ def test_a_host_that_is_lost_in_a_restore_decides_when_it_is_back(then: Any) -> 
     cluster.restore("p")
     number = shelf.machine.find("p").number
     shelf.taken.pop(number)
-    shelf.alive.add(number)  # it is restored, and nobody has heard of it
+    shelf.alive.add(number)  # restored, but unreported
     shelf.machine.connected = False
     cluster.wait(60.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("stuck", ["a"])
@@ -482,7 +488,7 @@ def test_a_host_that_is_lost_in_a_restore_decides_when_it_is_back(then: Any) -> 
 
 
 def test_a_host_that_is_lost_in_a_dump_does_not_keep_its_process_from_going_elsewhere() -> None:
-    """By its policy; what lies on the host goes when that is back, image and process."""
+    """The process moves by its policy; image and old instance are removed when the host rejoins."""
     shelf = Shelf("a")
     cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
     cluster.submit(process("p", host_loss=HostLossPolicy("elsewhere")))
@@ -508,14 +514,14 @@ def test_a_host_that_is_lost_in_a_dump_does_not_keep_its_process_from_going_else
 
 
 class Killed(Exception):
-    """The master was."""
+    """Signal that the master was killed."""
 
 
 def kill_at(cluster: Cluster, turn: int, *, durable: bool) -> Callable[[], None]:
-    """Have the master killed in its nth turn from now, after what it decided was made durable.
+    """Kill the master in its nth turn from now, before or after its decision was made durable.
 
     Returns:
-        What lets it live again.
+        a call that lets the next master live.
     """
     left, tell = [turn], cluster.tell
 
@@ -537,7 +543,7 @@ def kill_at(cluster: Cluster, turn: int, *, durable: bool) -> Callable[[], None]
 
 
 def calm(cluster: Cluster) -> str:
-    """The phase of p once nothing is under way."""
+    """Return the phase of p once no plan is in progress."""
     for _ in range(60):
         cluster.wait(0.5)
         if cluster.phase("p") in ("running", "checkpointed") and "p" not in cluster.state.runs:
@@ -546,7 +552,7 @@ def calm(cluster: Cluster) -> str:
 
 
 def look(shelf: Shelf, cluster: Cluster, first: int) -> None:
-    """Its memory is in one place: in a process that goes on, or in an image."""
+    """Check that the memory of p is in one place: in a running process, or in an image."""
     running = [instance.number for instance in shelf.machine.programs]
     awake = [number for number in running if number not in shelf.frozen]
     if cluster.phase("p") == "checkpointed":
@@ -560,7 +566,7 @@ def look(shelf: Shelf, cluster: Cluster, first: int) -> None:
 @pytest.mark.parametrize("durable", [True, False], ids=["decided", "undecided"])
 @pytest.mark.parametrize("asked", ["checkpoint", "restore"])
 def test_nothing_is_lost_when_the_master_is_killed_at_any_point(asked: str, durable: bool) -> None:
-    """Whatever was in hand is finished or undone, and the other request works afterwards."""
+    """The next master finishes or undoes each step, and the opposite request works afterwards."""
     for turn in range(1, 40):
         shelf, cluster = playing()
         first = cluster["p"].owner
@@ -589,7 +595,7 @@ def test_nothing_is_lost_when_the_master_is_killed_at_any_point(asked: str, dura
     "lost", ["set_restart", "freeze", "kill", "stop", "take", "start", "await"]
 )
 def test_nothing_is_lost_when_an_answer_is(lost: str) -> None:
-    """The step is undone, or given again: the process runs, or is checkpointed, in the end."""
+    """A lost answer leads to an undo or a retry; in the end the process runs or is checkpointed."""
     shelf, cluster = playing()
     first, obey, once = cluster["p"].owner, shelf.machine.obey, [lost]
 
@@ -634,11 +640,11 @@ MOVE = Move(process("p"), ONE, "a", TWO, "a", InstanceId("p", 3), 0, "p")
     ],
 )
 def test_an_unsound_plan_is_refused(aim: Aim, steps: Any, said: str) -> None:
-    """A source could go on beside its image, or a process begin anew."""
+    """Such a plan could run the source beside its image, or start a process from nothing."""
     assert said in plan_fault(Plan(steps), MOVE, aim)
 
 
 def test_the_plans_of_the_tests_are_sound() -> None:
-    """As those of `criu` have to be."""
+    """The same check holds for the plans of `criu`."""
     assert plan_fault(Freezer().checkpoint(MOVE), MOVE, Aim.CHECKPOINT) == ""
     assert plan_fault(Freezer().restore(MOVE), MOVE, Aim.RESTORE) == ""

@@ -1,6 +1,6 @@
-"""Checkpoints and restores with kills, cuts and failures in any order: the memory is in one place.
+"""Checkpoints and restores with random kills, cuts and failures: one copy of the memory.
 
-The wires are prompt but for the cuts; what is killed is the master, in any turn of its own.
+The wires are prompt except for the cuts; the master can be killed in any turn of its own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ACTIONS = st.sampled_from(["checkpoint", "restore"])
 
 
 class Life(RuleBasedStateMachine):
-    """The rules of the play; p has begun once, and must never begin anew."""
+    """Rules of the state machine; p has started once, and must never start from nothing again."""
 
     @initialize()
     def begin(self) -> None:
@@ -37,7 +37,7 @@ class Life(RuleBasedStateMachine):
     def machine(self) -> Machine:
         return self.shelf.machine
 
-    # --- what happens --------------------------------------------------------------------
+    # --- faults and requests -------------------------------------------------------------
 
     @rule(action=ACTIONS)
     def ask(self, action: str) -> None:
@@ -74,7 +74,7 @@ class Life(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from([0.5, 3.0, 60.0]), action=st.one_of(st.none(), ACTIONS))
     def cut_for_a_while(self, seconds: float, action: str | None) -> None:
-        """Before whatever is asked for has arrived."""
+        """Cut the host off before the requested action has arrived."""
         self.machine.connected = False
         if action is not None:
             getattr(self.cluster, action)("p")
@@ -86,7 +86,7 @@ class Life(RuleBasedStateMachine):
     @rule()
     def restart_slave(self) -> None:
         self.machine.connected = False
-        self.cluster.wait(1.5)  # its name is its former run's until that is silent
+        self.cluster.wait(1.5)  # the name is blocked until its former run is silent
         self.machine.restart_slave(self.cluster.now)
         self.machine.connected = True
         assert self.cluster.register(self.machine).accepted
@@ -95,11 +95,11 @@ class Life(RuleBasedStateMachine):
     def wait(self, seconds: float) -> None:
         self.cluster.wait(seconds)
 
-    # --- what holds ----------------------------------------------------------------------
+    # --- invariants ----------------------------------------------------------------------
 
     @invariant()
     def its_memory_is_in_one_place(self) -> None:
-        """In one process that is awake; else in an image, whose process stands still or is gone."""
+        """Check that the memory is in one running process, or else in one image."""
         shelf = self.shelf
         numbers = {one.number for one in self.machine.programs}
         holds = set(shelf.taken)
@@ -111,12 +111,12 @@ class Life(RuleBasedStateMachine):
 
     @invariant()
     def it_is_neither_queued_nor_over(self) -> None:
-        """Its memory is there: nobody asked for another process."""
+        """Check that p is neither queued nor terminal, because its memory still exists."""
         assert not self.cluster.queue()
         assert not self.cluster["p"].phase.over
 
     def teardown(self) -> None:
-        """When everything works again it comes to rest, and can be asked for the other."""
+        """Check that p comes to rest without faults and accepts the opposite request."""
         self.shelf.trouble.clear()
         self.shelf.mute.clear()
         for wanted, action in (("checkpointed", "checkpoint"), ("running", "restore")):

@@ -1,7 +1,7 @@
-"""A move by `criu` whose hosts are lost or leave: `host_loss` is followed, and one node is heard.
+"""Loss or departure of hosts during a move by `criu`: `host_loss` applies, one node is active.
 
-The source stands still from its dump on, and what is restored until it is told to join. So what
-nobody can reach any more has to be followed or waited for, and never to be taken back as it is.
+The source is frozen from its dump on; the restored node is silent until the order to join. So the
+master follows an unreachable instance's policy or waits; it never re-adopts it as it is.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from rosrm_criu.plans import AWAIT_RESTORED, END, FETCH, GO_ON, JOIN
 from tests.unit.core.cluster import Cluster, Machine, node, process
 from tests.unit.core.portable import Portable, by_criu
 
-#: Seconds after which a host counts as lost, and the longest that an order is waited for then.
+#: Seconds after which a host counts as lost, and the longest wait for an order's answer then.
 LEASE, LATEST = 10.0, 30.0
 POLICIES = ["wait", "elsewhere", "stop"]
-#: How a host gets lost.
+#: Ways in which a host gets lost.
 WAYS = ["cut", "without power"]
 
 
 def story(
     then: Any = "elsewhere", *others: str, delay: float = 0.0, seconds: float = 2.0
 ) -> Cluster:
-    """P runs on a, moves by criu, and could go to the others: b and c, if none are named.
+    """Return a cluster where p runs on a, moves by criu, and may go to the other hosts (b and c).
 
     Args:
-        then: its policy where its host is lost, after a `delay`.
-        others: the other hosts.
-        seconds: that each part of a move may take.
+        then: host-loss policy of p, applied after `delay` seconds.
+        others: names of the other hosts.
+        seconds: time-out of each part of a move.
     """
     cluster = Cluster(Portable("a"), strategies={"criu": by_criu(seconds)}, lease=LEASE)
     policy = HostLossPolicy(then, delay)
     cluster.submit(node("p", migration=MigrationPolicy("criu"), host_loss=policy))
     for name in others or ("b", "c"):
         cluster.add(Portable(name))
-    wait(cluster, LEASE + 1.0)  # somebody has been heard for a whole lease
+    wait(cluster, LEASE + 1.0)  # the master has had contact with some host for a whole lease
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     return cluster
 
@@ -50,7 +50,7 @@ def host(cluster: Cluster, name: str) -> Portable:
 
 
 def wait(cluster: Cluster, seconds: float) -> None:
-    """Time passes, and nodes come up."""
+    """Let time pass, with nodes appearing in the graph."""
     for _ in range(round(seconds / 0.5)):
         for machine in cluster.machines.values():
             for instance in machine.programs:
@@ -60,7 +60,7 @@ def wait(cluster: Cluster, seconds: float) -> None:
 
 
 def lose(cluster: Cluster, name: str, how: str = "cut") -> None:
-    """From now on a host is not heard."""
+    """Cut a host off, or switch it off."""
     if how == "cut":
         host(cluster, name).connected = False
     else:
@@ -68,7 +68,7 @@ def lose(cluster: Cluster, name: str, how: str = "cut") -> None:
 
 
 def back(cluster: Cluster, name: str, how: str = "cut") -> None:
-    """A host is heard again, and has time to say what it holds."""
+    """Reconnect a host and let its slave report its instances."""
     machine = host(cluster, name)
     machine.connected = True
     if how != "cut":
@@ -79,11 +79,11 @@ def back(cluster: Cluster, name: str, how: str = "cut") -> None:
 def move_and_lose(
     cluster: Cluster, executor: str, *, of: str, lost: str, how: str = "cut", heard: bool = False
 ) -> None:
-    """P moves to b; a host is lost just before an executor does its work.
+    """Move p to b and lose a host just before an executor does its work.
 
     Args:
         of: host of the executor.
-        heard: its answer is.
+        heard: True if the executor's answer arrives.
     """
     if not heard:
         host(cluster, of).mute.add(executor)
@@ -94,12 +94,12 @@ def move_and_lose(
 
 
 def heard(cluster: Cluster) -> list[str]:
-    """Hosts with an active node, as far as anybody hears them."""
+    """Return the hosts with an active node, among those that are connected."""
     return [name for name in cluster.active() if cluster.machines[name].connected]
 
 
 def runs_alone(cluster: Cluster, *on: str) -> None:
-    """P runs on one of these hosts, is heard there, and nothing of it is under way."""
+    """Check that p runs on one of these hosts, reachable and without a plan in progress."""
     assert "p" not in cluster.state.runs, cluster["p"].reason
     assert cluster.phase("p") == "running", cluster["p"].reason
     owner = cluster.state.instances[cluster["p"].owner]
@@ -108,7 +108,7 @@ def runs_alone(cluster: Cluster, *on: str) -> None:
 
 
 def nothing_else(cluster: Cluster) -> None:
-    """What runs on hosts that are heard is the owner of the name, if anything does."""
+    """Check that only the owner of the name runs on reachable hosts, if it has one."""
     owner = cluster.state.instances.get(cluster["p"].owner)
     reachable = [one for one in cluster.where("p") if cluster.machines[one].connected]
     assert reachable == ([owner.host.name] if owner is not None else [])
@@ -120,7 +120,7 @@ def nothing_else(cluster: Cluster) -> None:
 @pytest.mark.parametrize("how", WAYS)
 @pytest.mark.parametrize("executor", [FETCH, AWAIT_RESTORED])
 def test_a_source_that_is_lost_goes_elsewhere(executor: str, how: str) -> None:
-    """It is not waited for: its policy says so, and nobody is there to be called back."""
+    """The policy moves p on; the plan does not wait to resume the lost source."""
     cluster = story("elsewhere")
     move_and_lose(cluster, executor, of="b", lost="a", how=how)
     wait(cluster, LEASE + 3.0)
@@ -134,7 +134,7 @@ def test_a_source_that_is_lost_goes_elsewhere(executor: str, how: str) -> None:
 @pytest.mark.parametrize("how", WAYS)
 @pytest.mark.parametrize("executor", [FETCH, AWAIT_RESTORED])
 def test_a_source_that_is_lost_has_failed_where_it_says_so(executor: str, how: str) -> None:
-    """And nothing of it is left, there or here."""
+    """No instance of p is left on any host."""
     cluster = story("stop")
     move_and_lose(cluster, executor, of="b", lost="a", how=how)
     wait(cluster, LEASE + 3.0)
@@ -146,7 +146,7 @@ def test_a_source_that_is_lost_has_failed_where_it_says_so(executor: str, how: s
 
 @pytest.mark.parametrize("executor", [FETCH, AWAIT_RESTORED])
 def test_a_source_that_is_waited_for_goes_on_where_it_stands_still(executor: str) -> None:
-    """However long its host is away: its memory is there."""
+    """The source resumes after any absence of its host, because its memory is there."""
     cluster = story("wait")
     first = cluster["p"].owner
     move_and_lose(cluster, executor, of="b", lost="a")
@@ -159,7 +159,7 @@ def test_a_source_that_is_waited_for_goes_on_where_it_stands_still(executor: str
 
 
 def test_a_source_that_ends_is_followed_by_its_image_once_that_is_there() -> None:
-    """It stood still, so all that it remembered is in the image."""
+    """The source was frozen since its dump, so the image holds all its memory."""
     cluster = story("elsewhere", seconds=10.0)
     machine = host(cluster, "b")
     machine.slow.add(AWAIT_RESTORED)
@@ -174,7 +174,7 @@ def test_a_source_that_ends_is_followed_by_its_image_once_that_is_there() -> Non
 
 @pytest.mark.parametrize("then", ["elsewhere", "stop"])
 def test_a_source_that_is_given_up_is_followed_by_its_image(then: str) -> None:
-    """Its memory has left the lost host: neither is it begun anew, nor has it failed."""
+    """The source's memory has left the lost host: p continues from the image at the destination."""
     cluster = story(then, seconds=3 * LEASE)
     machine = host(cluster, "b")
     machine.befalls[AWAIT_RESTORED] = lambda: lose(cluster, "a")
@@ -193,7 +193,7 @@ def test_a_source_that_is_given_up_is_followed_by_its_image(then: str) -> None:
 
 
 def test_a_source_that_is_waited_for_and_has_ended_starts_anew() -> None:
-    """Its host has lost its power: nobody is called back."""
+    """The host lost its power, so the plan cannot resume the source and p starts again."""
     cluster = story("wait")
     move_and_lose(cluster, FETCH, of="b", lost="a", how="without power")
     wait(cluster, 60.0)
@@ -204,7 +204,7 @@ def test_a_source_that_is_waited_for_and_has_ended_starts_anew() -> None:
 
 
 def test_a_source_s_host_that_is_silent_for_a_while_is_waited_for() -> None:
-    """Its node is called back then: nothing is given up before the host counts as lost."""
+    """The source resumes then: an instance is given up only when its host counts as lost."""
     cluster = story("elsewhere")
     first = cluster["p"].owner
 
@@ -221,7 +221,7 @@ def test_a_source_s_host_that_is_silent_for_a_while_is_waited_for() -> None:
 
 
 def test_the_end_of_a_source_whose_host_is_silent_for_a_while_is_waited_for() -> None:
-    """The node runs at the destination meanwhile."""
+    """The node runs at the destination until the source's end is known."""
     cluster = story("elsewhere")
     move_and_lose(cluster, JOIN, of="b", lost="a", heard=True)
     wait(cluster, LEASE - 3.0)
@@ -233,7 +233,7 @@ def test_the_end_of_a_source_whose_host_is_silent_for_a_while_is_waited_for() ->
 
 
 def test_the_delay_of_its_policy_is_kept() -> None:
-    """A host that comes back meanwhile has its process go on."""
+    """A host that rejoins within the delay resumes its process."""
     cluster = story("elsewhere", delay=60.0)
     first = cluster["p"].owner
     move_and_lose(cluster, FETCH, of="b", lost="a")
@@ -245,7 +245,7 @@ def test_the_delay_of_its_policy_is_kept() -> None:
 
 
 def test_both_hosts_are_lost() -> None:
-    """It goes to a third one."""
+    """The process starts on a third host."""
     cluster = story("elsewhere")
     move_and_lose(cluster, AWAIT_RESTORED, of="b", lost="a")
     lose(cluster, "b")
@@ -259,7 +259,7 @@ def test_both_hosts_are_lost() -> None:
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["same master", "restarted master"])
 def test_a_source_that_stands_still_is_not_taken_back(restarted: bool) -> None:
-    """No host had room meanwhile: it starts anew once its host is heard, as nobody calls it."""
+    """Without room elsewhere p starts again after the rejoin: no plan resumes the source."""
     cluster = story("elsewhere", "b")
     host(cluster, "b").befalls[FETCH] = lambda: cluster.set_host("b", "cordon")
     host(cluster, "b").mute.add(FETCH)
@@ -277,12 +277,12 @@ def test_a_source_that_stands_still_is_not_taken_back(restarted: bool) -> None:
     nothing_else(cluster)
 
 
-# --- a slave that stops in good order ---------------------------------------------------------
+# --- graceful stop of a slave -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("then", POLICIES)
 def test_a_source_s_slave_that_stops_leaves_nobody_waiting(then: str) -> None:
-    """It has ended what ran there, and answers nothing any more: p starts anew elsewhere."""
+    """The slave has ended its processes and answers no more: p starts again elsewhere."""
     cluster = story(then)
     host(cluster, "b").mute.add(FETCH)
     cluster.migrate("p", "b")
@@ -295,7 +295,7 @@ def test_a_source_s_slave_that_stops_leaves_nobody_waiting(then: str) -> None:
 
 @pytest.mark.parametrize("then", POLICIES)
 def test_a_destination_s_slave_that_stops_in_the_fetch_lets_the_source_go_on(then: str) -> None:
-    """At once: the time-out of a fetch is long, and the source stands still."""
+    """The source resumes at once: it is frozen, and the time-out of a fetch is long."""
     cluster = story(then)
     first = cluster["p"].owner
     host(cluster, "b").mute.add(FETCH)
@@ -313,7 +313,7 @@ def test_a_destination_s_slave_that_stops_in_the_fetch_lets_the_source_go_on(the
 @pytest.mark.parametrize("how", WAYS)
 @pytest.mark.parametrize("then", POLICIES)
 def test_a_source_that_is_lost_after_the_commit_has_no_say(then: str, how: str) -> None:
-    """The node runs at the destination; what is left of the source ends when it is heard."""
+    """The node runs at the destination; the rest of the source ends when its host rejoins."""
     cluster = story(then)
     move_and_lose(cluster, JOIN, of="b", lost="a", how=how, heard=True)
     wait(cluster, LEASE + 3.0)
@@ -326,7 +326,7 @@ def test_a_source_that_is_lost_after_the_commit_has_no_say(then: str, how: str) 
 
 @pytest.mark.parametrize("then", POLICIES)
 def test_a_source_s_slave_that_stops_after_the_commit_has_no_say(then: str) -> None:
-    """It has ended what ran there."""
+    """The slave has ended its processes."""
     cluster = story(then)
     host(cluster, "a").mute.add(END)
     cluster.migrate("p", "b")
@@ -337,7 +337,7 @@ def test_a_source_s_slave_that_stops_after_the_commit_has_no_say(then: str) -> N
 
 
 def test_a_later_loss_of_the_destination_is_followed() -> None:
-    """The move is over by then, though the source's host is lost."""
+    """The move is finished by then, though the source's host is lost."""
     cluster = story("elsewhere")
     move_and_lose(cluster, JOIN, of="b", lost="a", heard=True)
     wait(cluster, LEASE + 3.0)
@@ -352,7 +352,10 @@ def test_a_later_loss_of_the_destination_is_followed() -> None:
 
 @pytest.mark.parametrize("how", WAYS)
 def test_a_destination_that_is_lost_before_it_joins_goes_elsewhere(how: str) -> None:
-    """As its policy says; whether it has joined nobody knows. The source is ended."""
+    """The policy decides, because the destination may or may not have joined.
+
+    The source is ended.
+    """
     cluster = story("elsewhere")
     move_and_lose(cluster, JOIN, of="b", lost="b", how=how)
     wait(cluster, LEASE + 3.0)
@@ -365,7 +368,7 @@ def test_a_destination_that_is_lost_before_it_joins_goes_elsewhere(how: str) -> 
 
 @pytest.mark.parametrize("how", WAYS)
 def test_a_destination_that_is_lost_before_it_joins_has_failed_where_it_says_so(how: str) -> None:
-    """And the source, which stands still, is ended."""
+    """The frozen source is ended, too."""
     cluster = story("stop")
     move_and_lose(cluster, JOIN, of="b", lost="b", how=how)
     wait(cluster, LEASE + 3.0)
@@ -376,7 +379,7 @@ def test_a_destination_that_is_lost_before_it_joins_has_failed_where_it_says_so(
 
 
 def test_a_destination_that_is_waited_for_joins_when_it_is_back() -> None:
-    """With its memory; nothing is heard of it until then."""
+    """The restored node keeps its memory; it stays silent until its host rejoins."""
     cluster = story("wait")
     move_and_lose(cluster, JOIN, of="b", lost="b")
     wait(cluster, 120.0)
@@ -388,7 +391,7 @@ def test_a_destination_that_is_waited_for_joins_when_it_is_back() -> None:
 
 
 def test_a_destination_that_never_joined_is_not_taken_back() -> None:
-    """No host had room meanwhile: it starts anew."""
+    """With no room elsewhere, p starts again."""
     cluster = story("elsewhere", "b")
     cluster.set_host("a", "cordon")
     move_and_lose(cluster, JOIN, of="b", lost="b")
@@ -401,7 +404,7 @@ def test_a_destination_that_never_joined_is_not_taken_back() -> None:
 
 @pytest.mark.parametrize("then", POLICIES)
 def test_a_destination_s_slave_that_stops_before_it_joins_leaves_nobody_waiting(then: str) -> None:
-    """It has ended what was restored there: p starts anew elsewhere."""
+    """The slave has ended the restored instance: p starts again elsewhere."""
     cluster = story(then)
     host(cluster, "b").mute.add(JOIN)
     cluster.migrate("p", "b")
@@ -411,7 +414,7 @@ def test_a_destination_s_slave_that_stops_before_it_joins_leaves_nobody_waiting(
     runs_alone(cluster, "a", "c")
 
 
-# --- a master that was killed meanwhile -------------------------------------------------------
+# --- restart of the master --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("then", POLICIES)
@@ -420,11 +423,11 @@ def test_a_destination_s_slave_that_stops_before_it_joins_leaves_nobody_waiting(
 def test_a_master_that_was_killed_comes_to_the_same_end(
     executor: str, of: str, lost: str, known: bool, then: str
 ) -> None:
-    """It reads from its journal what was given up, or loses the host itself."""
+    """The next master restores lost instances from its journal, or loses the host itself."""
     cluster = story(then)
     move_and_lose(cluster, executor, of=of, lost=lost)
     wait(cluster, LEASE + 0.5 if known else 1.0)
-    host(cluster, of).mute.add(executor)  # who is asked once more is not heard either
+    host(cluster, of).mute.add(executor)  # the answer to the repeated request is lost, too
     cluster.restart_master()
     wait(cluster, 2 * LEASE + LATEST)
     if then == "wait":
@@ -445,7 +448,7 @@ def test_a_master_that_was_killed_comes_to_the_same_end(
 
 
 def test_the_end_of_a_source_that_is_lost_is_left_to_its_host_by_the_next_master() -> None:
-    """The node runs at the destination all the time."""
+    """The node keeps running at the destination."""
     cluster = story("wait")
     move_and_lose(cluster, JOIN, of="b", lost="a", heard=True)
     cluster.restart_master()
@@ -458,11 +461,11 @@ def test_the_end_of_a_source_that_is_lost_is_left_to_its_host_by_the_next_master
     nothing_else(cluster)
 
 
-# --- what is not left out ---------------------------------------------------------------------
+# --- steps that still need their host ---------------------------------------------------------
 
 
 class Tidy:
-    """Of a third party: what it has laid out on the source's host has to be put away there."""
+    """Third-party strategy that must remove its files from the source's host."""
 
     def propose(self, move: Move) -> Plan:
         here, there = move.source_host, move.destination_host
@@ -480,7 +483,7 @@ class Tidy:
 
 
 def test_an_executor_whose_host_is_heard_is_asked_until_it_has_done_its_work() -> None:
-    """Though the instance there has ended: what is to be put away is still there."""
+    """The files must be removed even if the instance there has ended."""
     put_away: list[Any] = []
 
     def refuse(arguments: Any) -> None:
@@ -506,7 +509,7 @@ def test_an_executor_whose_host_is_heard_is_asked_until_it_has_done_its_work() -
 
 
 def test_a_checkpoint_that_was_left_behind_is_not_taken_back() -> None:
-    """Its process stands still: it starts anew once its host is heard, its image is removed."""
+    """The frozen process starts again after the rejoin, and its image is removed."""
     cluster = story("elsewhere", "b")
     cluster.set_host("b", "cordon")
     machine = host(cluster, "a")

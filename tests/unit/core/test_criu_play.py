@@ -1,6 +1,6 @@
-"""Moves by `criu` whose hosts are lost, come back and leave in any order: its policy is followed.
+"""Moves by `criu` with random loss, rejoin and departure of hosts: `host_loss` applies.
 
-The wires are prompt but for the cuts; the master is killed in any turn of its own.
+The wires are prompt except for the cuts; the master can be killed in any turn of its own.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ hosts, chance = st.sampled_from(HOSTS), st.booleans()
 
 
 class GivenUp:
-    """Instances that may run on, on hosts that were lost: nobody there hears of a successor."""
+    """Instances that may still run on lost hosts, unaware of their successors."""
 
     def __init__(self, cluster: Cluster) -> None:
         self._records = cluster.records
@@ -48,7 +48,7 @@ class GivenUp:
 
 
 class Life(RuleBasedStateMachine):
-    """The rules of the play; p has begun once, and does so again only where its memory is lost."""
+    """Rules of the state machine; p starts from nothing again only where its memory is lost."""
 
     @initialize(
         then=st.sampled_from([*POLICIES, "elsewhere"]), delay=st.sampled_from([0.0, 0.0, 20.0])
@@ -74,7 +74,7 @@ class Life(RuleBasedStateMachine):
     def move_and_lose(
         self, at: str, roles: str, answered: bool, room: bool, power: bool, seconds: float
     ) -> None:
-        """Hosts of a move are lost just before an executor does its work."""
+        """Lose hosts of a move just before an executor does its work."""
         for machine in self.machines:
             machine.befalls[at] = lambda: self.lose_hosts_of_the_move(roles, room, power)
             machine.mute |= set() if answered else {at}
@@ -118,7 +118,7 @@ class Life(RuleBasedStateMachine):
     @rule(name=hosts)
     def host_is_back(self, name: str) -> None:
         machine = host(self.cluster, name)
-        wait(self.cluster, 1.5)  # its name is its former run's until that is silent
+        wait(self.cluster, 1.5)  # the name is blocked until its former run is silent
         machine.connected = True
         assert self.cluster.register(machine).accepted
         wait(self.cluster, 2.0)
@@ -126,7 +126,7 @@ class Life(RuleBasedStateMachine):
 
     @rule(name=hosts)
     def slave_stops(self, name: str) -> None:
-        """In good order: it ends what runs there, and another one comes up later."""
+        """Stop a slave: it ends its processes, and another slave starts later."""
         machine = host(self.cluster, name)
         if machine.connected:
             self.cluster.leave(machine)
@@ -135,7 +135,7 @@ class Life(RuleBasedStateMachine):
 
     @rule(name=hosts)
     def slave_is_killed(self, name: str) -> None:
-        """What runs there runs on below the next one."""
+        """Kill a slave; its processes keep running under the next one."""
         machine = host(self.cluster, name)
         if machine.connected:
             machine.connected = False
@@ -156,7 +156,7 @@ class Life(RuleBasedStateMachine):
     @rule(turn=st.integers(1, 60), durable=chance, at=st.sampled_from(["", "", *STEPS]),
           roles=st.sampled_from(["source", "destination", "both"]))  # fmt: skip
     def master_is_killed(self, turn: int, durable: bool, at: str, roles: str) -> None:
-        """While a move begins, or while it loses a host."""
+        """Kill the master while a move begins or while it loses a host."""
         live = kill_at(self.cluster, turn, durable=durable)
         try:
             if at:
@@ -180,7 +180,7 @@ class Life(RuleBasedStateMachine):
         self.cluster.restart("p")
         wait(self.cluster, 1.0)
 
-    # --- what holds ----------------------------------------------------------------------
+    # --- invariants ----------------------------------------------------------------------
 
     @invariant()
     def one_node_is_heard(self) -> None:
@@ -188,7 +188,7 @@ class Life(RuleBasedStateMachine):
 
     @invariant()
     def its_memory_is_not_given_up_for_nothing(self) -> None:
-        """It is where its host is, where its policy is to wait for it."""
+        """Check that with the policy `wait` p starts again only after a power loss."""
         for machine in self.machines:
             for instance, program in machine.programs.items():
                 self.begun |= set() if program.assignment.restored else {instance.number}
@@ -196,7 +196,7 @@ class Life(RuleBasedStateMachine):
 
     @invariant()
     def its_policy_is_followed(self) -> None:
-        """Nothing waits for a host that is lost, but where the policy says so."""
+        """Check that no plan waits for a lost host, unless the policy is `wait`."""
         process = self.cluster["p"]
         calm = self.cluster.now - self.changed_at > self.patience
         if calm and self.up() and process.spec.host_loss.then != "wait":
@@ -210,7 +210,7 @@ class Life(RuleBasedStateMachine):
                 if table.condition_of(table.by_name[name]) is HostCondition.UP]  # fmt: skip
 
     def teardown(self) -> None:
-        """When everything works again it runs in one place, or has failed by its policy."""
+        """Check that p, without further faults, runs on one host or has failed by its policy."""
         for name in HOSTS:
             self.host_is_back(name)
             self.cluster.set_host(name, "uncordon")

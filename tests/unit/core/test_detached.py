@@ -1,4 +1,4 @@
-"""Hosts whose slave was stopped and left processes running."""
+"""Detached hosts: their slave was stopped and left processes running."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ REASON = "a is detached: its slave was stopped and left processes running"
 
 
 def detached(spec: ProcessSpec, **settings: Any) -> Cluster:
-    """A process runs on host a, whose slave was stopped; host b takes what is queued."""
+    """Return a cluster with a process on the detached host a; host b takes queued work."""
     cluster = Cluster("a", **settings)
     cluster.submit(spec)
     cluster.add("b")
-    cluster.wait(11.0)  # some host has been heard for a whole lease
+    cluster.wait(11.0)  # the master has had contact with some host for a whole lease
     assert cluster.where(spec.name) == ["a"]
     cluster.detach(cluster.machines["a"])
     return cluster
@@ -35,7 +35,7 @@ def row_of(cluster: Cluster, name: str) -> Any:
 
 
 def test_a_host_is_detached_however_long() -> None:
-    """Neither suspect nor lost; its processes are unreachable at once, with the reason."""
+    """The host is neither suspect nor lost; its processes are unreachable at once."""
     cluster = detached(process("p"))
     assert cluster.told("host_detached") == [
         "a is detached: its slave was stopped and left 1 process running"
@@ -49,7 +49,7 @@ def test_a_host_is_detached_however_long() -> None:
 
 
 def test_the_next_slave_takes_the_processes_over() -> None:
-    """Also after the lease: it is the same instance."""
+    """The next slave adopts the same instance, even after the lease."""
     cluster = detached(process("p"))
     number = cluster["p"].owner
     cluster.wait(50.0)
@@ -72,24 +72,24 @@ def test_a_process_goes_elsewhere_no_sooner_than_after_a_loss() -> None:
 
 
 def test_beats_name_a_detached_host() -> None:
-    """So a slave that has not quite ended takes no beat as a sign that the master hears it."""
+    """A slave that is still stopping must not take a beat as contact with the master."""
     cluster = detached(process("p"))
     assert cluster.state.hosts.unheard() == [cluster.machines["a"].host_id]
 
 
 def test_what_ended_before_the_slave_stopped_is_known_with_its_end() -> None:
-    """The last message has all that the slave holds, also what the master has not heard yet."""
+    """The slave's last message has all its instances, including ends not reported before."""
     cluster = Cluster("a")
     cluster.submit(process("p"), job("q"))
     machine = cluster.machines["a"]
     machine.finish("q", cluster.now)
-    machine.said.clear()  # on its way, and overtaken
+    machine.said.clear()  # on its way, and overtaken by the last message
     cluster.detach(machine)
     assert cluster.phase("q") == "finished"
 
 
 def test_what_has_not_begun_there_is_queued_again() -> None:
-    """An assignment that is on its way is not taken up: the slave starts nothing more."""
+    """The slave starts no more processes, so the master queues the assignment again."""
     cluster = detached(process("p"))
     cluster.attach(cluster.machines["a"])
     cluster.machines["b"].takes = False
@@ -101,7 +101,7 @@ def test_what_has_not_begun_there_is_queued_again() -> None:
 
 
 def test_a_late_report_changes_nothing() -> None:
-    """A report that was on its way says less than the last message."""
+    """A late report is older than the slave's last message."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     machine = cluster.machines["a"]
@@ -117,7 +117,7 @@ def test_a_late_report_changes_nothing() -> None:
 
 @pytest.mark.parametrize("first", ["cancelled", "detached"])
 def test_a_cancelled_process_names_the_host_that_it_waits_for(first: str) -> None:
-    """At once, with the time; the next slave is ordered to stop it as soon as it registers."""
+    """The reason names host and time at once. The next slave is ordered to stop the process."""
     if first == "detached":
         cluster = detached(process("p"))
         cluster.wait(7.0)
@@ -141,7 +141,7 @@ def test_a_cancelled_process_names_the_host_that_it_waits_for(first: str) -> Non
 
 
 def test_a_cancelled_process_on_a_silent_host_names_the_host() -> None:
-    """While the host is suspect, too."""
+    """The reason names the host also while the host is suspect."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.machines["a"].connected = False
@@ -153,7 +153,7 @@ def test_a_cancelled_process_on_a_silent_host_names_the_host() -> None:
 
 
 def test_a_slave_that_ends_its_processes_after_all_leaves() -> None:
-    """As `rosrm slave --stop-all` does: the master learns of the end of a cancelled process."""
+    """As with `rosrm slave --stop-all`, the master learns the end of a cancelled process."""
     cluster = detached(process("p"))
     cluster.cancel("p")
     machine = cluster.machines["a"]
@@ -163,7 +163,7 @@ def test_a_slave_that_ends_its_processes_after_all_leaves() -> None:
 
 
 def test_a_detached_host_is_pruned_once_nothing_is_left_there() -> None:
-    """By its name also what is being cancelled there is given up."""
+    """Pruning a host by name also gives up what is being cancelled there."""
     cluster = detached(process("p"))
     cluster.ask(happened.PruneRequested)
     assert state_of(cluster, "a") == "detached"
@@ -173,7 +173,7 @@ def test_a_detached_host_is_pruned_once_nothing_is_left_there() -> None:
 
 
 def test_a_registration_counts_the_processes_that_have_not_ended() -> None:
-    """A slave that is started again also reports what ended while it was stopped."""
+    """A restarted slave also reports the processes that ended while no slave ran."""
     cluster = Cluster("a")
     cluster.submit(process("p"), job("q"))
     machine = cluster.machines["a"]

@@ -1,4 +1,4 @@
-"""The placement filters: mask and reason of each agree, and everything that uses them agrees."""
+"""Placement filters: mask, reason, ranking and explanation agree."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ usually = st.sampled_from([True] * 7 + [False])
 
 @st.composite
 def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
-    """Hosts in any state that the master may know."""
+    """Draw hosts in any state that the master may know."""
     table = HostTable()
     for number in range(draw(st.integers(1, most))):
         name = f"h{number}"
@@ -82,7 +82,7 @@ def ranked(table: HostTable, demand: Demand) -> Ranking:
 
 
 def test_no_two_filters_have_one_name() -> None:
-    """A name stands for one rule."""
+    """A name stands for one filter."""
     assert len({one.name for one in FILTERS}) == len(FILTERS)
 
 
@@ -90,7 +90,7 @@ def test_no_two_filters_have_one_name() -> None:
 def test_a_host_fits_exactly_if_no_filter_has_a_reason_against_it(
     table: HostTable, demand: Demand
 ) -> None:
-    """The ranking and the explanation follow one list."""
+    """Ranking and explanation use the same list of filters."""
     ranking = ranked(table, demand)
     every = candidates(table, demand, ranking.need, slice(0, len(table)))
     found = refusals(FILTERS, every)
@@ -107,7 +107,7 @@ def test_a_host_fits_exactly_if_no_filter_has_a_reason_against_it(
 def test_every_filter_that_says_no_says_why(
     table: HostTable, demand: Demand, as_empty: bool
 ) -> None:
-    """Of all hosts, of some of them, and of hosts as if nothing ran there."""
+    """Reason and mask agree for all hosts, for some hosts, and for hosts taken as empty."""
     need = table.fractions(demand.amounts, demand.estimated)
     columns = np.arange(len(table))[::-2]
     if as_empty:
@@ -128,7 +128,7 @@ def test_every_filter_that_says_no_says_why(
 def test_a_ranking_that_was_refreshed_equals_a_new_one(
     table: HostTable, demand: Demand, chosen: list[int]
 ) -> None:
-    """After assignments of its own demand and of others, judged in advance or not."""
+    """The ranking stays correct after assignments of the same demand and of other demands."""
     ranking = ranked(table, demand)
     for number in chosen:
         fitting = [host for host in table.hosts if ranking.fits(host.column)]
@@ -144,7 +144,7 @@ def test_a_ranking_that_was_refreshed_equals_a_new_one(
 
 @given(tables(most=3), demands())
 def test_no_process_is_set_aside_that_a_host_takes_now(table: HostTable, demand: Demand) -> None:
-    """And one that is set aside is told a reason for each host."""
+    """The reason of a process that is set aside names each host."""
     never = why_never(table, demand)
     if (ranked(table, demand).value < np.inf).any():
         assert never == ""

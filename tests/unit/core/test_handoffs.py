@@ -1,6 +1,6 @@
-"""Handoffs: moved or stayed, never two active, and a source that fell silent goes on or has ended.
+"""Handoffs: moved or stayed, one active node at a time, and no source left silent.
 
-The nodes keep to the protocol (`nodes.Node`) but for the quirks that a test gives them.
+The nodes follow the protocol (`nodes.Node`) except for the quirks that a test gives them.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ ON_FAILURE = RestartPolicy("on-failure", delay=0.5)
 
 
 def stateful(name: str = "p", **fields: Any) -> ProcessSpec:
-    """A process that is moved with its state."""
+    """Return the spec of a process that moves with its state."""
     fields.setdefault("restart", ON_FAILURE)
     return process(name, migration=MigrationPolicy("handoff"), **fields)
 
 
 def two_hosts(*, spec: ProcessSpec | None = None, **settings: Any) -> Cluster:
-    """P runs on a; b has room."""
+    """Return a cluster where p runs on a, and b has room."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}), **settings)
     cluster.submit(spec or stateful())
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
@@ -46,7 +46,7 @@ def quirk(cluster: Cluster, host: str, *quirks: str) -> None:
 
 
 def said(cluster: Cluster) -> list[str]:
-    """The phases that were published, in order; what is not answered comes again."""
+    """Return the published phases in order, including retries of unanswered phases."""
     return [one.phase.name for one in cluster.carried if isinstance(one, PublishStateConfig)]
 
 
@@ -56,7 +56,7 @@ def restart_of(cluster: Cluster, host: str) -> RestartPolicy:
 
 
 def begin(cluster: Cluster, until: HandoffPhase) -> None:
-    """Begin the move of p to b; everything flows until this phase is published, and no further."""
+    """Begin the move of p to b; deliver messages until this phase is published, and no further."""
     cluster.tell(happened.MigrationRequested(9, "p", "b"))
     for _ in range(100):
         if until.name in said(cluster):
@@ -70,7 +70,7 @@ def begin(cluster: Cluster, until: HandoffPhase) -> None:
 
 
 def has_stayed(cluster: Cluster) -> None:
-    """As before: one active instance at the source, restarted as its spec says."""
+    """Check that p stayed: one active instance at the source, restarted as its spec says."""
     assert (cluster.phase("p"), cluster.where("p"), cluster.active()) == ("running", ["a"], ["a"])
     assert restart_of(cluster, "a") == ON_FAILURE
     assert len(cluster.told("stayed")) == 1
@@ -78,7 +78,7 @@ def has_stayed(cluster: Cluster) -> None:
 
 
 def has_moved(cluster: Cluster) -> None:
-    """One active instance at the destination, restarted as its spec says."""
+    """Check that p moved: one active instance at the destination, restarted as its spec says."""
     assert (cluster.phase("p"), cluster.where("p"), cluster.active()) == ("running", ["b"], ["b"])
     assert restart_of(cluster, "b") == ON_FAILURE
     assert len(cluster.told("migrated")) == 1
@@ -96,7 +96,7 @@ def settled(cluster: Cluster) -> None:
 
 
 def test_the_good_course() -> None:
-    """Shadow, switch, commit, stop: each phase is said once."""
+    """A handoff without faults publishes each of its phases SHADOW, SWITCH and DONE once."""
     cluster = two_hosts()
     reply = cluster.migrate("p", "b")
     assert reply.accepted
@@ -106,7 +106,7 @@ def test_the_good_course() -> None:
 
 
 def test_what_a_destination_waited_for_is_no_part_of_its_report() -> None:
-    """It is over when the report arrives; a wait that lasts too long is named by the time-out."""
+    """The report names the phase only; a wait that exceeds its time-out is named by the plan."""
     cluster = two_hosts()
     assert cluster.migrate("p").accepted
     cluster.wait(3.0)
@@ -114,7 +114,7 @@ def test_what_a_destination_waited_for_is_no_part_of_its_report() -> None:
 
 
 def test_names_on_the_wire_are_fully_qualified() -> None:
-    """With the namespace; the destination under its alias."""
+    """Node names have their namespace; the destination has its alias."""
     cluster = two_hosts(spec=stateful(namespace="/robot"))
     cluster.migrate("p", "b")
     config = next(one for one in cluster.carried if isinstance(one, PublishStateConfig))
@@ -124,7 +124,7 @@ def test_names_on_the_wire_are_fully_qualified() -> None:
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_second_handoff_knows_the_alias_of_the_source(restarted: bool) -> None:
-    """Also a master that was started anew."""
+    """A restarted master knows the alias, too."""
     moves = []
 
     class Watched(HandOver):
@@ -144,7 +144,7 @@ def test_a_second_handoff_knows_the_alias_of_the_source(restarted: bool) -> None
 
 
 def test_the_commit_is_durable_before_the_source_is_stopped() -> None:
-    """A stop is the first thing that cannot be undone."""
+    """The stop is the first step without an undo."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
     while not cluster["p"].migrations:
@@ -154,7 +154,7 @@ def test_the_commit_is_durable_before_the_source_is_stopped() -> None:
 
 
 def test_a_source_that_does_not_say_that_it_is_released_does_not_hold_up_the_move() -> None:
-    """Once the destination is active only time is lost by waiting."""
+    """The destination is active already, so waiting would only delay the move."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
     cluster.air.to_master = [
@@ -164,14 +164,14 @@ def test_a_source_that_does_not_say_that_it_is_released_does_not_hold_up_the_mov
         cluster.air.to_master = [
             one for one in cluster.air.to_master if one[1].phase is not ReportPhase.RELEASED
         ]
-    assert cluster["p"].migrations == 1  # the destination may fail from now on
+    assert cluster["p"].migrations == 1  # the destination may fail after this point
     assert not cluster.orders("stop")
     cluster.wait(11.0)
     has_moved(cluster)
 
 
 def test_a_second_move_is_refused_while_one_is_under_way() -> None:
-    """With its reason."""
+    """The refusal names the move in progress."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SHADOW)
     assert "p is moving already, to b" in cluster.migrate("p").message
@@ -196,7 +196,7 @@ def test_a_destination_that_is_never_ready_is_stopped_and_said_what_it_waits_for
 
 
 def test_a_node_that_follows_no_protocol_stays_and_it_is_said_what_to_check() -> None:
-    """It was never asked for silence: nobody waits for it to say that it goes on."""
+    """The plan needs no confirmation that the source resumed, because it never ordered silence."""
     cluster = two_hosts()
     quirk(cluster, "a", "deaf")
     quirk(cluster, "b", "deaf")
@@ -216,7 +216,7 @@ def test_a_node_that_follows_no_protocol_stays_and_it_is_said_what_to_check() ->
     ],
 )
 def test_a_report_of_failure_ends_the_handoff(host: str, told: str) -> None:
-    """Of either node, with its message."""
+    """A failed node on either side ends the handoff; the record has its message."""
     cluster = two_hosts()
     quirk(cluster, host, "unfit")
     cluster.migrate("p", "b")
@@ -225,7 +225,7 @@ def test_a_report_of_failure_ends_the_handoff(host: str, told: str) -> None:
 
 
 def test_a_source_that_does_not_fall_silent_goes_on() -> None:
-    """The destination gives up before the source is told to go on."""
+    """The destination aborts before the source receives RESUME."""
     cluster = two_hosts()
     quirk(cluster, "a", "never silent")
     cluster.migrate("p", "b")
@@ -236,7 +236,7 @@ def test_a_source_that_does_not_fall_silent_goes_on() -> None:
 
 @pytest.mark.parametrize("phase", [HandoffPhase.SHADOW, HandoffPhase.SWITCH])
 def test_a_destination_that_ends_leaves_the_source_as_it_was(phase: HandoffPhase) -> None:
-    """Its end is enough: nobody asks a dead node to give up."""
+    """The end of the destination is enough; the plan sends no ABORT to a dead node."""
     cluster = two_hosts()
     begin(cluster, phase)
     cluster.machines["b"].finish("p", cluster.now, code=3)
@@ -245,7 +245,7 @@ def test_a_destination_that_ends_leaves_the_source_as_it_was(phase: HandoffPhase
 
 
 def test_a_destination_that_ends_after_it_was_active_and_before_the_commit() -> None:
-    """The source goes on from its own state."""
+    """The source resumes from its own state."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
     while not cluster.node("b").active:
@@ -259,7 +259,7 @@ def test_a_destination_that_ends_after_it_was_active_and_before_the_commit() -> 
 
 
 def test_one_that_cannot_be_started_stays() -> None:
-    """The source was never told anything."""
+    """The source never received a message."""
     cluster = two_hosts()
     cluster.machines["b"].refuses["p"] = "no such executable"
     cluster.migrate("p", "b")
@@ -269,7 +269,7 @@ def test_one_that_cannot_be_started_stays() -> None:
 
 @pytest.mark.parametrize("phase", [HandoffPhase.SHADOW, HandoffPhase.SWITCH])
 def test_a_cancelled_process_ends_wherever_it_is(phase: HandoffPhase) -> None:
-    """The plan turns back, and both instances are stopped."""
+    """The plan is undone, and both instances are stopped."""
     cluster = two_hosts()
     begin(cluster, phase)
     cluster.tell(happened.CancelRequested(99, ("p",)))
@@ -279,10 +279,10 @@ def test_a_cancelled_process_ends_wherever_it_is(phase: HandoffPhase) -> None:
 
 
 def test_a_destination_that_answers_abort_with_active_has_moved() -> None:
-    """Too late to go back: the destination decides."""
+    """An active destination cannot be undone, so the handoff counts as moved."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
-    cluster.machines["b"].connected = False  # the master does not hear it; the nodes do each other
+    cluster.machines["b"].connected = False  # cut off from the master, not from the other node
     while any(node.reports or node.configs for _, node in cluster.air.nodes()):
         for _, node in cluster.air.nodes():
             if node.configs:
@@ -301,7 +301,7 @@ def test_a_destination_that_answers_abort_with_active_has_moved() -> None:
 
 
 def test_a_destination_that_does_not_answer_to_abort_is_stopped_before_the_source_goes_on() -> None:
-    """Only its end says that it will never be active."""
+    """Until its end is known, the destination could still become active."""
     cluster = two_hosts()
     quirk(cluster, "a", "never silent")
     quirk(cluster, "b", "no abort")
@@ -317,7 +317,7 @@ def test_a_destination_that_does_not_answer_to_abort_is_stopped_before_the_sourc
 
 
 def test_active_of_a_destination_that_was_ordered_to_stop_decides_nothing() -> None:
-    """Its end is on the way: then the source goes on."""
+    """The source resumes once the destination has ended."""
     cluster = two_hosts()
     quirk(cluster, "a", "never silent")
     quirk(cluster, "b", "no abort")
@@ -334,7 +334,7 @@ def test_active_of_a_destination_that_was_ordered_to_stop_decides_nothing() -> N
 
 
 def test_a_silent_source_that_does_not_say_that_it_goes_on_is_stuck() -> None:
-    """It is told again and again, and said; the process can be cancelled."""
+    """The master repeats RESUME and records the stuck move; the process can be cancelled."""
     cluster = two_hosts()
     quirk(cluster, "a", "no resume")
     begin(cluster, HandoffPhase.SWITCH)
@@ -350,11 +350,11 @@ def test_a_silent_source_that_does_not_say_that_it_goes_on_is_stuck() -> None:
     has_stayed(cluster)
 
 
-# --- the source ends --------------------------------------------------------------------------
+# --- end of the source ------------------------------------------------------------------------
 
 
 def test_a_source_that_ends_before_the_switch_is_queued_again_by_its_policy() -> None:
-    """Its slave may not restart it while it moves: so the master has to."""
+    """Its slave may not restart it during a move, so the master queues it."""
     cluster = two_hosts()
     quirk(cluster, "b", "never ready")
     cluster.migrate("p", "b")
@@ -368,13 +368,13 @@ def test_a_source_that_ends_before_the_switch_is_queued_again_by_its_policy() ->
 
 @pytest.mark.parametrize(("when", "again"), [("never", False), ("on-failure", True)])
 def test_a_source_that_was_unhealthy_has_failed_though_it_exits_with_0(when, again) -> None:
-    """It was told to end, and did; its slave would have started it again."""
+    """The process ended on a signal of its slave, which would have restarted it."""
     unhealthy = InstanceStatus(InstanceId("p", 1), InstanceState.FAILED, message="unhealthy: x")
     assert restarts_after(RestartPolicy(when), unhealthy) is again
 
 
 def test_a_source_that_is_never_restarted_and_ends_before_the_switch_has_failed() -> None:
-    """As if no move had been in the way."""
+    """The move does not change the restart policy."""
     cluster = two_hosts(spec=stateful(restart=RestartPolicy("never")))
     quirk(cluster, "b", "never ready")
     cluster.migrate("p", "b")
@@ -384,7 +384,7 @@ def test_a_source_that_is_never_restarted_and_ends_before_the_switch_has_failed(
 
 
 def test_a_source_that_ends_during_the_switch_is_taken_over() -> None:
-    """The destination has all that anybody has of its state."""
+    """The destination has the newest state that is left."""
     cluster = two_hosts()
     quirk(cluster, "a", "never silent")
     cluster.migrate("p", "b")
@@ -395,7 +395,7 @@ def test_a_source_that_ends_during_the_switch_is_taken_over() -> None:
 
 
 def test_take_over_is_said_again_until_it_is_answered() -> None:
-    """And when its time has passed both are gone: the process is queued."""
+    """After its time-out both instances are gone, and the process is queued."""
     cluster = two_hosts(order_retry=2.0)
     quirk(cluster, "a", "never silent")
     cluster.migrate("p", "b")
@@ -411,7 +411,7 @@ def test_take_over_is_said_again_until_it_is_answered() -> None:
 
 
 def test_a_phase_is_said_again_until_it_is_answered() -> None:
-    """A node may not have heard it."""
+    """A node may have missed the first message."""
     cluster = two_hosts(order_retry=2.0)
     quirk(cluster, "b", "deaf")
     cluster.migrate("p", "b")
@@ -424,7 +424,7 @@ def test_a_phase_is_said_again_until_it_is_answered() -> None:
 
 
 def test_a_destination_that_ends_after_the_commit_is_queued_by_its_policy() -> None:
-    """Its slave is not told yet that it may restart it."""
+    """Its slave has no order yet to restart it."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
     while not cluster["p"].migrations:
@@ -449,7 +449,7 @@ MOMENTS: dict[str, Callable[[Cluster], None]] = {
 @pytest.mark.parametrize("moment", MOMENTS)
 @pytest.mark.parametrize("first", ["a", "b"])
 def test_a_master_that_is_killed_goes_on_with_the_step_in_hand(moment: str, first: str) -> None:
-    """Whichever slave comes back first; the nodes say again what they have said."""
+    """Either slave may register first; the nodes repeat their reports."""
     cluster = two_hosts()
     MOMENTS[moment](cluster)
     cluster.kill_master()
@@ -461,14 +461,14 @@ def test_a_master_that_is_killed_goes_on_with_the_step_in_hand(moment: str, firs
 
 
 def every_moment(strategy: str, overlap: bool = True) -> int:
-    """How many events the master takes in while a process moves."""
+    """Return the number of events that the master handles during one move."""
     cluster, events = moving(strategy, overlap, stop_at=10_000)
     assert cluster.where("p") == ["b"]
     return events
 
 
 def moving(strategy: str, overlap: bool, stop_at: int) -> tuple[Cluster, int]:
-    """A move to b, until the master has taken in so many events."""
+    """Run a move to b until the master has handled this many events."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}))
     policy = MigrationPolicy(strategy, overlap=overlap)
     cluster.submit(process("p", migration=policy, restart=ON_FAILURE))
@@ -499,7 +499,7 @@ def moving(strategy: str, overlap: bool, stop_at: int) -> tuple[Cluster, int]:
     ("strategy", "overlap"), [("handoff", True), ("relaunch", True), ("relaunch", False)]
 )
 def test_a_master_may_be_killed_at_any_event_of_a_move(strategy: str, overlap: bool) -> None:
-    """It ends as moved or stayed, with one instance that runs; a handoff never has two active."""
+    """The move ends as moved or stayed with one running instance; never are two nodes active."""
     count = every_moment(strategy, overlap)
     assert count > 4
     for stop_at in range(1, count):
@@ -517,7 +517,7 @@ def test_a_master_may_be_killed_at_any_event_of_a_move(strategy: str, overlap: b
 @pytest.mark.parametrize("phase", PHASES)
 @pytest.mark.parametrize("host", ["a", "b"])
 def test_a_slave_that_is_killed_takes_nothing_with_it(phase: HandoffPhase, host: str) -> None:
-    """Its processes run on; the plan goes on with the slave that comes."""
+    """The processes keep running; the plan continues with the next slave."""
     cluster = two_hosts()
     begin(cluster, phase)
     cluster.machines[host].restart_slave(cluster.now)
@@ -533,7 +533,7 @@ def test_a_slave_that_is_killed_takes_nothing_with_it(phase: HandoffPhase, host:
 def test_a_host_that_is_cut_off_comes_back_to_one_active_instance(
     phase: HandoffPhase, host: str
 ) -> None:
-    """Whatever was decided meanwhile."""
+    """After the rejoin one instance is active, whatever the master decided during the cut."""
     cluster = two_hosts()
     begin(cluster, phase)
     cluster.machines[host].connected = False
@@ -547,7 +547,7 @@ def test_a_host_that_is_cut_off_comes_back_to_one_active_instance(
 
 
 def test_both_hosts_never_come_back_after_the_master() -> None:
-    """The plan gives up after their lease and its own time-outs, and says so."""
+    """The plan gives up after the lease and its own time-outs, and records that."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SHADOW)
     for machine in cluster.machines.values():
@@ -564,7 +564,7 @@ def test_both_hosts_never_come_back_after_the_master() -> None:
 
 
 def test_a_destination_that_was_ordered_to_stop_is_known_to_a_new_master() -> None:
-    """What it says afterwards decides nothing there either."""
+    """The new master ignores later reports of that destination, too."""
     cluster = two_hosts()
     quirk(cluster, "a", "never silent")
     quirk(cluster, "b", "no abort")
@@ -581,7 +581,7 @@ def test_a_destination_that_was_ordered_to_stop_is_known_to_a_new_master() -> No
 
 
 def test_a_move_in_the_journal_that_nobody_understands_is_over() -> None:
-    """Of another version: the owner goes on, and the other is stopped."""
+    """A move of another version is dropped: the owner keeps running, the other instance stops."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SHADOW)
     cluster.intents["migration"]["p"]["plan"]["steps"][0]["kind"] = "teleport"
@@ -596,7 +596,7 @@ def test_a_move_in_the_journal_that_nobody_understands_is_over() -> None:
 
 
 def test_reports_of_another_handoff_are_not_heard() -> None:
-    """Another destination, another process, or nobody at all."""
+    """A report is ignored if its process, destination or handoff number does not match."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SHADOW)
     for report in (("p", 7, 2), ("q", 2, 2), ("p", 2, 9)):

@@ -1,4 +1,4 @@
-"""Hosts that are lost, and that come back: what becomes of their processes."""
+"""Loss and rejoin of hosts: the effect on their processes."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ def back(cluster: Cluster, *names: str, seconds: float = 1.0) -> None:
 
 
 def on_a(spec: ProcessSpec, *others: str, **settings: Any) -> Cluster:
-    """A cluster in which a process runs on host a."""
+    """Return a cluster in which a process runs on host a."""
     cluster = Cluster("a", **settings)
     cluster.submit(spec)
     for name in others:
         cluster.add(name)
-    cluster.wait(11.0)  # somebody has been heard for a whole lease
+    cluster.wait(11.0)  # the master has had contact with some host for a whole lease
     assert cluster.where(spec.name) == ["a"]
     return cluster
 
 
-# --- by policy --------------------------------------------------------------------------------
+# --- host-loss policies -----------------------------------------------------------------------
 
 
 def test_by_default_a_process_waits_for_its_host() -> None:
-    """However long, here ten leases: it may well run on."""
+    """The process may still run there, so it waits for any time (here ten leases)."""
     cluster = on_a(process("p"), "b")
     lose(cluster, "a", seconds=100.0)
     assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "a is lost")
@@ -63,7 +63,7 @@ def test_by_default_a_process_waits_for_its_host() -> None:
 
 
 def test_elsewhere_starts_it_on_another_host_as_soon_as_its_host_is_lost() -> None:
-    """Not before its lease is over."""
+    """The successor starts as soon as the lease has expired, not before."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     lose(cluster, "a", seconds=9.5)
     assert cluster.where("p") == ["a"]
@@ -74,7 +74,7 @@ def test_elsewhere_starts_it_on_another_host_as_soon_as_its_host_is_lost() -> No
 
 
 def test_elsewhere_waits_for_its_delay() -> None:
-    """And says so meanwhile."""
+    """The reason names the delay."""
     cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
     lose(cluster, "a", seconds=25.0)
     assert cluster["p"].reason == "a is lost; the process is started on another host in 20 s"
@@ -84,7 +84,7 @@ def test_elsewhere_waits_for_its_delay() -> None:
 
 
 def test_stop_lets_it_fail() -> None:
-    """Nothing follows it, and when the host is back it is stopped there."""
+    """The process has no successor, and is stopped when its host rejoins."""
     cluster = on_a(process("p", host_loss=HostLossPolicy("stop")), "b")
     lose(cluster, "a")
     assert (cluster.phase("p"), cluster["p"].reason) == ("failed", "a is lost")
@@ -93,11 +93,11 @@ def test_stop_lets_it_fail() -> None:
     assert cluster.where("p") == []
 
 
-# --- what comes back --------------------------------------------------------------------------
+# --- rejoin -----------------------------------------------------------------------------------
 
 
 def test_the_old_instance_is_fenced_when_its_host_is_heard() -> None:
-    """At once, also where it would take its time to stop: the new one owns the name."""
+    """The new instance owns the name, so the old one ends at once, without its stop time."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     cluster.machines["a"].stubborn.add("p")
     lose(cluster, "a")
@@ -110,7 +110,7 @@ def test_the_old_instance_is_fenced_when_its_host_is_heard() -> None:
 
 
 def test_the_old_instance_is_fenced_by_a_master_that_was_restarted() -> None:
-    """What is not intended anywhere is not meant to run."""
+    """The new master fences an instance that its journal does not contain."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     lose(cluster, "a")
     cluster.restart_master()
@@ -123,7 +123,7 @@ def test_the_old_instance_is_fenced_by_a_master_that_was_restarted() -> None:
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["same master", "restarted master"])
 def test_what_nothing_has_followed_goes_on(restarted: bool) -> None:
-    """No host had room for it meanwhile: it leaves the queue, and no process was touched."""
+    """With no room elsewhere, the process leaves the queue and keeps running untouched."""
     cluster = on_a(process("p", host_loss=ELSEWHERE, required_labels={}), "b")
     cluster.set_host("b", "cordon")
     lose(cluster, "a")
@@ -142,7 +142,7 @@ def test_what_nothing_has_followed_goes_on(restarted: bool) -> None:
 
 
 def test_a_job_that_completed_out_of_sight_is_not_done_again() -> None:
-    """Nothing had followed it yet."""
+    """The job had no successor yet."""
     cluster = on_a(job("p", host_loss=ELSEWHERE), "b")
     cluster.set_host("b", "cordon")
     lose(cluster, "a")
@@ -152,7 +152,7 @@ def test_a_job_that_completed_out_of_sight_is_not_done_again() -> None:
 
 
 def test_what_failed_out_of_sight_has_failed() -> None:
-    """By its own restart policy, which its host has followed."""
+    """The host has applied the process's restart policy, so the failure is final."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     cluster.set_host("b", "cordon")
     lose(cluster, "a")
@@ -162,7 +162,7 @@ def test_what_failed_out_of_sight_has_failed() -> None:
 
 
 def test_what_is_not_there_any_more_goes_elsewhere() -> None:
-    """The host was switched off and on: it comes back with nothing."""
+    """A host that lost its power rejoins without the process."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     cluster.set_host("b", "cordon")
     lose(cluster, "a")
@@ -174,11 +174,11 @@ def test_what_is_not_there_any_more_goes_elsewhere() -> None:
     assert (cluster.phase("p"), cluster["p"].owner, cluster.where("p")) == ("running", 2, ["a"])
 
 
-# --- is it the host, or are we cut off? -------------------------------------------------------
+# --- lost host or isolated master -------------------------------------------------------------
 
 
 def test_a_master_that_hears_nobody_gives_nothing_up() -> None:
-    """It is cut off itself; what comes back within a lease of the first keeps its processes."""
+    """A host that rejoins within a lease of the first host keeps its processes."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     lose(cluster, "a", "b", seconds=60.0)
     assert (cluster.phase("p"), cluster.told("given_up")) == ("unreachable", [])
@@ -189,7 +189,7 @@ def test_a_master_that_hears_nobody_gives_nothing_up() -> None:
 
 
 def test_a_host_that_stays_away_when_the_others_are_back_is_given_up() -> None:
-    """One lease after the first of them was heard."""
+    """The host is given up one lease after the first host rejoined."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     lose(cluster, "a", "b", seconds=60.0)
     back(cluster, "b", seconds=12.0)
@@ -197,7 +197,7 @@ def test_a_host_that_stays_away_when_the_others_are_back_is_given_up() -> None:
 
 
 def test_a_restarted_master_gives_the_hosts_their_lease_first() -> None:
-    """It has heard nobody yet, which says nothing."""
+    """A new master has had no contact yet, so silence counts from its start."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     cluster.machines["a"].connected = False
     cluster.restart_master()
@@ -207,7 +207,7 @@ def test_a_restarted_master_gives_the_hosts_their_lease_first() -> None:
     assert cluster.where("p") == ["a", "b"]
 
 
-# --- others than owners -----------------------------------------------------------------------
+# --- instances that do not own the name -------------------------------------------------------
 
 
 BEING_CANCELLED = "being cancelled; it may still run on a, which is lost, and ends when a returns"
@@ -217,7 +217,7 @@ BEING_CANCELLED = "being cancelled; it may still run on a, which is lost, and en
 def test_a_process_on_a_lost_host_is_being_cancelled_until_the_host_reports_its_end(
     then: Any,
 ) -> None:
-    """However long that takes: it may run. The name is not given again before."""
+    """The process may still run there, so its name stays taken until then."""
     cluster = on_a(process("p", host_loss=HostLossPolicy(then, 50.0)), "b")
     lose(cluster, "a")
     assert cluster.cancel("p").message == f"1 process being cancelled; p is {BEING_CANCELLED}"
@@ -229,7 +229,7 @@ def test_a_process_on_a_lost_host_is_being_cancelled_until_the_host_reports_its_
 
 
 def test_a_process_that_is_being_cancelled_when_its_host_is_lost_says_so() -> None:
-    """Also after a restart of the master."""
+    """The reason is kept over a restart of the master."""
     cluster = on_a(process("p"), "b")
     cluster.machines["a"].stubborn.add("p")
     cluster.cancel("p")
@@ -246,7 +246,7 @@ def test_a_process_that_is_being_cancelled_when_its_host_is_lost_says_so() -> No
 
 
 def test_a_fenced_process_is_cancelled_when_its_fence_has_ended_it() -> None:
-    """With `elsewhere` it has ended by the time at which a successor could have started."""
+    """With `elsewhere` the process ended before a successor could have started."""
     spec = process(
         "p", host_loss=HostLossPolicy("elsewhere", 20.0), isolation=IsolationPolicy("stop")
     )
@@ -259,7 +259,7 @@ def test_a_fenced_process_is_cancelled_when_its_fence_has_ended_it() -> None:
 
 
 def test_a_cancelled_process_that_its_host_keeps_is_not_said_to_have_ended() -> None:
-    """A fence of `isolation: keep` ends nothing while the slave is at work."""
+    """A fence of `isolation: keep` ends nothing while the slave runs."""
     cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
     lose(cluster, "a")
     cluster.cancel("p")
@@ -277,14 +277,14 @@ def test_a_cancelled_process_waits_for_a_fence_that_is_later_than_its_delay() ->
     cluster = on_a(spec, "b")
     lose(cluster, "a")
     cluster.cancel("p")
-    cluster.wait(48.0)  # the lease of 10 s is over since 2 s
+    cluster.wait(48.0)  # the lease of 10 s expired 2 s ago
     assert cluster.phase("p") == "stopping"
     cluster.wait(6.0)
     assert cluster.phase("p") == "cancelled"
 
 
 def test_the_former_host_of_a_move_that_is_lost_does_not_hold_it_up() -> None:
-    """The destination owns the name; what is left at the source is fenced when it is back."""
+    """The destination owns the name; the source is fenced when its host rejoins."""
     cluster = on_a(movable("p"), "b")
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
@@ -302,7 +302,7 @@ def test_the_former_host_of_a_move_that_is_lost_does_not_hold_it_up() -> None:
 def fence(
     host_loss: HostLossPolicy, isolation: IsolationPolicy, **settings: float
 ) -> tuple[float, float] | None:
-    """After and grace of the assignment of such a process."""
+    """Return the fence of the assignment of such a process: after and grace."""
     cluster = Cluster("a", **settings)
     cluster.submit(process("p", host_loss=host_loss, isolation=isolation, stop=StopPolicy(2, 1)))
     given = cluster.machines["a"].programs[cluster.machines["a"].find("p")].assignment.fence
@@ -310,12 +310,12 @@ def fence(
 
 
 def test_by_default_nothing_is_fenced() -> None:
-    """Nothing follows it, so it may go on."""
+    """The process has no successor, so it may keep running."""
     assert fence(HostLossPolicy(), IsolationPolicy()) is None
 
 
 def test_what_may_have_a_successor_is_fenced_where_its_slave_is_not_at_work() -> None:
-    """A host that is only cut off goes on, whatever it hears."""
+    """A host that is only cut off keeps the process, as long as its slave runs."""
     cluster = Cluster("a")
     followed = process(
         "q", ros=True, migration=MigrationPolicy("handoff"), standby=StandbyPolicy(True)
@@ -331,7 +331,7 @@ def test_what_may_have_a_successor_is_fenced_where_its_slave_is_not_at_work() ->
 
 
 def test_a_fenced_process_has_ended_before_its_successor_starts() -> None:
-    """Its grace included, counted from when the master can have heard its host last."""
+    """The successor waits for the grace, too, counted from the last possible contact."""
     settings = CoreSettings()
     for delay in (0.0, 5.0, 60.0):
         given = fence(HostLossPolicy("elsewhere", delay), IsolationPolicy("stop"))
@@ -341,21 +341,21 @@ def test_a_fenced_process_has_ended_before_its_successor_starts() -> None:
 
 
 def test_a_fence_of_a_short_lease_leaves_time_for_beats() -> None:
-    """Three tenths of a second, at a lease of 0.8 s and suspicion after 0.3 s."""
+    """The time is 0.3 s with a lease of 0.8 s and suspicion after 0.3 s."""
     after, grace = fence(ELSEWHERE, IsolationPolicy("stop"), lease=0.8, suspect=0.3) or (0.0, 0.0)
     assert after == pytest.approx(0.3)
     assert grace == pytest.approx(0.1)
 
 
 def test_a_time_of_ones_own_is_kept() -> None:
-    """Without a successor its whole grace is given too."""
+    """A process without a successor gets its whole grace, too."""
     assert fence(HostLossPolicy(), IsolationPolicy("stop", 7.0)) == (7.0, 3.0)
     assert fence(HostLossPolicy(), IsolationPolicy("stop")) == (CoreSettings().lease, 3.0)
     assert fence(ELSEWHERE, IsolationPolicy("stop", 100.0)) == (100.0, 0.0)
 
 
 def test_beats_name_the_hosts_that_are_not_heard() -> None:
-    """Suspect and lost ones; not those that are expected or have left."""
+    """Beats name suspect and lost hosts, not expected ones or those that have left."""
     cluster = Cluster("a", "b", "c")
     assert cluster.state.hosts.unheard() == []
     lose(cluster, "b", seconds=2.0)
@@ -367,7 +367,7 @@ def test_beats_name_the_hosts_that_are_not_heard() -> None:
 
 @pytest.mark.parametrize(("then", "phase"), [("wait", "running"), ("stop", "failed")])
 def test_what_its_host_has_fenced_starts_again(then: str, phase: str) -> None:
-    """It was cut off for a moment only: nobody but its host has given it up."""
+    """The host was cut off only briefly and never lost, so the process has no successor."""
     cluster = on_a(process("p", host_loss=HostLossPolicy(then)), "b")
     machine = cluster.machines["a"]
     machine._end(machine.find("p"), InstanceState.FENCED, cluster.now, signal=9)
@@ -376,9 +376,9 @@ def test_what_its_host_has_fenced_starts_again(then: str, phase: str) -> None:
 
 
 def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
-    """A move that was under way when its host was lost had told its slave not to."""
+    """A move in progress at the loss had ordered the slave not to restart the process."""
     cluster = on_a(process("p", restart=RestartPolicy("on-failure"), host_loss=ELSEWHERE))
-    cluster.add(Machine("b", busy={"memory": 0.9}))  # somebody is heard, who has no room
+    cluster.add(Machine("b", busy={"memory": 0.9}))  # a host in contact, without room
     cluster.wait(11.0)
     a = cluster.machines["a"]
     a.tell(reducer.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
@@ -390,7 +390,7 @@ def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
 
 
 def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:
-    """Queued anew it waits for a host; the old instance has been told to end."""
+    """The process is queued again; the old instance is ordered to end."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     cluster.set_host("b", "cordon")
     lose(cluster, "a")
@@ -401,7 +401,7 @@ def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:
 
 
 def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
-    """Its host was pruned while it was lost, the name was given again; the host comes back."""
+    """The lost host was pruned and the name reused; then the host returns."""
     cluster = on_a(process("p"), "b")
     cluster.machines["a"].stubborn.add("p")
     lose(cluster, "a")
@@ -423,7 +423,7 @@ def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
 
 
 def test_of_a_silent_host_nothing_is_said_to_run_and_readings_are_old() -> None:
-    """From the first silence on, in every row; when the host is back all is known."""
+    """From the first silence on every row shows old readings; after the rejoin all is current."""
     cluster = on_a(process("p"), "b")
 
     def rows() -> Any:

@@ -1,4 +1,4 @@
-"""What hosts say of themselves, and when they are not believed or not heard."""
+"""Host reports: invalid readings, silence, registration and departure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def usage_seen(cluster: Cluster, name: str = "a") -> float:
 @pytest.mark.parametrize("wrong", [float("nan"), -0.1, float("inf"), 1e6])
 @pytest.mark.parametrize("what", ["usage", "limit"])
 def test_a_reading_that_makes_no_sense_is_refused_and_said(what: str, wrong: float) -> None:
-    """NaN, negative, absurd: nothing of it is used, and the record says whose it was."""
+    """A reading with NaN, negative or absurd values is dropped, and the record names its host."""
     cluster = Cluster("a")
     values = np.full((1, RESOURCE_SLOTS), 0.3)
     values[0, 1] = wrong
@@ -43,7 +43,7 @@ def test_a_reading_that_makes_no_sense_is_refused_and_said(what: str, wrong: flo
 
 
 def test_a_host_that_talks_nonsense_gets_no_work_and_is_not_lost() -> None:
-    """Its last good reading grows stale; that it speaks shows that it lives."""
+    """Its last valid reading grows stale, but each message renews the last contact."""
     cluster = Cluster("a")
     nonsense = np.full((1, RESOURCE_SLOTS), np.nan)
     for _ in range(150):
@@ -55,14 +55,14 @@ def test_a_host_that_talks_nonsense_gets_no_work_and_is_not_lost() -> None:
     assert not cluster.told("host_lost")
     (verdict,) = cluster.explain("p")["decision"]["hosts"]
     assert verdict["reason"] == "its reading of memory, cpu is stale"
-    assert len(cluster.told("reading_refused")) == 2  # said now and then, not each time
+    assert len(cluster.told("reading_refused")) == 2  # recorded now and then, not each time
     cluster.read()
     cluster.settle()
     assert cluster.where("p") == ["a"]
 
 
 def test_one_host_of_a_batch_that_talks_nonsense_harms_no_other() -> None:
-    """The good readings of the batch are used."""
+    """The valid readings of the batch are used."""
     cluster = Cluster("a", "b")
     usage = np.full((2, RESOURCE_SLOTS), 0.4)
     usage[0, 0] = np.nan
@@ -83,7 +83,7 @@ def test_a_reading_that_comes_late_does_not_replace_a_newer_one() -> None:
 
 
 def test_a_reading_of_a_stranger_is_ignored() -> None:
-    """A former run of a slave, or a number that nobody was given."""
+    """A reading of a former run of a slave, or of an unassigned host number, is ignored."""
     cluster = Cluster("a")
     for wrong in ({"incarnation": np.array([99], np.uint64)}, {"host_id": np.array([7])}):
         cluster.read(usage=np.full((1, RESOURCE_SLOTS), 0.5), **wrong)
@@ -91,7 +91,7 @@ def test_a_reading_of_a_stranger_is_ignored() -> None:
 
 
 def test_a_stale_reading_closes_its_host_and_is_never_zero() -> None:
-    """A probe that is late: no work, and the usage stays as it was seen last."""
+    """With a late probe the host takes no work, and its usage stays as last measured."""
     cluster = Cluster("a", "b")
     cluster.machines["a"].stale.add("memory")
     cluster.read()
@@ -101,7 +101,7 @@ def test_a_stale_reading_closes_its_host_and_is_never_zero() -> None:
 
 
 def test_a_stale_reading_without_a_limit_closes_nothing() -> None:
-    """A late probe of something that nobody limits is no reason to stand idle."""
+    """A late probe of an unlimited resource does not keep work from the host."""
     resources = (ResourceDescription("memory", "B", 1e9), ResourceDescription("fan", "1", 1.0))
     cluster = Cluster(Machine("a", resources=resources))
     cluster.machines["a"].stale.add("fan")
@@ -111,7 +111,7 @@ def test_a_stale_reading_without_a_limit_closes_nothing() -> None:
 
 
 def test_hosts_with_different_resources_in_different_slots_are_told_apart() -> None:
-    """A slot means what its host said at registration."""
+    """The registration of a host defines the meaning of its slots."""
     memory, cpu = ResourceDescription("memory", "B", 1e9), ResourceDescription("cpu", "core", 4.0)
     cluster = Cluster(
         Machine("a", resources=(memory, cpu), busy={"memory": 0.2, "cpu": 0.3}),
@@ -126,7 +126,7 @@ def test_hosts_with_different_resources_in_different_slots_are_told_apart() -> N
 
 
 def test_a_usage_that_makes_no_sense_is_refused() -> None:
-    """What a process is said to use counts only if it can be."""
+    """An invalid usage of an instance is recorded, and its last valid usage stays."""
     cluster = Cluster("a")
     cluster.submit(process("p", memory=100))
     for wrong in (float("nan"), -1.0, float("inf")):
@@ -140,20 +140,20 @@ def test_a_usage_that_makes_no_sense_is_refused() -> None:
 
 
 def test_a_second_live_slave_of_a_name_is_refused() -> None:
-    """With the first one named, and nothing of the first one changed."""
+    """The refusal names the first slave, which is unchanged."""
     cluster = Cluster("a")
     second = replace(cluster.machines["a"].description(), incarnation=77)
     reply = cluster.ask(happened.HostRegistered, second, ())
     assert (reply.accepted, reply.code) == (False, "name_taken")
     assert "pid 7 on a.local" in reply.message
-    cluster.ask(happened.HostRegistered, second, ())  # it asks again for a moment
+    cluster.ask(happened.HostRegistered, second, ())  # a retry shortly afterwards
     assert len(cluster.told("host_refused")) == 1
     cluster.submit(process("p"))
     assert cluster.where("p") == ["a"]
 
 
 def test_a_new_run_of_a_slave_is_taken_in_when_the_old_one_is_silent() -> None:
-    """And what it holds runs on."""
+    """The instances of the old slave keep running."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     machine = cluster.machines["a"]
@@ -168,7 +168,7 @@ def test_a_new_run_of_a_slave_is_taken_in_when_the_old_one_is_silent() -> None:
 
 
 def test_a_registration_that_comes_twice_changes_nothing() -> None:
-    """Its first answer may have been lost; an assignment on its way is not given twice."""
+    """The first answer may have been lost; an assignment on its way is not given twice."""
     cluster = Cluster("a", "b")
     machine = cluster.machines["a"]
     again = happened.HostRegistered(901, machine.description(), ())
@@ -197,7 +197,7 @@ def test_a_registration_that_comes_twice_changes_nothing() -> None:
     ],
 )
 def test_a_description_that_makes_no_sense_is_refused(change: dict, said: str) -> None:
-    """Before anything of it is used."""
+    """The description is checked before any part of it is used."""
     cluster = Cluster()
     description = replace(Machine("a", incarnation=5).description(), **change)
     reply = cluster.ask(happened.HostRegistered, description, ())
@@ -207,14 +207,14 @@ def test_a_description_that_makes_no_sense_is_refused(change: dict, said: str) -
 
 
 def test_a_host_that_was_never_registered_is_told_so() -> None:
-    """A request for work or a farewell of a stranger is answered."""
+    """A request for work or a departure of an unknown host is answered."""
     cluster = Cluster()
     for kind in (happened.ProcessRequested, happened.HostLeft):
         assert cluster.ask(kind, 3, 4).code == "unknown"
 
 
 def test_more_hosts_and_resources_than_at_first_keep_everything() -> None:
-    """The arrays grow without losing anything."""
+    """The arrays grow without loss."""
     cluster = Cluster()
     for i in range(11):
         resources = (
@@ -233,7 +233,7 @@ def test_more_hosts_and_resources_than_at_first_keep_everything() -> None:
 
 
 def test_a_silent_host_is_suspect_and_gets_no_work() -> None:
-    """Its processes go on."""
+    """The processes of a suspect host keep running."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.machines["a"].connected = False
@@ -248,7 +248,7 @@ def test_a_silent_host_is_suspect_and_gets_no_work() -> None:
 
 
 def test_a_host_that_reports_slowly_by_its_own_word_is_not_silent() -> None:
-    """It has three of its own periods before it is suspect, and its lease is as much longer."""
+    """The host is suspect after three of its own periods, and its lease grows by the same time."""
     cluster = Cluster(Machine("slow", period=4.0), "quick", suspect=1.0, lease=10.0)
     for name in cluster.machines:
         cluster.machines[name].connected = False
@@ -266,7 +266,7 @@ def test_a_host_that_reports_slowly_by_its_own_word_is_not_silent() -> None:
 
 
 def test_a_host_that_is_silent_past_its_lease_is_lost() -> None:
-    """Its processes are out of reach, not gone, and nothing is started in their place."""
+    """Its processes are unreachable, not ended, and have no successors."""
     cluster = Cluster("a", "b", lease=10.0)
     cluster.machines["b"].busy["memory"] = 0.5
     cluster.read()
@@ -280,7 +280,7 @@ def test_a_host_that_is_silent_past_its_lease_is_lost() -> None:
 
 
 def test_a_lost_host_that_comes_back_brings_its_processes_along() -> None:
-    """They are again what they were, and the host is asked for everything."""
+    """The processes return to their former phases, and the master requests a full report."""
     cluster = Cluster("a")
     cluster.submit(process("p"), job("q"))
     machine = cluster.machines["a"]
@@ -294,7 +294,7 @@ def test_a_lost_host_that_comes_back_brings_its_processes_along() -> None:
 
 
 def test_a_lost_host_whose_slave_was_restarted_brings_its_processes_along() -> None:
-    """The same, by way of a new registration."""
+    """A new registration restores the processes, too."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     machine = cluster.machines["a"]
@@ -308,7 +308,7 @@ def test_a_lost_host_whose_slave_was_restarted_brings_its_processes_along() -> N
 
 
 def test_a_status_batch_that_was_missed_makes_the_master_ask_for_everything() -> None:
-    """A gap in the count shows it."""
+    """A gap in the batch numbers shows the loss."""
     cluster = Cluster("a")
     cluster.submit(job("p"), process("q"))
     machine = cluster.machines["a"]
@@ -321,7 +321,7 @@ def test_a_status_batch_that_was_missed_makes_the_master_ask_for_everything() ->
 
 
 def test_the_last_status_batch_is_missed_by_what_the_reading_says() -> None:
-    """Without a later batch, the reading tells how many there were."""
+    """The reading has the number of batches sent, so a lost last batch is noticed."""
     cluster = Cluster("a")
     cluster.submit(job("p"))
     machine = cluster.machines["a"]
@@ -332,7 +332,7 @@ def test_the_last_status_batch_is_missed_by_what_the_reading_says() -> None:
 
 
 def test_a_status_batch_that_comes_late_or_twice_changes_nothing() -> None:
-    """What is newer is known already."""
+    """The master already knows a newer status."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     machine = cluster.machines["a"]
@@ -348,7 +348,7 @@ def test_a_status_batch_that_comes_late_or_twice_changes_nothing() -> None:
 
 
 def test_a_cordoned_host_gets_no_work_and_keeps_what_it_has() -> None:
-    """Until it is uncordoned."""
+    """The host takes work again once it is uncordoned."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(process("p"))
     assert cluster.set_host("a", "cordon").message == "a is cordoned"
@@ -360,7 +360,7 @@ def test_a_cordoned_host_gets_no_work_and_keeps_what_it_has() -> None:
 
 
 def test_an_unknown_host_or_action_is_refused_with_what_there_is() -> None:
-    """The answer names the hosts, or the actions."""
+    """The answer names the known hosts or actions."""
     cluster = Cluster("a", "b")
     said = cluster.set_host("c", "cordon").message
     assert said == "no such host: 'c'; there are: a, b (`rosrm hosts` lists them)"
@@ -368,7 +368,7 @@ def test_an_unknown_host_or_action_is_refused_with_what_there_is() -> None:
 
 
 def test_what_a_host_ends_as_it_leaves_returns_to_the_queue() -> None:
-    """Also a service that exits with 0 because it was told to."""
+    """A service that exits with 0 on its slave's signal is queued again, too."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(process("p"), job("q"))
     assert cluster.counts() == {"a": 2, "b": 0}
@@ -378,7 +378,7 @@ def test_what_a_host_ends_as_it_leaves_returns_to_the_queue() -> None:
 
 
 def test_a_job_that_completes_as_its_host_leaves_has_finished() -> None:
-    """It came to its end by itself and is not run again."""
+    """The job completed by its own exit and does not run again."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(job("p"))
     machine = cluster.machines["a"]
@@ -389,7 +389,7 @@ def test_a_job_that_completes_as_its_host_leaves_has_finished() -> None:
 
 
 def test_what_a_slave_that_was_stopped_still_ends_says_so_and_how_long() -> None:
-    """A bare "SIGINT" would not tell the user why, nor whether the process ever ends."""
+    """A bare "SIGINT" would not tell the user the cause, nor whether the process ever ends."""
     cluster = Cluster("a")
     cluster.submit(process("deaf", stop=StopPolicy(2.0, 3.0)))
     machine = cluster.machines["a"]
@@ -407,7 +407,7 @@ def test_what_a_slave_that_was_stopped_still_ends_says_so_and_how_long() -> None
 
 
 def test_a_host_that_left_and_says_no_more_is_lost_with_what_it_held() -> None:
-    """Nothing of it is forgotten: its processes show as unreachable."""
+    """Its processes stay in memory and show as unreachable."""
     cluster = Cluster("a", "b")
     cluster.submit(process("p"))
     machine = cluster.machines["a"]
@@ -418,7 +418,7 @@ def test_a_host_that_left_and_says_no_more_is_lost_with_what_it_held() -> None:
 
 
 def test_a_host_that_left_comes_back_by_registering() -> None:
-    """With a new run of its slave."""
+    """A new run of its slave registers."""
     cluster = Cluster("a")
     cluster.leave(cluster.machines["a"])
     cluster.submit(process("p"))
@@ -429,7 +429,7 @@ def test_a_host_that_left_comes_back_by_registering() -> None:
 
 
 def test_an_instance_that_nobody_intends_is_stopped_until_it_has_ended() -> None:
-    """A slave that reports a stranger is told to stop it, again if need be."""
+    """The slave receives a stop order for an unknown instance, and again after each time-out."""
     cluster = Cluster("a")
     machine = cluster.machines["a"]
     machine.stubborn.add("ghost")

@@ -1,4 +1,4 @@
-"""Kept states in the core: what the policy is asked, what slaves are told, what a start is told."""
+"""Snapshot replication in the core: policy calls, orders to slaves, replicas at a start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.unit.core.cluster import Cluster, job, process
 
 
 class Asked:
-    """A policy that does as it is told, and remembers what it was asked."""
+    """Checkpoint policy that returns a set answer and records its questions."""
 
     def __init__(self, *hosts: str, every: float = 1.0) -> None:
         self.answer: Any = CheckpointChoice(hosts, every)
@@ -41,7 +41,7 @@ def stateful(name: str = "p", **fields: Any) -> ProcessSpec:
 
 
 def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
-    """A host says all that it keeps: process, instance, sequence."""
+    """Report all snapshots of a host: process, instance, sequence."""
     machine = cluster.machines[host]
     kept = tuple(
         KeptState(InstanceId(name, number), sequence, 100) for name, number, sequence in states
@@ -50,7 +50,7 @@ def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
 
 
 def running(policy: Asked | None, *hosts: str, spec: ProcessSpec | None = None) -> Cluster:
-    """A stateful process that runs, its state kept on its own host."""
+    """Return a cluster with a running stateful process whose snapshot is on its own host."""
     cluster = Cluster(*(hosts or ("a", "b", "c")), lease=3.0)
     cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "asked"
     cluster.submit(spec or stateful())
@@ -70,12 +70,12 @@ def others(cluster: Cluster) -> list[str]:
 
 
 def assigned(cluster: Cluster) -> Any:
-    """The newest assignment."""
+    """Return the newest assignment."""
     return [one for one in cluster.carried if isinstance(one, Assign)][-1].assignment
 
 
 def test_the_policys_choice_is_told_once():
-    """To the slave where the process runs; and again only when it changes."""
+    """The slave receives the hosts of the replicas once, and again after a change."""
     policy = Asked("b")
     cluster = running(policy, "a", "b")
     host = where(cluster)
@@ -92,7 +92,7 @@ def test_the_policys_choice_is_told_once():
 
 
 def test_the_order_of_the_hosts_that_are_chosen_makes_no_difference():
-    """A policy that lists them as `kept_on` does gives no order and makes no event."""
+    """A policy that lists the hosts as `kept_on` does causes no order and no event."""
     policy = Asked()
     cluster = running(policy)
     one, two = others(cluster)
@@ -105,7 +105,7 @@ def test_the_order_of_the_hosts_that_are_chosen_makes_no_difference():
 
 
 def test_what_the_policy_sees():
-    """The hosts that are up with their labels, what is kept, and how old it is."""
+    """The view has the hosts that are up, their labels, the replicas and the age of the newest."""
     policy = Asked()
     cluster = running(policy)
     other = others(cluster)[0]
@@ -122,7 +122,7 @@ def test_what_the_policy_sees():
 
 
 def test_it_is_asked_about_once_a_second_for_each_process():
-    """However many there are, and however often time passes."""
+    """The rate does not depend on the number of processes or of ticks."""
     policy = Asked()
     cluster = Cluster("a", "b")
     cluster.state.keeping.policy = policy
@@ -149,7 +149,7 @@ def test_it_is_asked_about_once_a_second_for_each_process():
     ],
 )
 def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
-    """And what was told before holds on."""
+    """The replication that was ordered before stays in place."""
     policy = Asked()
     cluster = running(policy, "a", "b")
     policy.answer = answer
@@ -167,7 +167,7 @@ def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
 
 @pytest.mark.parametrize("answer", [None, ValueError("no idea"), TimeoutError("late")])
 def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer):
-    """The state is shipped to the hosts that report a copy, and no copy is deleted."""
+    """The snapshot is sent to the hosts that report a replica, and no replica is deleted."""
     policy = Asked("b", "c")
     cluster = running(policy, "a", "b", "c")
     number, host = cluster["p"].owner, where(cluster)
@@ -178,7 +178,7 @@ def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer
     register(cluster, host, ("p", number, 9))
     register(cluster, one, ("p", number, 8))
     cluster.wait(3.0)
-    register(cluster, two, ("p", number, 7))  # later, and with an older state
+    register(cluster, two, ("p", number, 7))  # registers later, with an older snapshot
     cluster.wait(5.0)
     assert not cluster.orders("drop_kept")
     assert cluster.orders("keep")[-1].keep_on == (one, two)
@@ -197,7 +197,7 @@ def test_a_choice_of_the_processs_own_host_is_refused():
 
 
 def test_a_slave_that_was_started_anew_is_told_again():
-    """It has forgotten; so has one that was told by a master before this one."""
+    """A new run of a slave does not know the orders of the former run."""
     policy = Asked()
     cluster = running(policy, "a", "b")
     policy.answer = CheckpointChoice((others(cluster)[0],))
@@ -214,11 +214,11 @@ def test_a_slave_that_was_started_anew_is_told_again():
 
 
 def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
-    """Newest first, lost hosts left out; and the host that has it is preferred."""
+    """The hosts are listed newest first, without lost ones; a host with a snapshot is preferred."""
     cluster = running(Asked())
     host, (one, two) = where(cluster), others(cluster)
     number = cluster["p"].owner
-    # Without the state, the emptier one would be chosen.
+    # Without the snapshot the host with less load would be chosen.
     cluster.machines[two].busy = {"memory": 0.3, "cpu": 0.3}
     keep(cluster, two, ("p", number, 4))
     cluster.machines[host].connected = False
@@ -231,7 +231,7 @@ def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
 
 
 def test_a_restarted_one_is_kept_elsewhere_from_its_first_state_on():
-    """Its slave is told before it has said that it keeps anything: a second loss may come soon."""
+    """The slave receives the order before its first report, because a second loss may come soon."""
     policy = Asked()
     cluster = running(policy)
     lost, (keeper, _) = where(cluster), others(cluster)
@@ -249,7 +249,7 @@ def test_a_restarted_one_is_kept_elsewhere_from_its_first_state_on():
 
 
 def test_a_failed_process_that_is_restarted_goes_on_from_its_state():
-    """It was not asked to begin anew."""
+    """The restart does not ask for a start from nothing, so the snapshot is used."""
     cluster = running(Asked())
     host, number = where(cluster), cluster["p"].owner
     cluster.machines[host].finish("p", cluster.now, code=1)
@@ -265,7 +265,7 @@ def test_a_failed_process_that_is_restarted_goes_on_from_its_state():
 
 
 def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
-    """Also on a host that was away when it was cancelled."""
+    """The drop includes hosts that were away at the cancel."""
     policy = Asked()
     cluster = running(policy)
     host, other = where(cluster), others(cluster)[0]
@@ -290,7 +290,7 @@ def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
 
 
 def test_the_replicas_of_a_pruned_process_are_dropped():
-    """Also on a host that returns after the prune; those of an unknown later instance stay."""
+    """Hosts that return after the prune drop them, too; those of an unknown later instance stay."""
     cluster = running(Asked())
     host, (other, third) = where(cluster), others(cluster)
     number = cluster["p"].owner
@@ -334,7 +334,7 @@ def test_what_was_pruned_is_not_forgotten_with_the_master():
 
 
 def test_where_it_was_submitted_is_not_forgotten_with_the_master():
-    """The state of a former life stays unused after a restart of the master too."""
+    """A snapshot from before the submission stays unused after a restart of the master too."""
     cluster = running(Asked())
     other, number = others(cluster)[0], cluster["p"].owner
     cluster.cancel("p")
@@ -345,7 +345,7 @@ def test_where_it_was_submitted_is_not_forgotten_with_the_master():
 
 
 def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer_one():
-    """Not before: until then they are all there is, if the new host is lost."""
+    """The old replicas are the only ones if the new host is lost before its first snapshot."""
     cluster = running(Asked(), "a", "b")
     source = where(cluster)
     number = cluster["p"].owner
@@ -362,7 +362,7 @@ def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer
 
 
 def test_an_explanation_says_where_the_state_is_kept():
-    """The newest first, with the cycle that it covers and its age."""
+    """Replicas are listed newest first, with the sequence number and the age."""
     cluster = running(Asked("b", "c"))
     number = cluster["p"].owner
     (other, *_) = others(cluster)
@@ -376,7 +376,7 @@ def test_an_explanation_says_where_the_state_is_kept():
 
 
 def test_without_a_policy_it_is_kept_on_its_own_host_alone():
-    """And a start elsewhere is told of it all the same."""
+    """An assignment to another host still lists where the snapshot is."""
     cluster = running(None)
     cluster.wait(3.0)
     assert all(order.keep_on == () for order in cluster.orders("keep"))
@@ -384,7 +384,7 @@ def test_without_a_policy_it_is_kept_on_its_own_host_alone():
 
 
 def test_stateless_processes_and_strangers_are_left_alone():
-    """What is kept of a name that nobody knows stays: the journal may be lost."""
+    """Snapshots of an unknown process stay, because the journal may be lost."""
     cluster = Cluster("a")
     cluster.submit(process("s"), job("j"))
     keep(cluster, "a", ("unknown", 70, 3))
@@ -397,7 +397,7 @@ def test_stateless_processes_and_strangers_are_left_alone():
 
 
 def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
-    """A slave registers with the master, and says at once what it keeps."""
+    """Register a slave, which reports its snapshots at once."""
     machine = cluster.machines[host]
     kept = tuple(
         KeptState(InstanceId(name, number), sequence, 100) for name, number, sequence in states
@@ -406,13 +406,13 @@ def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None
 
 
 def test_a_master_that_starts_knows_what_a_host_keeps_as_soon_as_it_registers():
-    """A start that follows from the very registration goes on from that state."""
+    """A start caused by this registration already uses the reported snapshot."""
     cluster = running(Asked(), "a", "b")
     host, number = where(cluster), cluster["p"].owner
     register(cluster, others(cluster)[0])
     cluster.kill_master()
     machine = cluster.machines[host]
-    machine.programs.clear()  # it ended, and was forgotten, while there was no master
+    machine.programs.clear()  # the process ended and was forgotten while there was no master
     machine.slave.held.clear()
     register(cluster, others_of(cluster, host)[0])
     register(cluster, host, ("p", number, 5))
@@ -426,7 +426,7 @@ def others_of(cluster: Cluster, host: str) -> list[str]:
 
 
 def test_after_a_start_of_the_master_its_state_may_lie_on_a_host_that_comes_back_later():
-    """It is not started from nothing meanwhile, nor waited for for ever; those behind it go on."""
+    """The process waits for that host for one lease; other queued processes do not wait."""
     cluster = running(Asked())
     host, left = where(cluster), others(cluster)
     for name in left:
@@ -443,12 +443,12 @@ def test_after_a_start_of_the_master_its_state_may_lie_on_a_host_that_comes_back
     assert cluster.phase("behind") == "running"
     assert cluster.queue() == ["p"]
     assert "has not come back yet" in cluster["p"].reason
-    cluster.wait(4.0)  # the lease is over
+    cluster.wait(4.0)  # the lease has expired
     assert cluster.phase("p") == "running"
 
 
 def test_the_last_copy_may_vanish_while_processes_are_looked_at():
-    """It was the one of a host that has been told to drop it."""
+    """The last replica may be on a host that was ordered to drop it."""
     policy = Asked()
     cluster = running(policy)
     cluster.wait(3.0)
@@ -460,20 +460,20 @@ def test_the_last_copy_may_vanish_while_processes_are_looked_at():
 
 
 def lost_with_its_copy() -> tuple[Cluster, str, str]:
-    """The host of a process is lost, and that which keeps the copy of its state, at once."""
+    """Return a cluster that lost the hosts of a process and of its replica at the same time."""
     cluster = running(Asked())
     host, (keeper, left) = where(cluster), others(cluster)
     keep(cluster, keeper, ("p", cluster["p"].owner, 4))
     for name in (host, keeper):
         cluster.machines[name].connected = False
-    cluster.wait(4.5)  # the lease is over, and another one has begun
+    cluster.wait(4.5)  # the lease has expired, and the next one has begun
     assert cluster.queue() == ["p"]
     assert "has not come back yet" in cluster["p"].reason
     return cluster, keeper, left
 
 
 def test_when_the_copy_is_lost_too_its_host_may_come_back():
-    """A moment later, as from a cut: then the process goes on from its state."""
+    """A host that rejoins within the next lease provides the snapshot."""
     cluster, keeper, _ = lost_with_its_copy()
     cluster.machines[keeper].connected = True
     cluster.wait(1.0)
@@ -481,7 +481,7 @@ def test_when_the_copy_is_lost_too_its_host_may_come_back():
 
 
 def test_when_the_copy_stays_lost_it_begins_from_nothing():
-    """One lease later: nobody else can go on."""
+    """One lease later the process starts from nothing, because no host has its snapshot."""
     cluster, _, left = lost_with_its_copy()
     cluster.wait(3.0)
     assert left in cluster.where("p")
@@ -489,7 +489,7 @@ def test_when_the_copy_stays_lost_it_begins_from_nothing():
 
 
 def test_a_host_that_was_to_keep_the_state_is_asked_for_it_though_it_has_not_said_so():
-    """What came there since it spoke last is the newest there is."""
+    """The newest replica may have arrived there after the last report."""
     policy = Asked()
     cluster = running(policy)
     host, (keeper, stale) = where(cluster), others(cluster)

@@ -1,4 +1,4 @@
-"""A short job ahead: what may wait on a host whose slots are taken, and for how long."""
+"""Assignment ahead of a free slot: conditions and withdrawal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from tests.unit.core.cluster import Cluster, Machine, job
 
 
 def cluster_of_one_slot(run_time: float) -> Cluster:
-    """One host with one slot, on which a job has run once."""
+    """Return a cluster of one host with one slot, on which a job has run once."""
     cluster = Cluster(Machine("a", max_processes=1))
     cluster.submit(job("first"))
     cluster.machines["a"].finish("first", cluster.now, run_time=run_time)
@@ -16,7 +16,7 @@ def cluster_of_one_slot(run_time: float) -> Cluster:
 
 
 def test_one_short_job_waits_on_the_host_that_runs_another() -> None:
-    """Its slave holds it, and starts it by itself when the slot is free."""
+    """The slave holds the next job and starts it as soon as the slot is free."""
     cluster = cluster_of_one_slot(run_time=0.1)
     cluster.submit(job("p"), job("q"), job("r"))
     assert [cluster.phase(name) for name in "pqr"] == ["running", "assigned", "queued"]
@@ -27,14 +27,14 @@ def test_one_short_job_waits_on_the_host_that_runs_another() -> None:
 
 
 def test_nothing_waits_behind_a_job_that_is_long_or_unknown() -> None:
-    """Only what earlier runs of the same program took allows an assignment ahead."""
+    """An assignment ahead needs a known run time from earlier runs of the same program."""
     cluster = cluster_of_one_slot(run_time=60.0)
     cluster.submit(job("p"), job("q"))
     assert [cluster.phase(name) for name in "pq"] == ["running", "queued"]
 
 
 def test_what_waits_behind_a_job_that_proves_long_goes_back_to_its_place() -> None:
-    """It is not started there, and goes to a host that has become free."""
+    """The job is withdrawn unstarted, and goes to the next host with a free slot."""
     cluster = cluster_of_one_slot(run_time=0.1)
     cluster.submit(job("p"), job("q"), job("r"))
     assert cluster.phase("q") == "assigned"
@@ -46,7 +46,7 @@ def test_what_waits_behind_a_job_that_proves_long_goes_back_to_its_place() -> No
 
 
 def test_a_job_that_waits_ahead_can_be_cancelled() -> None:
-    """It never starts."""
+    """A cancelled job that waits ahead never starts."""
     cluster = cluster_of_one_slot(run_time=0.1)
     cluster.submit(job("p"), job("q"))
     cluster.cancel("q")

@@ -1,4 +1,4 @@
-"""A master whose journal has lost what was newest in it: it says so, and starts nothing twice."""
+"""Journal gap: the master detects lost newest records and starts no process twice."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ LEASE = 10.0
 
 
 class Loss:
-    """A cluster whose journal loses all that is written from here until it strikes.
+    """Cluster whose journal loses all records from the construction of this object to `strike`.
 
     Attributes:
-        seen: newest record that hosts have been told of.
+        seen: newest record number that the hosts know.
     """
 
     def __init__(self, cluster: Cluster) -> None:
@@ -26,7 +26,7 @@ class Loss:
         self._newest = len(cluster.records)
 
     def strike(self, *, fell: bool = False) -> None:
-        """The master comes up from what is left; nobody is heard yet."""
+        """Kill the master and restore it from the remaining journal, before any registration."""
         cluster = self.cluster
         self.seen = len(cluster.records)
         cluster.intents.clear()
@@ -35,18 +35,18 @@ class Loss:
         begin(cluster, self._newest, fell=fell)
 
     def come_back(self, host: str, seen: int) -> None:
-        """The host registers and says how much of the journal it has seen."""
+        """Register the host, which reports the newest record number it has seen."""
         self.cluster.register(self.cluster.machines[host], journal_seen=seen)
 
 
 def begin(cluster: Cluster, newest: int, *, fell: bool = False) -> None:
-    """As a master does with its start: what it must remember becomes durable at once."""
+    """Start a master, which writes its restart records at once."""
     journal_gap.begin(cluster.state, newest, cluster.now, fell=fell)
     cluster.journal([journal_gap.intent(cluster.state)])
 
 
 def kill_again(cluster: Cluster) -> None:
-    """The master that came up from what is left is killed too; the next has all that it wrote."""
+    """Kill the master of the gap, too; the next master has all records that it wrote."""
     cluster.kill_master()
     begin(cluster, len(cluster.records))
 
@@ -61,7 +61,7 @@ def told(cluster: Cluster) -> list:
 
 
 def lost_with_p_on_b(cluster: Cluster) -> Loss:
-    """By what will be left of the journal `p` is queued, and both hosts take no work."""
+    """Return a journal gap after which `p` is queued by the journal; both hosts are cordoned."""
     cluster.set_host("a", "cordon")
     cluster.set_host("b", "cordon")
     cluster.submit(process("p"))
@@ -72,13 +72,13 @@ def lost_with_p_on_b(cluster: Cluster) -> Loss:
 
 
 def waits(cluster: Cluster) -> None:
-    """`p` is given to nobody, and runs where it was started in what is lost."""
+    """Check that `p` is not assigned again and keeps running on b."""
     assert cluster.where("p") == ["b"]
     assert "the master waits for all hosts to report" in cluster["p"].reason
 
 
 def test_it_is_said_once_with_how_much(cluster) -> None:
-    """The first host tells; a second one that knows no more is no news, one that knows more is."""
+    """The first host reveals the gap; later hosts cause a record only if they know more."""
     loss = Loss(cluster)
     cluster.submit(process("p"))
     loss.strike()
@@ -92,7 +92,7 @@ def test_it_is_said_once_with_how_much(cluster) -> None:
 
 
 def test_a_whole_journal_is_not_suspected(cluster) -> None:
-    """What hosts have seen is there, and work is given at once."""
+    """The journal has all records that hosts have seen, so work is assigned at once."""
     cluster.submit(process("p"))
     loss = Loss(cluster)
     loss.strike()
@@ -104,7 +104,10 @@ def test_a_whole_journal_is_not_suspected(cluster) -> None:
 
 
 def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
-    """It is queued by what is left, and runs on a host that is heard later: that one ends first."""
+    """By the journal p is queued, while a host that registers later runs it.
+
+    That instance ends first.
+    """
     loss = lost_with_p_on_b(cluster)
     loss.strike()
     loss.come_back("a", loss.seen)
@@ -123,7 +126,10 @@ def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
 
 @pytest.mark.parametrize("there", [True, False])
 def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, there) -> None:
-    """Though nobody has seen more than there is; a host that stays away holds it for a lease."""
+    """The master waits for every known host, though none can prove the gap.
+
+    An absent host blocks placement for one lease.
+    """
     loss = lost_with_p_on_b(cluster)
     loss.strike(fell=True)
     loss.come_back("a", 0)
@@ -142,7 +148,7 @@ def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, th
 
 
 def test_a_master_that_is_killed_while_it_waits_forgets_nothing_of_it(cluster) -> None:
-    """After a fall of the machine: the next one waits for the same hosts, and then no more."""
+    """The next master waits for the same hosts, and then for no more."""
     loss = lost_with_p_on_b(cluster)
     loss.strike(fell=True)
     kill_again(cluster)
@@ -158,7 +164,7 @@ def test_a_master_that_is_killed_while_it_waits_forgets_nothing_of_it(cluster) -
 
 
 def test_nothing_is_waited_for_twice(cluster) -> None:
-    """All have come back, with nothing to do: a later restart of the master is as any other."""
+    """Once all hosts have registered, a later restart of the master does not wait."""
     loss = Loss(cluster)
     loss.strike(fell=True)
     assert cluster.intents["cluster"]["unheard"]["fell"]
@@ -173,7 +179,7 @@ def test_nothing_is_waited_for_twice(cluster) -> None:
 
 
 def test_what_one_host_knew_to_be_lost_counts_for_the_next_master_too(cluster) -> None:
-    """That host has seen no more than there is now; the others are still to be heard."""
+    """After both restarts the master still waits for the hosts that have not registered."""
     loss = lost_with_p_on_b(cluster)
     loss.strike()
     loss.come_back("a", loss.seen)
@@ -190,7 +196,7 @@ def test_what_one_host_knew_to_be_lost_counts_for_the_next_master_too(cluster) -
 
 @pytest.mark.parametrize("killed", [False, True])
 def test_numbers_of_what_is_lost_are_not_given_again(cluster, killed) -> None:
-    """Also of instances that have ended and that no host remembers, and by the next master."""
+    """This includes ended instances that no host remembers, and holds for the next master, too."""
     loss = Loss(cluster)
     cluster.submit(process("p"))
     given = cluster["p"].owner
@@ -211,7 +217,7 @@ def test_numbers_of_what_is_lost_are_not_given_again(cluster, killed) -> None:
 
 
 def test_an_absurd_number_harms_nobody(cluster) -> None:
-    """A host that says nonsense costs a lease, not the numbers of instances."""
+    """An invalid record number costs one lease and no instance numbers."""
     loss = Loss(cluster)
     loss.strike()
     loss.come_back("a", 2**63)

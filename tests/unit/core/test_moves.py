@@ -1,4 +1,4 @@
-"""Migrations by plan: forward, back from each step, and what can be neither."""
+"""Migration plans: forward, undo of each step, and moves that are stuck."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.unit.core.cluster import Cluster, Machine, StartFirstOrStopFirst, job
 
 
 def two_hosts(*, overlap: bool = True, **settings: Any) -> Cluster:
-    """P runs on a, as a ROS node; b has room."""
+    """Return a cluster where p runs on a as a ROS node, and b has room."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}), **settings)
     cluster.submit(movable("p", overlap=overlap, ros=True))
     cluster.machines["a"].seen_in_graph("p", cluster.now)
@@ -42,7 +42,7 @@ def ready_on(cluster: Cluster, host: str, name: str = "p") -> None:
 
 
 def test_start_first_runs_both_until_the_new_one_is_ready() -> None:
-    """Start there, ready there, commit, stop here."""
+    """The steps are start there, ready there, commit, stop here."""
     cluster = two_hosts()
     reply = cluster.migrate("p")
     assert (reply.accepted, reply.host, reply.message) == (True, "b", "p moves to b")
@@ -54,7 +54,7 @@ def test_start_first_runs_both_until_the_new_one_is_ready() -> None:
 
 
 def test_stop_first_never_runs_two() -> None:
-    """Stop here, start there, ready there, commit."""
+    """The steps are stop here, start there, ready there, commit."""
     cluster = two_hosts(overlap=False)
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
@@ -77,7 +77,7 @@ def test_the_destination_is_counted_from_the_beginning_and_the_source_to_its_end
 
 
 def test_what_was_seen_of_the_source_is_counted_at_the_destination() -> None:
-    """A process that uses more than anybody declared needs that much room there."""
+    """The measured usage counts at the destination if it exceeds the declared needs."""
     cluster = two_hosts()
     cluster.machines["a"].shown["p"] = {"memory": 6 * 2.0**30}
     cluster.wait(0.2)
@@ -88,7 +88,7 @@ def test_what_was_seen_of_the_source_is_counted_at_the_destination() -> None:
 
 
 def test_a_move_is_refused_with_its_reason() -> None:
-    """Nothing has changed then."""
+    """A refused move changes nothing."""
     cluster = two_hosts()
     cluster.submit(process("fixed"), process("waits", memory=1e6))
     cases = [
@@ -109,11 +109,11 @@ def test_a_move_is_refused_with_its_reason() -> None:
     assert "p is moving already, to b" in cluster.migrate("p").message
 
 
-# --- back -------------------------------------------------------------------------------------
+# --- undo -------------------------------------------------------------------------------------
 
 
 def test_a_destination_that_never_becomes_ready_is_stopped_and_the_source_goes_on() -> None:
-    """Before the commit a failure is undone."""
+    """A failure before the commit is undone."""
     cluster = two_hosts()
     cluster.migrate("p")
     cluster.wait(11.0)
@@ -134,7 +134,7 @@ def test_a_destination_that_refuses_or_ends_is_undone() -> None:
 
 
 def test_stop_first_starts_again_at_the_source_when_the_destination_fails() -> None:
-    """The fallback is a new instance, and the owner."""
+    """The fallback is a new instance, and owns the name."""
     cluster = two_hosts(overlap=False)
     cluster.machines["b"].refuses["p"] = "no such executable"
     cluster.migrate("p")
@@ -144,7 +144,7 @@ def test_stop_first_starts_again_at_the_source_when_the_destination_fails() -> N
 
 
 def test_a_fallback_is_not_started_beside_a_source_that_has_not_ended() -> None:
-    """The stop took too long: the way back waits until the source is really gone."""
+    """After a time-out of the stop, the undo waits for the source's end."""
     cluster = two_hosts(overlap=False)
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
@@ -159,7 +159,7 @@ def test_a_fallback_is_not_started_beside_a_source_that_has_not_ended() -> None:
 
 
 def test_a_fallback_starts_as_soon_as_the_source_has_ended() -> None:
-    """The stop took too long: the way back then loses no time to `order_retry`."""
+    """After a time-out of the stop, the undo does not wait for `order_retry`."""
     cluster = two_hosts(overlap=False)
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
@@ -174,7 +174,7 @@ def test_a_fallback_starts_as_soon_as_the_source_has_ended() -> None:
 
 
 def test_when_neither_side_can_run_it_the_process_returns_to_the_queue() -> None:
-    """Destination and fallback refused: it is placed anew rather than lost."""
+    """Destination and fallback refused the process, so the scheduler places it on a third host."""
     cluster = two_hosts(overlap=False)
     cluster.add(Machine("c", busy={"memory": 0.6}))
     for name in "ab":
@@ -186,7 +186,7 @@ def test_when_neither_side_can_run_it_the_process_returns_to_the_queue() -> None
 
 
 def test_a_source_that_ends_by_itself_ends_the_move() -> None:
-    """Its own end counts, and the destination is stopped."""
+    """The source's own end counts, and the destination is stopped."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(job("p", migration=MigrationPolicy("relaunch"), ros=True))
     cluster.machines["a"].seen_in_graph("p", cluster.now)
@@ -199,7 +199,7 @@ def test_a_source_that_ends_by_itself_ends_the_move() -> None:
 
 
 def test_a_job_that_completes_while_it_is_told_to_stop_has_finished() -> None:
-    """A stop-first move does not run it once more."""
+    """A stop-first move does not run the job a second time."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(job("p", migration=MigrationPolicy("relaunch", overlap=False)))
     machine = cluster.machines["a"]
@@ -210,7 +210,7 @@ def test_a_job_that_completes_while_it_is_told_to_stop_has_finished() -> None:
 
 
 def test_a_source_whose_host_forgot_it_returns_to_the_queue() -> None:
-    """Gone without a word is no failure of the process."""
+    """An instance that is missing without a status is no failure of the process."""
     cluster = two_hosts()
     cluster.migrate("p")
     machine = cluster.machines["a"]
@@ -223,7 +223,7 @@ def test_a_source_whose_host_forgot_it_returns_to_the_queue() -> None:
 
 
 def test_a_fallback_whose_slot_was_given_away_returns_to_the_queue() -> None:
-    """While it was between two hosts another process took its place: it is placed anew."""
+    """Another process took the slot during the move, so the scheduler places the process again."""
     cluster = Cluster(
         Machine("a", max_processes=1, labels={"x": "y"}), Machine("b", busy={"memory": 0.5})
     )
@@ -241,7 +241,7 @@ def test_a_fallback_whose_slot_was_given_away_returns_to_the_queue() -> None:
 
 
 def test_after_the_commit_a_source_that_does_not_stop_leaves_the_move_stuck() -> None:
-    """It is said, tried again, and over once the source has ended."""
+    """The stuck move is recorded once, retried, and finished once the source has ended."""
     cluster = two_hosts()
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
@@ -259,7 +259,7 @@ def test_after_the_commit_a_source_that_does_not_stop_leaves_the_move_stuck() ->
 
 
 def test_one_that_is_stuck_can_be_cancelled() -> None:
-    """What can be reached is stopped; the rest is told to stop until it has."""
+    """Each reachable instance is stopped; stop orders to the other one repeat until its end."""
     cluster = two_hosts()
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
@@ -276,7 +276,7 @@ def test_one_that_is_stuck_can_be_cancelled() -> None:
 
 
 def test_one_that_is_stuck_does_not_keep_others_from_moving() -> None:
-    """It does not count towards the most moves at a time."""
+    """A stuck move does not count against `max_migrations`."""
     cluster = two_hosts(max_migrations=1)
     cluster.machines["a"].stubborn.add("p")
     cluster.submit(movable("q"))
@@ -290,7 +290,7 @@ def test_one_that_is_stuck_does_not_keep_others_from_moving() -> None:
 
 
 def test_a_destination_host_that_is_lost_on_the_way_leaves_the_source_running() -> None:
-    """The move is undone; what runs on the lost host is fenced when that is heard."""
+    """The move is undone; the instance on the lost host is fenced after the rejoin."""
     cluster = two_hosts()
     cluster.migrate("p")
     cluster.machines["b"].connected = False
@@ -302,7 +302,7 @@ def test_a_destination_host_that_is_lost_on_the_way_leaves_the_source_running() 
 
 
 def test_a_source_host_that_leaves_during_the_move() -> None:
-    """The move turns back and the process is queued: it ends up running once."""
+    """The move is undone and the process queued: in the end it runs once."""
     cluster = two_hosts()
     cluster.migrate("p")
     cluster.leave(cluster.machines["a"])
@@ -311,11 +311,11 @@ def test_a_source_host_that_leaves_during_the_move() -> None:
     assert cluster.phase("p") == "running"
 
 
-# --- strange strategies -----------------------------------------------------------------------
+# --- unsound strategies -----------------------------------------------------------------------
 
 
 class Strange:
-    """Proposes what a test says."""
+    """Strategy that proposes the plan of a test."""
 
     def __init__(self, make: Any) -> None:
         self.make = make
@@ -361,7 +361,7 @@ DELAY: Any = {"delay": "1s"}
 
 
 def with_step(kind: Any, **fields: Any) -> Any:
-    """Propose a sound plan with one more step before the commit."""
+    """Return a strategy that adds one step before the commit to a sound plan."""
 
     def propose(move: Move) -> Plan:
         start = Start(move.destination, move.destination_host, 1.0)
@@ -396,7 +396,7 @@ def none_at_all(move: Move) -> Any:
     ],
 )
 def test_a_strategy_that_raises_or_proposes_nonsense_moves_nothing(make: Any, said: str) -> None:
-    """It is named, and the process runs on."""
+    """The reply names the strategy, and the process keeps running."""
     cluster = Cluster(
         "a", Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(make)}
     )
@@ -413,7 +413,10 @@ def test_a_strategy_that_raises_or_proposes_nonsense_moves_nothing(make: Any, sa
 
 
 def test_a_strategy_that_cannot_move_a_process_does_not_fail() -> None:
-    """`ValueError` is its answer by the contract: the reply has the reason, no plugin fails."""
+    """By contract a `ValueError` is a refusal.
+
+    The reply has its reason, and no failure is recorded.
+    """
 
     def declines(move: Move) -> Plan:
         raise ValueError("not on a Sunday")
@@ -425,7 +428,7 @@ def test_a_strategy_that_cannot_move_a_process_does_not_fail() -> None:
 
 
 def waits_first(move: Move) -> Plan:
-    """Runs an executor on both hosts, then stops first."""
+    """Propose a plan that runs an executor on both hosts and then stops first."""
     plan = StartFirstOrStopFirst().propose(replace(move, spec=movable("p", overlap=False)))
     wait = Execute("sleepy.wait", move.source_host, {}, 5.0)
     there = replace(wait, host=move.destination_host)
@@ -433,7 +436,7 @@ def waits_first(move: Move) -> Plan:
 
 
 def sleepy(*executors: str) -> Cluster:
-    """A strategy whose offer has an executor; of two hosts only `a` has it, too."""
+    """Return a cluster whose strategy has an executor; of two hosts only `a` has it."""
     machines = [Machine("a"), Machine("b", busy={"memory": 0.5})]
     machines[0].executors["sleepy.wait"] = lambda arguments: {}
     cluster = Cluster(
@@ -447,7 +450,10 @@ def sleepy(*executors: str) -> Cluster:
 
 
 def test_a_plan_is_refused_before_its_first_step_where_a_host_lacks_an_executor() -> None:
-    """By its undo too. Nothing was stopped, and the reply names what to install on which host."""
+    """The check includes the undo steps.
+
+    Nothing was stopped, and the reply names the package to install.
+    """
     cluster = sleepy("sleepy.wait")
     orders = sum(isinstance(one, Order) for one in cluster.carried)
     reply = cluster.migrate("p")
@@ -462,7 +468,7 @@ def test_a_plan_is_refused_before_its_first_step_where_a_host_lacks_an_executor(
 
 
 def test_a_move_goes_to_the_next_host_where_the_best_lacks_an_executor() -> None:
-    """Only a host that was asked for by name is not replaced by another."""
+    """A host that was requested by name is not replaced by another one."""
     cluster = sleepy("sleepy.wait")
     assert not cluster.migrate("p", "b").accepted
     cluster.add(Machine("c", busy={"memory": 0.55}))
@@ -471,7 +477,7 @@ def test_a_move_goes_to_the_next_host_where_the_best_lacks_an_executor() -> None
 
 
 def test_a_host_that_lacks_an_executor_as_its_plugin_is_broken_says_so() -> None:
-    """To install what is installed there would not help; `rosrm explain` shows the refusal, too."""
+    """To install it again would not help; `rosrm explain` shows the refusal, too."""
     cluster = sleepy("sleepy.wait")
     machine = cluster.machines["b"]
     machine.batches += 1
@@ -491,7 +497,7 @@ def test_a_host_that_lacks_an_executor_as_its_plugin_is_broken_says_so() -> None
 
 
 def test_hosts_that_lack_an_executor_are_named_together() -> None:
-    """As one reason with one advice."""
+    """Hosts with the same reason share one reason and one advice."""
     cluster = sleepy("sleepy.wait")
     cluster.add(Machine("c", busy={"memory": 0.55}))
     assert cluster.migrate("p").message == (
@@ -501,7 +507,7 @@ def test_hosts_that_lack_an_executor_are_named_together() -> None:
 
 
 def test_a_plan_that_names_an_executor_that_its_offer_lacks_is_unsound() -> None:
-    """A misspelt one is found when the plan is checked, whatever the hosts have."""
+    """The plan check finds a misspelt executor, whatever the hosts have."""
     reply = sleepy("sleepy.wiat").migrate("p")
     assert not reply.accepted
     assert (
@@ -511,7 +517,7 @@ def test_a_plan_that_names_an_executor_that_its_offer_lacks_is_unsound() -> None
 
 
 def test_a_move_brings_the_options_of_its_process() -> None:
-    """As the offer declares them; options that it does not take are refused at submission."""
+    """The plan gets the options declared by the offer; unknown ones are refused at submission."""
     moves = []
 
     def propose(move: Move) -> Plan:
@@ -537,7 +543,7 @@ def test_a_move_brings_the_options_of_its_process() -> None:
 
 
 def test_options_that_raise_cost_one_submission() -> None:
-    """An options class is code of a third party: what it raises is a failure of the plugin."""
+    """An options class is third-party code: its exceptions are a failure of the plugin."""
 
     def options_of(strategy: str, spec: ProcessSpec) -> None:
         raise KeyError("speed")
@@ -552,7 +558,7 @@ def test_options_that_raise_cost_one_submission() -> None:
 
 
 def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
-    """What it started and does not own the name is stopped; nothing else is started meanwhile."""
+    """Started instances that do not own the name are stopped before anything else is started."""
 
     def careless(move: Move) -> Plan:
         return Plan(
@@ -573,7 +579,7 @@ def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
 
 
 def test_a_same_name_start_waits_where_no_overlap_is_declared() -> None:
-    """A plan that would run two under one name is kept from it, and undone."""
+    """A plan that would run two instances under one name waits, and is undone."""
 
     def overlapping(move: Move) -> Plan:
         stop = Stop(move.destination, move.destination_host, 5.0)
@@ -591,7 +597,7 @@ def test_a_same_name_start_waits_where_no_overlap_is_declared() -> None:
 
 
 def noted(calls: list[Any]) -> Any:
-    """An executor that notes its arguments."""
+    """Return an executor that records its arguments."""
 
     def execute(arguments: Any) -> dict[str, Any]:
         calls.append(arguments)
@@ -615,7 +621,7 @@ def executing(move: Move) -> Plan:
 
 
 def test_an_executor_does_the_open_step_on_its_host() -> None:
-    """With the arguments of the plan; a shadow under an alias may run beside the source."""
+    """The executor gets the plan's arguments; a shadow under an alias may run beside the source."""
     done: list[Any] = []
     cluster = Cluster(
         Machine("a", executors={"dump": noted(done), "sweep": noted(done)}),
@@ -628,7 +634,7 @@ def test_an_executor_does_the_open_step_on_its_host() -> None:
 
 
 def test_an_executor_is_asked_again_when_its_slave_was_started_again() -> None:
-    """Nobody waits for the answer of the former run, which ended with it."""
+    """The former run's answer cannot arrive, so the master sends the order to the new run."""
     done: list[Any] = []
     cluster = Cluster(
         Machine("a", executors={"dump": noted(done), "sweep": noted(done)}),
@@ -649,7 +655,7 @@ def test_an_executor_is_asked_again_when_its_slave_was_started_again() -> None:
 
 
 def test_an_executor_on_a_lost_host_is_not_waited_for() -> None:
-    """Its time-out may be long, and the source stand still: it turns back when the host is lost."""
+    """The plan is undone when the host is lost. The source may be frozen during a long time-out."""
 
     def fetching(move: Move) -> Plan:
         undo = Execute("go_on", move.source_host, {}, 5.0)
@@ -679,7 +685,7 @@ def test_an_executor_on_a_lost_host_is_not_waited_for() -> None:
 
 
 def test_a_new_instance_that_is_to_settle_runs_beside_the_old_one() -> None:
-    """The others have to find it."""
+    """Its peers need the overlap to discover the new instance."""
 
     def settling(move: Move) -> Plan:
         return Plan(
@@ -704,7 +710,7 @@ def test_a_new_instance_that_is_to_settle_runs_beside_the_old_one() -> None:
 
 
 def test_an_executor_that_fails_is_undone() -> None:
-    """With the undo of its own step."""
+    """The plan runs the undo of the executor's own step."""
     swept: list[Any] = []
 
     def fails(arguments: Any) -> None:
@@ -722,11 +728,11 @@ def test_an_executor_that_fails_is_undone() -> None:
 
 
 def bad_executor(arguments: Any) -> None:
-    """Forgets `return {}`."""
+    """Return None, as an executor does that lacks `return {}`."""
 
 
 def test_an_executor_that_answers_nothing_is_undone_also_by_one_that_answers_nothing() -> None:
-    """The undo ran to its end: asked again it would answer so for ever, and the move never end."""
+    """The undo is not retried. The executor would return nothing each time and block the move."""
     cluster = Cluster(
         Machine("a", executors={"dump": bad_executor, "sweep": bad_executor}),
         Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
@@ -739,7 +745,7 @@ def test_an_executor_that_answers_nothing_is_undone_also_by_one_that_answers_not
 
 
 def test_a_journalled_step_that_answers_nothing_is_undone_by_the_next_master() -> None:
-    """The step in hand is given once more, fails, and the source is what remains."""
+    """The step is ordered once more, fails, and the source remains."""
     cluster = Cluster(
         Machine("a", executors={"dump": bad_executor, "sweep": bad_executor}),
         Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
@@ -754,7 +760,7 @@ def test_a_journalled_step_that_answers_nothing_is_undone_by_the_next_master() -
 
 
 def test_an_executor_that_answers_nothing_after_the_commit_does_not_hold_the_plan_up() -> None:
-    """There is no way back: the plan goes to its end, and the failure is recorded."""
+    """After the commit there is no undo: the plan is completed, and the failure is recorded."""
 
     def late(move: Move) -> Plan:
         return Plan(
@@ -778,7 +784,7 @@ def test_an_executor_that_answers_nothing_after_the_commit_does_not_hold_the_pla
 
 
 def test_a_lost_order_is_given_again() -> None:
-    """Starts and stops may be given twice without harm."""
+    """A repeated start or stop order has no effect."""
     cluster = two_hosts(order_retry=2.0)
     cluster.carry_out(cluster.decide(happened.MigrationRequested(9, "p")))
     cluster.machines["b"].ordered.clear()
@@ -788,7 +794,7 @@ def test_a_lost_order_is_given_again() -> None:
 
 
 def test_the_shipped_shape_of_relaunch_keeps_to_its_declared_overlap() -> None:
-    """Stop-first declares none, start-first a bound."""
+    """A stop-first plan declares no overlap, a start-first plan a bounded one."""
     move = Move(movable("p"), _id(1), "a", _id(2), "b", _id(3), 0, "p")
     assert StartFirstOrStopFirst().propose(move).overlap > 0.0
 
@@ -798,7 +804,7 @@ def _id(number: int) -> Any:
 
 
 def test_how_the_destination_ended_is_known_after_a_restart_of_the_master() -> None:
-    """It was ended by a signal while the source did not stop: that is no success."""
+    """The destination ended by a signal while the source did not stop: the process has failed."""
     cluster = two_hosts()
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")

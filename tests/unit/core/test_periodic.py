@@ -1,4 +1,4 @@
-"""Periodic checkpoints in the core: who is asked for one, when, and what follows."""
+"""Periodic checkpoints in the core: eligible processes, pace, failures and removal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.unit.core.machine import Machine
 
 
 class Pacing:
-    """A checkpoint policy that does as it is told, and remembers what it was asked."""
+    """Checkpoint policy that returns a set answer and records its questions."""
 
     def __init__(self) -> None:
         self.answer: Any = None
@@ -37,7 +37,7 @@ class Pacing:
 
 
 class Host:
-    """A machine on which CRIU works; it remembers when it was asked for what."""
+    """Simulated host on which CRIU works; records its executor calls."""
 
     def __init__(self, name: str = "a") -> None:
         self.dumps: list[Mapping[str, Any]] = []
@@ -69,7 +69,7 @@ def portable(every: Any = 10.0, **fields: Any) -> ProcessSpec:
 
 
 def running(policy: Any, *hosts: Host, spec: ProcessSpec | None = None) -> Cluster:
-    """A portable node that has run for a second."""
+    """Return a cluster with a portable node that has run for a second."""
     machines = [host.machine for host in hosts]
     cluster = Cluster(*machines, strategies={"criu": Criu(CriuOptions())})
     cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "pacing"
@@ -80,7 +80,7 @@ def running(policy: Any, *hosts: Host, spec: ProcessSpec | None = None) -> Clust
 
 
 def test_it_is_asked_for_at_the_pace_that_the_process_wants():
-    """The first after one period, each for an absence of its own."""
+    """The first image follows after one period; each image has its own attempt number."""
     host = Host()
     cluster = running(Pacing(), host)
     cluster.wait(8.0)
@@ -92,7 +92,7 @@ def test_it_is_asked_for_at_the_pace_that_the_process_wants():
 
 
 def test_the_policy_hears_what_the_last_one_cost():
-    """And may have longer pauses."""
+    """The policy may then choose longer pauses."""
     host, policy = Host(), Pacing()
     cluster = running(policy, host)
     cluster.wait(12.0)
@@ -107,7 +107,7 @@ def test_the_policy_hears_what_the_last_one_cost():
 
 @pytest.mark.parametrize("spec", [portable(None), portable(0.0)])
 def test_who_does_not_ask_has_none(spec):
-    """To stand still for one is not for everybody."""
+    """A periodic checkpoint freezes the process, so only processes that ask for it get one."""
     host = Host()
     cluster = running(Pacing(), host, spec=spec)
     cluster.wait(60.0)
@@ -116,7 +116,7 @@ def test_who_does_not_ask_has_none(spec):
 
 
 def test_the_first_one_is_told_and_explained():
-    """Not each one: they are many."""
+    """Later images are not recorded, because they are many."""
     host = Host()
     cluster = running(Pacing(), host)
     cluster.wait(60.0)
@@ -128,7 +128,7 @@ def test_the_first_one_is_told_and_explained():
 
 
 def test_what_fails_is_said_once_and_tried_again():
-    """And when it works again, that is said too."""
+    """The record of the next success follows, too."""
     host = Host()
     host.answer = RuntimeError("no room")
     cluster = running(Pacing(), host)
@@ -150,7 +150,7 @@ def test_what_fails_is_said_once_and_tried_again():
     ],
 )
 def test_a_policy_without_a_pace_makes_none(policy, reason):
-    """The process asks in vain, and is told why."""
+    """The record names the reason why the process gets no periodic checkpoint."""
     host = Host()
     cluster = running(policy, host)
     cluster.wait(30.0)
@@ -161,7 +161,7 @@ def test_a_policy_without_a_pace_makes_none(policy, reason):
 
 @pytest.mark.parametrize("answer", [ValueError("oops"), 0.0, -1.0, float("nan"), float("inf")])
 def test_a_policy_that_makes_no_sense_harms_nobody(answer):
-    """It is named, and the process runs on without."""
+    """The record names the policy, and the process keeps running without checkpoints."""
     host, policy = Host(), Pacing()
     policy.answer = answer
     cluster = running(policy, host)
@@ -173,7 +173,7 @@ def test_a_policy_that_makes_no_sense_harms_nobody(answer):
 
 
 def test_where_criu_does_not_work_there_are_none():
-    """With the host's own reason."""
+    """The record names the host's own reason."""
     machine = Machine("a")
     cluster = Cluster(machine, strategies={"criu": Criu(CriuOptions())})
     cluster.state.keeping.policy = Pacing()
@@ -184,7 +184,7 @@ def test_where_criu_does_not_work_there_are_none():
 
 
 def test_none_while_it_moves_is_stopped_or_unheard():
-    """Who is at work on it is not disturbed."""
+    """A checkpoint would disturb a plan, a stop or a process on a host without contact."""
     host = Host()
     cluster = running(Pacing(), host)
     host.machine.connected = False
@@ -193,7 +193,7 @@ def test_none_while_it_moves_is_stopped_or_unheard():
 
 
 def test_the_images_of_an_instance_go_with_it():
-    """As soon as it has ended, its host is asked to look."""
+    """Once the instance has ended, its host is ordered to remove its images."""
     host = Host()
     cluster = running(Pacing(), host)
     cluster.wait(12.0)
@@ -205,7 +205,7 @@ def test_the_images_of_an_instance_go_with_it():
 
 
 class Unsound(Criu):
-    """Proposes a step that a test has changed."""
+    """Strategy that proposes a step changed by a test."""
 
     fields: Mapping[str, Any] = {}
 
@@ -221,7 +221,7 @@ class Unsound(Criu):
     ],
 )
 def test_a_step_with_a_field_of_a_wrong_type_is_not_ordered(fields, reason):
-    """The strategy is named; an order with that field would end the master."""
+    """The record names the strategy; an order with that field would end the master."""
     host, strategy = Host(), Unsound(CriuOptions())
     strategy.fields = fields
     cluster = Cluster(host.machine, strategies={"criu": strategy})
@@ -234,7 +234,7 @@ def test_a_step_with_a_field_of_a_wrong_type_is_not_ordered(fields, reason):
 
 
 def late(plugin: tuple[str, str], call: Any) -> Any:
-    """Stand for the deadline of a plugin call that has passed, for strategies."""
+    """Stand for a plugin call of a strategy that exceeded its deadline."""
     if plugin[0] == "migration":
         raise TimeoutError("late")
     return call()
@@ -257,7 +257,7 @@ def test_a_strategy_that_fails_to_name_its_removal_is_asked_again():
 
 
 def test_a_restarted_master_goes_on():
-    """It knows of none any more, and asks for the next one."""
+    """The new master knows of no image and orders the next one."""
     host = Host()
     cluster = running(Pacing(), host)
     cluster.wait(12.0)
@@ -270,7 +270,7 @@ def test_a_restarted_master_goes_on():
 
 
 class Lossy(deque):
-    """Orders on their way, of which those for a dump get lost."""
+    """Queue of orders that loses those for a dump."""
 
     def append(self, order: Any) -> None:
         if order.executor != "criu_dump":
@@ -278,7 +278,7 @@ class Lossy(deque):
 
 
 def test_one_that_ended_with_its_slave_is_not_waited_for():
-    """The next slave is asked at the same pace, though no answer ever comes."""
+    """The next slave receives orders at the same pace, though no answer to the first arrives."""
     host = Host()
     cluster = running(Pacing(), host)
     host.machine.ordered = Lossy()
@@ -286,7 +286,7 @@ def test_one_that_ended_with_its_slave_is_not_waited_for():
     assert (host.dumps, len(cluster.orders("execute"))) == ([], 2)
     host.machine.ordered = deque()
     host.machine.connected = False
-    cluster.wait(1.5)  # else its name is still taken
+    cluster.wait(1.5)  # otherwise its name is still taken
     host.machine.connected = True
     host.machine.restart_slave(cluster.now)
     cluster.register(host.machine)

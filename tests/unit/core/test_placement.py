@@ -1,4 +1,4 @@
-"""Where the head of the queue goes."""
+"""Placement of the queue's head: score, limits, in-flight load, labels and explanation."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ def machine(name: str, memory: float = 0.1, cpu: float = 0.1, **fields: object) 
 
 
 def test_the_host_with_the_largest_margin_is_chosen() -> None:
-    """Eq. 1: the lowest weighted usage goes first."""
+    """Eq. 1 prefers the lowest weighted usage."""
     cluster = Cluster(machine("a", memory=0.5), machine("b", memory=0.2), machine("c", memory=0.3))
     cluster.submit(process("p"))
     assert cluster.where("p") == ["b"]
 
 
 def test_the_weights_of_eq_1_decide() -> None:
-    """With the whole weight on CPU, memory does not matter."""
+    """With the whole weight on CPU, memory has no effect."""
     hosts = machine("a", memory=0.1, cpu=0.5), machine("b", memory=0.5, cpu=0.1)
     cluster = Cluster(*hosts, policy=Eq1(memory=0.0, cpu=1.0))
     cluster.submit(process("p"))
@@ -37,7 +37,7 @@ def test_equal_scores_go_to_the_host_with_fewer_processes_then_to_the_first() ->
 
 
 def test_a_host_that_has_just_registered_takes_its_part_of_the_work(monkeypatch) -> None:
-    """The host whose first request comes a moment later is waited for; the reason says so."""
+    """Placement waits for the host's first request, and the reason names that wait."""
     cluster = Cluster("a")
     with monkeypatch.context() as patched:
         patched.setattr(cluster, "ask_for_work", lambda machine: None)
@@ -64,7 +64,7 @@ def test_hosts_that_register_and_never_ask_hold_up_no_work(monkeypatch) -> None:
 
 @pytest.mark.parametrize("needs", ["declared", "default", "learned"])
 def test_sixty_equal_processes_on_three_equal_hosts_end_20_20_20(needs: str) -> None:
-    """What was just assigned counts before it shows, however its needs are known."""
+    """A new assignment counts before readings show it, with declared, learned or unknown needs."""
     cluster = Cluster("a", "b", "c")
     if needs == "learned":
         cluster.machines["a"].shown["first"] = {"memory": 90 * MIB}
@@ -90,7 +90,10 @@ def test_learned_needs_stand_in_for_those_that_were_not_declared() -> None:
 
 
 def test_cpu_is_not_learned_from_a_run_too_short_to_tell() -> None:
-    """The start of `true` looks like a whole core; it must not keep its likes off small hosts."""
+    """The start of `true` looks like a whole core.
+
+    It must not exclude such processes from small hosts.
+    """
     cluster = Cluster("a")
     cluster.submit(job("first"))
     cluster.machines["a"].shown["first"] = {"cpu": 1.0, "memory": 2 * MIB}
@@ -101,7 +104,7 @@ def test_cpu_is_not_learned_from_a_run_too_short_to_tell() -> None:
 
 
 def test_a_declared_need_holds_an_estimate_is_capped() -> None:
-    """A guess fills at most half of a limit: a guess alone keeps no process off every host."""
+    """An estimate fills at most half of a limit, so that it excludes no process from every host."""
     cluster = Cluster(Machine("tiny", memory=64 * MIB, cpu=0.1))
     cluster.submit(process("guessed"))
     assert cluster.where("guessed") == ["tiny"]
@@ -110,7 +113,7 @@ def test_a_declared_need_holds_an_estimate_is_capped() -> None:
 
 
 def test_an_estimate_of_a_resource_that_a_host_has_not_counts_nothing() -> None:
-    """A host that probes memory only still takes processes whose CPU need is a guess."""
+    """A host that probes memory only still takes processes with an estimated CPU need."""
     only_memory = Machine("a", resources=(ResourceDescription("memory", "B", GIB),))
     cluster = Cluster(only_memory)
     cluster.submit(process("p"))
@@ -118,7 +121,7 @@ def test_an_estimate_of_a_resource_that_a_host_has_not_counts_nothing() -> None:
 
 
 def test_a_declared_need_of_a_resource_that_a_host_has_not_excludes_it() -> None:
-    """Who needs a GPU never goes where there is none."""
+    """A process that needs a GPU never goes to a host without one."""
     gpu = Machine(
         "g", resources=(ResourceDescription("memory", "B", GIB), ResourceDescription("gpu", "1", 1))
     )
@@ -131,14 +134,14 @@ def test_a_declared_need_of_a_resource_that_a_host_has_not_excludes_it() -> None
 
 
 def test_a_host_without_any_resource_takes_no_declared_need() -> None:
-    """Nothing is known of its room."""
+    """The free room of such a host is unknown."""
     cluster = Cluster(Machine("a", resources=(ResourceDescription("disk", "B", GIB),)))
     cluster.submit(process("p", memory=1))
     assert cluster.phase("p") == "set_aside"
 
 
 def test_nothing_is_assigned_over_a_limit() -> None:
-    """Reading + in-flight load + need stays under every limit."""
+    """Reading, in-flight load and needs together stay under every limit."""
     cluster = Cluster(Machine("a", memory=1000 * MIB, busy={"memory": 0.3}))
     cluster.submit(*[process(f"p{i}", memory=100) for i in range(9)])
     assert cluster.counts() == {"a": 5}  # 0.3 + 5 x 0.1 = 0.8
@@ -146,7 +149,7 @@ def test_nothing_is_assigned_over_a_limit() -> None:
 
 
 def test_one_more_goes_when_usage_falls() -> None:
-    """What waits is placed as soon as a reading leaves room."""
+    """The queued process is placed as soon as a reading leaves room."""
     cluster = Cluster(Machine("a", memory=1000 * MIB, busy={"memory": 0.75}))
     cluster.submit(process("p", memory=100))
     assert cluster.phase("p") == "queued"
@@ -157,7 +160,7 @@ def test_one_more_goes_when_usage_falls() -> None:
 
 
 def test_a_host_that_has_told_no_reading_yet_is_given_nothing(monkeypatch) -> None:
-    """Until the first reading its usage and its limits are not known."""
+    """Usage and limits of a host are unknown until its first reading."""
     cluster = Cluster()
     with monkeypatch.context() as silent:
         silent.setattr(cluster, "read", lambda *machines: None)
@@ -170,7 +173,7 @@ def test_a_host_that_has_told_no_reading_yet_is_given_nothing(monkeypatch) -> No
 
 
 def test_max_processes_is_the_most_that_a_host_holds() -> None:
-    """Slots are counted from the assignment to the end."""
+    """A slot is taken from the assignment to the end."""
     cluster = Cluster(Machine("a", max_processes=2), Machine("b", max_processes=1))
     cluster.submit(*[job(f"p{i}") for i in range(5)])
     assert cluster.counts() == {"a": 2, "b": 1}
@@ -189,7 +192,7 @@ def load(cluster: Cluster, host: str) -> float:
 
 
 def test_a_charge_sinks_as_usage_shows() -> None:
-    """A process is not counted twice: in flight and in the reading."""
+    """A process counts once, not both in flight and in the reading."""
     cluster = Cluster(Machine("a", memory=1000 * MIB))
     cluster.submit(process("p", memory=100))
     assert load(cluster, "a") == pytest.approx(100)
@@ -202,7 +205,7 @@ def test_a_charge_sinks_as_usage_shows() -> None:
 
 
 def test_a_charge_ends_with_its_instance() -> None:
-    """Nothing of it is left behind."""
+    """The reservation is released completely."""
     cluster = Cluster("a")
     cluster.submit(job("p", memory=100))
     cluster.machines["a"].finish("p", cluster.now)
@@ -211,7 +214,7 @@ def test_a_charge_ends_with_its_instance() -> None:
 
 
 def test_an_estimate_expires_and_a_declared_need_stays() -> None:
-    """After `settle` the readings are believed, save where somebody declared more."""
+    """After `settle` the reading replaces an estimate; a larger declared need stays reserved."""
     cluster = Cluster(Machine("a", memory=1000 * MIB), settle=10.0)
     cluster.submit(process("guessed"), process("declared", memory=100))
     assert load(cluster, "a") == pytest.approx(164)
@@ -225,7 +228,7 @@ def test_an_estimate_expires_and_a_declared_need_stays() -> None:
 
 
 def test_a_process_goes_only_where_its_required_labels_are() -> None:
-    """However full that host is beside others."""
+    """The load of the matching hosts makes no difference."""
     hosts = machine("a"), machine("b", memory=0.7, labels={"lidar": "front"})
     cluster = Cluster(*hosts)
     cluster.submit(process("driver", required_labels={"lidar": "front"}))
@@ -233,7 +236,7 @@ def test_a_process_goes_only_where_its_required_labels_are() -> None:
 
 
 def test_preferred_labels_go_before_the_margin() -> None:
-    """Among hosts that fit, those with more of the preferred labels go first."""
+    """Among hosts that fit, those with more of the preferred labels come first."""
     both = {"ssd": "yes", "fast": "yes"}
     hosts = [
         machine("a"), machine("b", memory=0.4, labels={"ssd": "yes"}),
@@ -245,7 +248,7 @@ def test_preferred_labels_go_before_the_margin() -> None:
 
 
 def test_avoided_labels_are_taken_only_when_no_other_fits() -> None:
-    """A host to be avoided is better than none."""
+    """A host with avoided labels is better than none."""
     hosts = machine("a", labels={"battery": "yes"}), machine("b", memory=0.7)
     cluster = Cluster(*hosts)
     cluster.submit(process("p", avoided_labels={"battery": "yes"}))
@@ -260,7 +263,7 @@ def test_avoided_labels_are_taken_only_when_no_other_fits() -> None:
 
 
 def test_every_placement_explains_itself() -> None:
-    """Why this host, with its score, and why not the others."""
+    """The explanation has the chosen host with its score, and a reason for each other host."""
     hosts = [
         machine("full", memory=0.79), machine("good", memory=0.2), machine("fair", memory=0.3),
         machine("closed"), machine("other", labels={"arch": "arm"}),
@@ -285,7 +288,7 @@ def test_every_placement_explains_itself() -> None:
 
 
 def test_an_explanation_is_of_its_moment() -> None:
-    """What happens afterwards does not change why it went there."""
+    """Later readings do not change the recorded decision."""
     cluster = Cluster(machine("a", memory=0.2), machine("b", memory=0.3))
     commands = cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
     (record,) = [c for c in commands if getattr(c, "kind", "") == "assigned"]
@@ -296,7 +299,7 @@ def test_an_explanation_is_of_its_moment() -> None:
 
 
 def test_of_many_hosts_the_best_are_named_and_the_rest_counted() -> None:
-    """A thousand hosts do not make a record of a thousand lines."""
+    """A record in a cluster of a thousand hosts stays short."""
     cluster = Cluster(*[machine(f"h{i}", memory=0.01 * i) for i in range(40)])
     cluster.set_host("h39", "cordon")
     cluster.submit(process("p"))
@@ -306,7 +309,7 @@ def test_of_many_hosts_the_best_are_named_and_the_rest_counted() -> None:
 
 
 def test_a_waiting_process_tells_who_is_before_it() -> None:
-    """`explain` of one in the queue names the head that it waits behind."""
+    """`explain` of a queued process names the head of the queue."""
     cluster = Cluster()
     cluster.submit(process("p"), process("q"))
     assert cluster.explain("p")["reason"] == "no host has registered yet"

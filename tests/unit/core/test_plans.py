@@ -1,4 +1,4 @@
-"""Plans in the journal: every field of every step, and nothing that is not known."""
+"""Plans in the journal: every field of every step, and refusal of unknown content."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def stored() -> Any:
 
 
 def test_a_plan_survives_the_journal() -> None:
-    """In every field."""
+    """Each field is restored."""
     assert plan_from_dict(stored()) == EVERYTHING
 
 
@@ -65,7 +65,7 @@ def test_a_plan_survives_the_journal() -> None:
     ],
 )
 def test_what_is_not_known_is_refused(path: Any, value: Any, said: str) -> None:
-    """Rather than carried out in part."""
+    """An unknown plan is refused as a whole, rather than carried out in part."""
     plain = stored()
     inner = plain
     for key in path[:-1]:
@@ -77,7 +77,7 @@ def test_what_is_not_known_is_refused(path: Any, value: Any, said: str) -> None:
 
 
 def test_what_must_be_there_is_missed() -> None:
-    """A step without its host is none."""
+    """A step without its host is refused."""
     plain = stored()
     del plain["steps"][0]["host"]
     with pytest.raises(ValueError, match="Start has no host"):

@@ -1,4 +1,4 @@
-"""The guard of plugin calls in the core: counted, recorded when the state changes, with a place."""
+"""Guard of plugin calls in the core: failures counted, located, and recorded on change."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.unit.core.cluster import Cluster, Eq1, StartFirstOrStopFirst, process
 
 
 class Moody:
-    """A scoring policy that fails while a test says so."""
+    """Scoring policy that fails on demand of a test."""
 
     def __init__(self) -> None:
         self.fails = False
@@ -31,11 +31,11 @@ class Moody:
 
 
 def submitted(cluster: Cluster, number: int) -> None:
-    cluster.submit(process(f"p{number}", memory=number))  # each has a ranking of its own
+    cluster.submit(process(f"p{number}", memory=number))  # each process has a ranking of its own
 
 
 def test_a_failing_plugin_is_recorded_once_and_again_when_it_works() -> None:
-    """Not with each failure; and it works only when nothing failed for a while."""
+    """Further failures are not recorded; the plugin works again after a while without failures."""
     policy = Moody()
     cluster = Cluster("a", policy=policy)
     policy.fails = True
@@ -53,7 +53,7 @@ def test_a_failing_plugin_is_recorded_once_and_again_when_it_works() -> None:
 
 
 def test_a_failing_plugin_is_listed_with_its_last_error_and_how_often() -> None:
-    """The reason of its row."""
+    """The reason of its row has both."""
     policy = Moody()
     cluster = Cluster("a", policy=policy)
     policy.fails = True
@@ -65,7 +65,7 @@ def test_a_failing_plugin_is_listed_with_its_last_error_and_how_often() -> None:
 
 
 def test_the_place_is_the_plugin_s_own_innermost_frame() -> None:
-    """Not the frame of a library that it called, and none of rosrm."""
+    """The place is neither a frame of a library that the plugin called nor one of rosrm."""
 
     def sorts() -> None:
         sorted([1, 2], key=lambda _: sys.intern(3))  # type: ignore[arg-type]
@@ -75,13 +75,13 @@ def test_the_place_is_the_plugin_s_own_innermost_frame() -> None:
 
 
 def test_an_error_of_rosrm_s_own_check_has_no_place() -> None:
-    """The sentence about the answer says all; there is no line to look at."""
+    """The message about the answer is sufficient; no line of code is involved."""
     with pytest.raises(PluginError, match=r"^answered None; Scores is required$"):
         PluginCalls().ask("scoring", "x", "score", lambda: required(None, Scores))
 
 
 class Wordless(Exception):
-    """An exception that fails to give its text."""
+    """Exception whose text raises, too."""
 
     def __str__(self) -> str:
         raise RuntimeError("no words")
@@ -91,7 +91,7 @@ class Wordless(Exception):
     "fault", [SystemExit(3), GeneratorExit(), ZeroDivisionError(), Wordless()], ids=repr
 )
 def test_nothing_that_a_plugin_raises_ends_its_caller(fault: BaseException) -> None:
-    """Also what `except Exception` lets pass."""
+    """The guard catches exceptions that `except Exception` lets pass, too."""
 
     def call() -> Any:
         raise fault
@@ -101,7 +101,7 @@ def test_nothing_that_a_plugin_raises_ends_its_caller(fault: BaseException) -> N
 
 
 def test_ctrl_c_passes_the_guard() -> None:
-    """A simulation ends by it; a master's own handler raises nothing."""
+    """Ctrl-C ends a simulation; a master's own handler raises nothing."""
 
     def call() -> Any:
         raise KeyboardInterrupt
@@ -111,7 +111,7 @@ def test_ctrl_c_passes_the_guard() -> None:
 
 
 def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
-    """Every report of a slave is complete: what is missing in the next one works again."""
+    """A slave reports all failing probes, so a probe missing in the next report works again."""
     cluster = Cluster("a")
     for failing in ({"lidar": "no such sensor"}, {"lidar": "no such sensor"}, {}):
         fails_there(cluster, failing)
@@ -120,7 +120,7 @@ def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
 
 
 def test_a_strategy_whose_executors_fail_is_recorded_with_its_host() -> None:
-    """The slave that runs them reports it."""
+    """The slave that runs the executors reports the failures."""
     cluster = Cluster("a")
     for failing in ({"acme": "executor rest raised OSError: no arm"}, {}):
         fails_there(cluster, {}, failing)
@@ -130,7 +130,7 @@ def test_a_strategy_whose_executors_fail_is_recorded_with_its_host() -> None:
 
 
 def fails_there(cluster: Cluster, *failing: dict[str, str]) -> None:
-    """Let the slave of `a` report the probes and the strategies that fail there."""
+    """Let the slave of `a` report its failing probes and strategies."""
     machine = cluster.machines["a"]
     machine.batches += 1
     cluster.tell(
@@ -152,7 +152,7 @@ def test_another_error_of_a_failing_plugin_is_recorded_once_a_minute() -> None:
     assert cluster.told("plugin_failed") == [f"{said}unplugged", f"{said}too cold"]
 
 
-#: Of a strategy whose processes ask for periodic checkpoints.
+#: Capability of a strategy whose processes ask for periodic checkpoints.
 PERIODIC = {
     "checkpoint_every": lambda *_: 10.0, "periodic": lambda *_: None, "discard": "sweep",
 }  # fmt: skip
@@ -168,7 +168,7 @@ def leave(_plugin: object) -> Any:
      "checkpoint_every periodic discard", "pace"],
 )  # fmt: skip
 def test_a_property_of_a_plugin_that_raises_costs_one_decision(members: str) -> None:
-    """A look for what a plugin can do runs no code of the plugin outside the guard."""
+    """The core looks up the members of a plugin inside the guard only."""
     raising = {name: property(leave) for name in members.split()}
     strategy = type("Strategy", (StartFirstOrStopFirst,), dict(PERIODIC | raising))()
     cluster = Cluster("a", "b", strategies={"criu": strategy})

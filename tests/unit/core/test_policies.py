@@ -1,4 +1,4 @@
-"""Scoring policies of third parties: used as they say, left out and named where they are broken."""
+"""Third-party scoring policies: their scores apply; broken policies are skipped and named."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.unit.core.cluster import Cluster, Eq1, Machine, node, process
 
 
 class Policy:
-    """Scores as a test says."""
+    """Scoring policy that calls a function of a test."""
 
     def __init__(self, make: Any) -> None:
         self.make = make
@@ -67,7 +67,7 @@ def veto_in_words(hosts: HostView, process: ProcessView) -> Scores:
 
 
 def by_name(hosts: HostView, process: ProcessView) -> Scores:
-    """Groups of processes by the beginning of their name, each on a host of its own."""
+    """Score processes so that each group, by the beginning of the name, has its own host."""
     group = process.spec.name.split("_")[0]
     return Scores(np.array([float(name != group) for name in hosts.names]))
 
@@ -110,7 +110,7 @@ def three(**fields: Any) -> Cluster:
 
 @pytest.mark.parametrize(("make", "said"), BROKEN)
 def test_a_broken_policy_is_left_out_and_named(make: Any, said: str) -> None:
-    """Any host that fits takes the process, and the decision says why it was so."""
+    """Any host that fits takes the process, and the decision names the failure."""
     cluster = three(policy=Policy(make))
     cluster.submit(process("p"))
     assert cluster.where("p") == ["a"]
@@ -124,7 +124,7 @@ def test_a_broken_policy_is_left_out_and_named(make: Any, said: str) -> None:
 
 @pytest.mark.parametrize(("make", "said"), BROKEN)
 def test_a_fallback_decides_where_the_policy_is_broken(make: Any, said: str) -> None:
-    """Both are named."""
+    """The decision names the policy and the fallback."""
     cluster = three(policy=Policy(make), fallback=("weighted", Eq1()))
     cluster.submit(process("p"))
     assert cluster.where("p") == ["b"]
@@ -134,7 +134,7 @@ def test_a_fallback_decides_where_the_policy_is_broken(make: Any, said: str) -> 
 
 
 def test_a_policy_that_breaks_on_one_host_is_left_out_for_all() -> None:
-    """Scores of two policies do not compare: all hosts are judged anew."""
+    """Scores of two policies do not compare, so the fallback scores all hosts."""
 
     def breaks_when_loaded(hosts: HostView, process: ProcessView) -> Scores:
         if (hosts.processes > 0).any():
@@ -147,7 +147,7 @@ def test_a_policy_that_breaks_on_one_host_is_left_out_for_all() -> None:
 
 
 def test_a_policy_is_asked_again_with_the_next_reading() -> None:
-    """It is left out of a decision, not for ever."""
+    """A failure skips the policy for one decision only."""
     broken = [True]
 
     def recovers(hosts: HostView, process: ProcessView) -> Scores:
@@ -165,7 +165,7 @@ def test_a_policy_is_asked_again_with_the_next_reading() -> None:
 
 
 def test_a_vetoed_host_takes_nothing() -> None:
-    """With the policy's reason."""
+    """The explanation has the policy's reason."""
 
     def not_b(hosts: HostView, process: ProcessView) -> Scores:
         veto = np.array([name == "b" for name in hosts.names])
@@ -179,7 +179,7 @@ def test_a_vetoed_host_takes_nothing() -> None:
 
 
 def test_a_process_that_is_vetoed_everywhere_does_not_wait_for_room() -> None:
-    """The reason why it waits is true of a veto as well as of a full host."""
+    """The reason names the veto as well as the full hosts."""
 
     def nowhere(hosts: HostView, process: ProcessView) -> Scores:
         return Scores(hosts.column("memory"), np.ones(len(hosts.names), np.bool_))
@@ -190,7 +190,7 @@ def test_a_process_that_is_vetoed_everywhere_does_not_wait_for_room() -> None:
 
 
 def test_a_score_of_a_host_that_does_not_fit_may_be_anything() -> None:
-    """NaN where a host has no such resource harms nobody who is not asked."""
+    """A NaN score of a host that lacks the resource is ignored."""
 
     def by_gpu(hosts: HostView, process: ProcessView) -> Scores:
         return Scores(hosts.usage[:, hosts.resources.index("gpu")])
@@ -207,7 +207,7 @@ def test_a_score_of_a_host_that_does_not_fit_may_be_anything() -> None:
 
 
 def test_a_reason_that_raises_harms_no_decision() -> None:
-    """It is told in its place."""
+    """The error replaces the reason."""
 
     def shy(hosts: HostView, process: ProcessView) -> Scores:
         return Scores(hosts.column("memory"), reason=lambda row: f"{1 / 0}")
@@ -221,7 +221,7 @@ def test_a_reason_that_raises_harms_no_decision() -> None:
 
 @pytest.mark.parametrize("batched", [True, False])
 def test_a_policy_judges_the_process_that_it_is_asked_about(*, batched: bool) -> None:
-    """By a field that its offer declares, in one submission as in many."""
+    """The policy reads a field that its offer declares, for one process and for batches."""
     cluster = three(policy=Policy(by_name), declared=Declared(reads=("name",)))
     specs = [process(f"{group}_{n}") for n in range(2) for group in "cab"]
     for batch in [specs] if batched else [[spec] for spec in specs]:
@@ -232,7 +232,7 @@ def test_a_policy_judges_the_process_that_it_is_asked_about(*, batched: bool) ->
 
 
 def test_values_that_are_equal_and_not_alike_are_told_apart() -> None:
-    """1, 1.0 and True: what is declared is compared as it is written."""
+    """1, 1.0 and True: declared values are compared as written."""
     seen = []
 
     def look(hosts: HostView, process: ProcessView) -> Scores:
@@ -245,14 +245,14 @@ def test_values_that_are_equal_and_not_alike_are_told_apart() -> None:
 
 
 def test_processes_that_differ_in_nothing_that_is_read_share_a_ranking() -> None:
-    """A queue of equal processes is judged once, as ever."""
+    """Equal processes in the queue are scored once."""
     cluster = three()
     cluster.submit(*(process(f"p{n}") for n in range(5)))
     assert len(cluster.state.demands) == 1
 
 
 def test_a_policy_may_read_what_decides_where_a_process_may_go() -> None:
-    """Without a declaration: what runs, namespace, kind, priority, needs and labels."""
+    """Program, namespace, kind, priority, needs and labels need no declaration."""
     read: dict[str, object] = {}
 
     def look(hosts: HostView, process: ProcessView) -> Scores:
@@ -268,7 +268,7 @@ def test_a_policy_may_read_what_decides_where_a_process_may_go() -> None:
 
 
 def test_a_policy_sees_the_labels_of_hosts() -> None:
-    """Those that they registered with, row by row; it cannot change them."""
+    """The labels are those of the registration, row by row, and read-only."""
     policy = Policy(
         lambda hosts, process: Scores(
             np.array([float(labels.get("rack") != "2") for labels in hosts.labels])
@@ -282,7 +282,7 @@ def test_a_policy_sees_the_labels_of_hosts() -> None:
 
 
 def test_a_column_is_zero_or_what_is_said_where_a_host_has_no_such_resource() -> None:
-    """So a policy that weighs the GPU decides on a cluster in which some have none."""
+    """A policy that weighs the GPU also works in a cluster where some hosts have none."""
     memory, gpu = ResourceDescription("memory", "B", 1e9), ResourceDescription("gpu", "1", 1.0)
     policy = Policy(lambda hosts, process: Scores(hosts.column("gpu", missing=0.5)))
     cluster = Cluster(
@@ -296,7 +296,7 @@ def test_a_column_is_zero_or_what_is_said_where_a_host_has_no_such_resource() ->
 
 
 def test_a_nan_of_a_host_that_does_not_measure_is_explained() -> None:
-    """The message says where it comes from, and which call has none."""
+    """The message names the cause of the NaN and the call that avoids it."""
     memory, gpu = ResourceDescription("memory", "B", 1e9), ResourceDescription("gpu", "1", 1.0)
     policy = Policy(lambda hosts, process: Scores(hosts.usage.sum(axis=1)))
     cluster = Cluster(
@@ -308,7 +308,7 @@ def test_a_nan_of_a_host_that_does_not_measure_is_explained() -> None:
 
 
 def test_a_policy_sees_nan_where_a_host_has_no_such_resource() -> None:
-    """As `HostView` says: usage and capacity NaN, limit 1."""
+    """Usage and capacity are NaN and the limit is 1, as `HostView` documents."""
     memory, gpu = ResourceDescription("memory", "B", 1e9), ResourceDescription("gpu", "1", 1.0)
     policy = Policy(lambda hosts, process: Scores(hosts.column("memory")))
     cluster = Cluster(

@@ -1,4 +1,4 @@
-"""Ended processes and departed hosts are removed from the listings."""
+"""Removal of ended processes and departed hosts from the listings."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ def prune(cluster: Cluster, *names: str, hosts: tuple[str, ...] = ()) -> Reply:
 
 
 def seen(cluster: Cluster) -> tuple[list[str], list[str]]:
-    """Names of the processes and hosts that are listed."""
+    """Return the names of the listed processes and hosts."""
     processes = listing.process_rows(cluster.state, cluster.now)
     hosts = listing.host_rows(cluster.state, cluster.now)
     return [row.name for row in processes], [row.description.name for row in hosts]
 
 
 def of_two_hosts() -> Cluster:
-    """Host b has left; of three processes one has finished, one was cancelled, one runs."""
+    """Return a cluster: host b has left; one process finished, one was cancelled, one runs."""
     cluster = Cluster("a")
     cluster.submit(job("done"), process("gone"), process("live"))
     cluster.machines["a"].finish("done", cluster.now)
@@ -34,7 +34,7 @@ def of_two_hosts() -> Cluster:
 
 
 def test_without_names_all_that_ended_and_all_hosts_that_left_are_removed() -> None:
-    """From the journal too."""
+    """They are removed from the journal, too."""
     cluster = of_two_hosts()
     assert prune(cluster).message == "2 processes and 1 host removed"
     assert seen(cluster) == (["live"], ["a"])
@@ -48,7 +48,7 @@ def test_without_names_all_that_ended_and_all_hosts_that_left_are_removed() -> N
 
 
 def test_a_process_that_every_listed_host_refused_fails() -> None:
-    """A pruned host is no host that may still take it."""
+    """A pruned host no longer counts as a possible host."""
     cluster = of_two_hosts()
     prune(cluster)
     cluster.machines["a"].refuses["next"] = "no such package"
@@ -58,7 +58,7 @@ def test_a_process_that_every_listed_host_refused_fails() -> None:
 
 
 def test_a_pruned_host_that_registers_is_listed_and_given_work() -> None:
-    """As a new one; a master that was restarted knows it."""
+    """The host is listed as a new one, by a restarted master, too."""
     cluster = of_two_hosts()
     prune(cluster)
     assert "no such host: 'b'; there are: a" in cluster.set_host("b", "cordon").message
@@ -73,7 +73,7 @@ def test_a_pruned_host_that_registers_is_listed_and_given_work() -> None:
 
 
 def test_a_pruned_host_registers_as_a_new_host() -> None:
-    """Open for work, though it was cordoned and draining; nothing is recorded about it before."""
+    """The new host is open for work, though the old one was cordoned and draining."""
     cluster = of_two_hosts()
     cluster.set_host("b", "cordon")
     cluster.set_host("b", "drain")
@@ -95,7 +95,7 @@ def test_a_pruned_host_registers_as_a_new_host() -> None:
 
 
 def test_no_reason_names_a_pruned_host() -> None:
-    """The reasons are right with another host in the listing, and without any."""
+    """Reasons are correct with another host in the listing, and without any."""
     cluster = of_two_hosts()
     prune(cluster, hosts=("b",))
     cluster.set_host("a", "cordon")
@@ -112,7 +112,7 @@ def test_no_reason_names_a_pruned_host() -> None:
 
 
 def test_a_pruned_host_is_not_among_the_hosts_of_a_decision_about_many() -> None:
-    """Neither by name nor in the number of those that are left out."""
+    """The host is neither named nor counted among the hosts left out."""
     cluster = Cluster(*(f"h{number}" for number in range(20)))
     for number in range(18):
         cluster.set_host(f"h{number}", "cordon")
@@ -127,7 +127,7 @@ def test_a_pruned_host_is_not_among_the_hosts_of_a_decision_about_many() -> None
 
 
 def test_what_has_not_ended_or_left_is_refused_and_nothing_is_removed() -> None:
-    """By name, of processes and hosts."""
+    """The refusal names such processes and hosts."""
     cluster = of_two_hosts()
     refused = prune(cluster, "done", "live")
     assert refused.message == "live is running; cancel it first. Nothing was removed"
@@ -138,7 +138,7 @@ def test_what_has_not_ended_or_left_is_refused_and_nothing_is_removed() -> None:
 
 
 def test_a_suspect_host_is_refused_as_suspect() -> None:
-    """With its silence and the time after which it is lost; then it is pruned."""
+    """The refusal names its silence and the time of its loss; after the loss it is pruned."""
     cluster = Cluster("a")
     cluster.machines["a"].connected = False
     cluster.wait(3.0)
@@ -152,7 +152,7 @@ def test_a_suspect_host_is_refused_as_suspect() -> None:
 
 
 def test_a_host_that_leaves_is_pruned_once_its_processes_have_ended() -> None:
-    """Its slave still stops them; the user has to wait, and need not cancel."""
+    """Its slave still stops the processes; the user has to wait, and need not cancel."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     machine = cluster.machines["a"]
@@ -163,7 +163,7 @@ def test_a_host_that_leaves_is_pruned_once_its_processes_have_ended() -> None:
 
 
 def test_a_lost_host_is_pruned_once_all_that_it_may_run_was_cancelled() -> None:
-    """Then they are cancelled; if the host returns after all, they are stopped there."""
+    """The processes are then cancelled; if the host returns, they are stopped there."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.machines["a"].connected = False
@@ -186,7 +186,7 @@ def test_a_lost_host_is_pruned_once_all_that_it_may_run_was_cancelled() -> None:
 
 
 def test_every_process_that_a_host_may_still_run_is_named() -> None:
-    """Both in the refusal and in the answer; a detached host goes on running what was cancelled."""
+    """Refusal and reply name each process, because a detached host keeps running cancelled ones."""
     cluster = Cluster("a")
     cluster.submit(process("p"), process("q"))
     cluster.detach(cluster.machines["a"])

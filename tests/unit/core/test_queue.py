@@ -1,4 +1,4 @@
-"""First in, first out, within a priority; who waits, who is set aside, and who comes back."""
+"""Queue order: FIFO within a priority, waiting, set-aside processes, and return to the queue."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def make_room(cluster: Cluster, memory: float = 0.1) -> None:
 
 
 def test_those_who_wait_go_in_the_order_in_which_they_came() -> None:
-    """FIFO over several submissions."""
+    """FIFO order holds over several submissions."""
     cluster = Cluster(full())
     cluster.submit(process("p", memory=20), process("q", memory=20))
     cluster.submit(process("r", memory=20))
@@ -37,7 +37,7 @@ def test_a_higher_priority_goes_first_and_fifo_holds_within_one() -> None:
 
 
 def test_the_head_blocks_those_behind_it() -> None:
-    """Who waits for room is not passed by a smaller one."""
+    """No smaller process passes a process that waits for room."""
     cluster = Cluster(Machine("a", memory=1000 * MIB))
     cluster.submit(process("filler", memory=400))
     cluster.submit(process("large", memory=600), process("small", memory=10))
@@ -46,7 +46,7 @@ def test_the_head_blocks_those_behind_it() -> None:
 
 
 def test_with_backfill_those_behind_may_pass() -> None:
-    """The large one keeps its place; equal ones still go in order."""
+    """The large process keeps its place; equal ones still go in order."""
     cluster = Cluster(Machine("a", memory=1000 * MIB), backfill=True)
     cluster.submit(process("filler", memory=400))
     cluster.submit(
@@ -58,7 +58,7 @@ def test_with_backfill_those_behind_may_pass() -> None:
 
 
 def test_that_somebody_waits_is_said_once() -> None:
-    """Two demands that wait under backfill do not fill the record by turns."""
+    """Two demands that wait under backfill do not alternate in the record."""
     cluster = Cluster(full(), backfill=True)
     cluster.submit(process("p", memory=100), process("q", memory=50))
     cluster.wait(3.0)
@@ -66,7 +66,7 @@ def test_that_somebody_waits_is_said_once() -> None:
 
 
 def test_who_may_never_run_is_set_aside_and_lets_the_others_pass() -> None:
-    """With the reason, which is said once for all hosts that it holds for."""
+    """The reason lists hosts with the same reason together."""
     cluster = Cluster("a", Machine("b", labels={"gpu": "old"}))
     cluster.submit(process("p", required_labels={"gpu": "new"}), process("q"))
     assert cluster.phase("p") == "set_aside"
@@ -75,7 +75,7 @@ def test_who_may_never_run_is_set_aside_and_lets_the_others_pass() -> None:
 
 
 def test_who_is_too_large_for_every_host_is_set_aside() -> None:
-    """Not even an idle host would take it."""
+    """Not even an idle host could take it."""
     cluster = Cluster(Machine("a", memory=1000 * MIB))
     cluster.submit(process("p", memory=900))
     assert cluster.phase("p") == "set_aside"
@@ -87,7 +87,7 @@ def test_who_is_too_large_for_every_host_is_set_aside() -> None:
 
 
 def test_nothing_is_set_aside_before_the_limits_are_known(monkeypatch) -> None:
-    """A host that has registered and sent no reading may yet turn out to be large enough."""
+    """A host that has registered without a reading may still prove large enough."""
     cluster = Cluster()
     cluster.submit(process("p", memory=1200))
     with monkeypatch.context() as patched:
@@ -101,7 +101,7 @@ def test_nothing_is_set_aside_before_the_limits_are_known(monkeypatch) -> None:
 
 
 def test_a_misspelt_resource_is_named_with_the_nearest_that_is_reported() -> None:
-    """Set aside, as a host that reports it may still come."""
+    """The process is set aside, because a host that reports the resource may still register."""
     cluster = Cluster("a", "b")
     cluster.submit(process("p", needs={"memroy": 1e6}))
     assert cluster["p"].reason == (
@@ -111,14 +111,14 @@ def test_a_misspelt_resource_is_named_with_the_nearest_that_is_reported() -> Non
 
 
 def test_restart_of_a_process_that_waits_for_room_is_refused() -> None:
-    """The process starts as soon as there is room anyway."""
+    """The process starts anyway as soon as there is room."""
     cluster = Cluster(full())
     cluster.submit(process("p"))
     assert cluster.restart("p").message == "p waits in the queue already. Nothing was restarted"
 
 
 def test_a_queue_without_hosts_that_are_there_says_that_they_are_away() -> None:
-    """Not that they are full."""
+    """The reason names absent hosts, not full ones."""
     cluster = Cluster("a", "b")
     cluster.leave(cluster.machines["a"])
     cluster.machines["b"].connected = False
@@ -129,7 +129,7 @@ def test_a_queue_without_hosts_that_are_there_says_that_they_are_away() -> None:
 
 
 def test_who_was_set_aside_returns_to_its_place_when_a_fitting_host_comes() -> None:
-    """Ahead of those that were submitted later and still wait."""
+    """The process goes ahead of those submitted later that still wait."""
     cluster = Cluster(full())
     cluster.submit(process("special", memory=20, required_labels={"gpu": "yes"}))
     cluster.submit(process("plain", memory=20))
@@ -145,7 +145,7 @@ def test_who_was_set_aside_returns_to_its_place_when_a_fitting_host_comes() -> N
 
 
 def test_with_no_host_at_all_everybody_waits() -> None:
-    """Nobody is set aside as long as nothing is known of any host."""
+    """No process is set aside before the first host registers."""
     cluster = Cluster()
     cluster.submit(process("p", memory=1e6), process("q"))
     assert cluster.queue() == ["p", "q"]
@@ -156,7 +156,7 @@ def test_with_no_host_at_all_everybody_waits() -> None:
 
 
 def test_who_waits_for_a_host_that_is_away_does_not_block_the_others() -> None:
-    """Cordoned, left or lost: only somebody's doing brings it back."""
+    """A cordoned, departed or lost host does not return without an operator."""
     cluster = Cluster("a", Machine("b", labels={"gpu": "yes"}))
     cluster.set_host("b", "cordon")
     cluster.submit(process("special", required_labels={"gpu": "yes"}), process("plain"))
@@ -168,7 +168,7 @@ def test_who_waits_for_a_host_that_is_away_does_not_block_the_others() -> None:
 
 
 def test_who_waits_for_a_lost_host_is_placed_when_it_is_back() -> None:
-    """Its lease decides when it is set aside, its next message when it returns."""
+    """The lease decides when the process is set aside, the host's next message when it returns."""
     cluster = Cluster("a", Machine("b", labels={"gpu": "yes"}))
     cluster.machines["b"].connected = False
     cluster.wait(2.0)
@@ -183,7 +183,7 @@ def test_who_waits_for_a_lost_host_is_placed_when_it_is_back() -> None:
 
 
 def test_when_every_host_is_away_everybody_waits_in_order() -> None:
-    """Nobody is set aside only because there is nobody to wait behind."""
+    """If all hosts are away, no process is set aside, since none would be passed."""
     cluster = Cluster("a")
     cluster.set_host("a", "cordon")
     cluster.submit(process("p"), process("q"))
@@ -193,7 +193,7 @@ def test_when_every_host_is_away_everybody_waits_in_order() -> None:
 
 
 def test_one_that_comes_back_goes_to_its_old_place() -> None:
-    """What was assigned and not taken up is still ahead of those behind it."""
+    """A withdrawn assignment returns to its place ahead of later processes."""
     cluster = Cluster(Machine("a", max_processes=1), delivery_timeout=5.0)
     cluster.decide(happened.SubmissionReceived(1, (job("p"), job("q"))))
     assert cluster.phase("p") == "assigned"
@@ -203,7 +203,7 @@ def test_one_that_comes_back_goes_to_its_old_place() -> None:
 
 
 def test_an_assignment_that_was_lost_is_given_again_as_an_order() -> None:
-    """The process does not wait until the assignment counts as not taken up."""
+    """The order comes before the assignment counts as not taken up."""
     cluster = Cluster("a", order_retry=2.0, delivery_timeout=5.0)
     cluster.decide(happened.SubmissionReceived(1, (job("p"),)))  # the answer never arrives
     cluster.wait(1.5)
@@ -213,7 +213,7 @@ def test_an_assignment_that_was_lost_is_given_again_as_an_order() -> None:
 
 
 def test_an_assignment_that_arrives_twice_is_one() -> None:
-    """The answer was only late."""
+    """A late answer and the repeated order start one instance."""
     machine = Machine("a")
     cluster = Cluster(machine, order_retry=2.0, delivery_timeout=5.0)
     commands = cluster.decide(happened.SubmissionReceived(1, (job("p"),)))
@@ -224,7 +224,7 @@ def test_an_assignment_that_arrives_twice_is_one() -> None:
 
 
 def test_an_assignment_given_twice_and_withdrawn_never_starts() -> None:
-    """Neither the answer nor the order, if they come after all."""
+    """Neither the late answer nor the order starts the process."""
     machine = Machine("a")
     cluster = Cluster(machine, order_retry=2.0, delivery_timeout=5.0)
     given = cluster.decide(happened.SubmissionReceived(1, (job("p"),)))
@@ -240,7 +240,7 @@ def test_an_assignment_given_twice_and_withdrawn_never_starts() -> None:
 
 
 def test_a_job_that_was_taken_back_before_it_ran_has_not_completed() -> None:
-    """Its late assignment and the order to stop it met: it ended with code 0, and never ran."""
+    """The late assignment met the stop order: the job ended with code 0 without running."""
     machine = Machine("a")
     cluster = Cluster(machine, order_retry=50.0, delivery_timeout=5.0)
     cluster.decide(happened.SubmissionReceived(1, (job("p"),)))  # the answer is late

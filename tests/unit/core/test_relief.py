@@ -1,4 +1,4 @@
-"""Which process leaves a host that is over a limit or is being drained, and when none does."""
+"""Eviction and drain: choice of the process that leaves a host, and reasons against it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.unit.core.cluster import GIB, MIB, Cluster, Machine, movable, process
 
 
 def machine(name: str, memory: float = 0.1) -> Machine:
-    """1000 MiB and 4 cores, 80 % of each allowed."""
+    """Return a host with 1000 MiB and 4 cores, 80 % of each allowed."""
     return Machine(
         name, memory=1000 * MIB, cpu=4.0, busy={"memory": memory, "cpu": 0.05},
         limits={"memory": 0.8, "cpu": 0.8},
@@ -24,7 +24,7 @@ def cluster_of(*machines: Machine, **settings: Any) -> Cluster:
 
 
 def on_a(cluster: Cluster, **memory: float) -> None:
-    """Processes that run on a and use so many MiB."""
+    """Submit processes that run on a and use this memory, MiB."""
     for name, used in memory.items():
         cluster.machines["a"].shown[name] = {"memory": used * MIB}
         cluster.submit(movable(name))
@@ -33,7 +33,7 @@ def on_a(cluster: Cluster, **memory: float) -> None:
 
 
 def test_the_largest_relief_leaves_a_host_that_is_over_its_limit() -> None:
-    """One process, of the resource that is over, to the host with room."""
+    """One process leaves, the largest user of that resource, to a host with room."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, small=50, large=300, middle=200)
     cluster.add(machine("b"))
@@ -48,7 +48,10 @@ def test_the_largest_relief_leaves_a_host_that_is_over_its_limit() -> None:
 
 
 def test_a_stale_reading_says_nothing_of_a_limit() -> None:
-    """It does not change when processes leave, so all of them would. Nor is it under the limit."""
+    """A stale reading does not fall when processes leave, so it would evict all of them.
+
+    It does not show the host under its limit either.
+    """
     cluster = cluster_of(machine("a"))
     on_a(cluster, large=300, middle=200)
     cluster.add(machine("b"))
@@ -67,7 +70,7 @@ def test_a_stale_reading_says_nothing_of_a_limit() -> None:
 
 
 def test_a_reading_that_crosses_the_limit_each_second_is_recorded_once() -> None:
-    """The end is on record when the host has been under its limits for the hysteresis."""
+    """The end is recorded once the host has been under its limits for the hysteresis."""
     cluster = cluster_of(machine("a"))
     for _ in range(10):
         for memory in (0.9, 0.3):
@@ -80,7 +83,7 @@ def test_a_reading_that_crosses_the_limit_each_second_is_recorded_once() -> None
 
 
 def test_it_must_relieve_the_resource_that_is_over() -> None:
-    """A process that uses no CPU does not leave a host whose CPU is over."""
+    """A process that uses no CPU does not leave a host over its CPU limit."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, fat=400, busy=10)
     cluster.machines["a"].shown["busy"]["cpu"] = 1.0
@@ -92,17 +95,17 @@ def test_it_must_relieve_the_resource_that_is_over() -> None:
 
 
 def test_it_must_fit_where_it_goes() -> None:
-    """The largest that fits goes; a destination keeps its headroom below the limit."""
+    """The largest process that fits leaves; a destination keeps its headroom below the limit."""
     cluster = cluster_of(machine("a"), headroom=0.05)
     on_a(cluster, large=300, small=100)
-    cluster.add(machine("b", memory=0.5))  # 0.5 + 0.3 is the limit, and too near to it
+    cluster.add(machine("b", memory=0.5))  # 0.5 + 0.3 reaches the limit, without headroom
     cluster.machines["a"].busy["memory"] = 0.45
     cluster.wait(3.0)
     assert (cluster.where("small"), cluster.where("large")) == (["b"], ["a"])
 
 
 def test_nothing_moves_when_every_host_is_at_its_limits() -> None:
-    """And nothing is assigned: the queue waits."""
+    """Nothing is assigned either: the queue waits."""
     cluster = cluster_of(machine("a"), machine("b", memory=0.2))
     on_a(cluster, p=300)
     for name in "ab":
@@ -128,7 +131,7 @@ def test_a_full_resource_without_a_limit_is_no_reason_to_move() -> None:
 
 
 def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
-    """Hysteresis: less than that long, nothing moves."""
+    """Nothing moves within the hysteresis."""
     cluster = cluster_of(machine("a"), hysteresis=2.0)
     on_a(cluster, p=300)
     cluster.add(machine("b"))
@@ -143,7 +146,7 @@ def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
 
 
 def test_a_process_that_moved_is_left_alone_for_its_cool_down() -> None:
-    """It does not flap between two full hosts."""
+    """The cool-down keeps a process from flapping between two full hosts."""
     cluster = cluster_of(machine("a"), cooldown=30.0)
     on_a(cluster, p=300)
     cluster.add(machine("b"))
@@ -161,7 +164,7 @@ def test_a_process_that_moved_is_left_alone_for_its_cool_down() -> None:
 
 
 def test_one_move_at_a_time_leaves_a_host_and_its_effect_is_seen_first() -> None:
-    """After a move the host has its hysteresis anew before the next one leaves."""
+    """After each move the hysteresis starts again before the next process leaves."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, p=150, q=150, r=150)
     cluster.add(machine("b"))
@@ -175,7 +178,7 @@ def test_one_move_at_a_time_leaves_a_host_and_its_effect_is_seen_first() -> None
 
 
 def test_at_most_max_migrations_are_under_way() -> None:
-    """Over the whole cluster."""
+    """The limit holds for the whole cluster."""
     cluster = cluster_of(machine("a"), max_migrations=2)
     for name in "pqrs":
         cluster.submit(movable(name, ros=True))
@@ -194,7 +197,7 @@ def test_at_most_max_migrations_are_under_way() -> None:
 
 
 def test_a_drained_host_is_emptied_of_what_can_move() -> None:
-    """What cannot stays, and why is said."""
+    """The reply and the record name the processes that cannot leave, with the reason."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, p=50, q=50)
     cluster.submit(process("fixed"), process("rooted"))
@@ -214,7 +217,7 @@ def test_a_drained_host_is_emptied_of_what_can_move() -> None:
 
 
 def test_a_draining_host_is_drained_only_when_what_can_leave_has_left() -> None:
-    """Not while no host has room for it, nor while it is lost; another process brings it back."""
+    """The drain waits while no host has room or the host is lost; a new process ends the state."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, p=50)
     cluster.add(machine("b"))
@@ -234,7 +237,7 @@ def test_a_draining_host_is_drained_only_when_what_can_leave_has_left() -> None:
 
 
 def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> None:
-    """The host is drained with it, until a host registers that may take the process."""
+    """The host counts as drained until a host registers that may take the process."""
     cluster = cluster_of(Machine("a", labels={"camera": "front"}), machine("b"))
     cluster.submit(movable("p", required_labels={"camera": "front"}))
     said = cluster.set_host("a", "drain").message
@@ -249,7 +252,7 @@ def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> Non
 
 
 def test_a_process_too_large_for_every_other_host_stays_on_a_draining_host() -> None:
-    """Waiting for room would never end."""
+    """Such a process would wait for room forever."""
     cluster = cluster_of(machine("a"), Machine("small", memory=100 * MIB))
     cluster.submit(movable("p", needs={"memory": 400 * MIB}))
     assert cluster.where("p") == ["a"]
@@ -259,7 +262,7 @@ def test_a_process_too_large_for_every_other_host_stays_on_a_draining_host() -> 
 
 
 def test_that_there_is_no_other_host_is_said_once() -> None:
-    """To a command as well as to a drain; it is not the room that is lacking."""
+    """Both a command and a drain name the missing host, not missing room."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, p=50, q=50)
     assert cluster.migrate("p").message == "there is no other host"
@@ -268,7 +271,7 @@ def test_that_there_is_no_other_host_is_said_once() -> None:
 
 
 def test_with_automatic_off_nothing_moves_by_itself() -> None:
-    """Drain and `migrate` still do."""
+    """Drain and `migrate` still move processes."""
     cluster = cluster_of(machine("a"), automatic=False)
     on_a(cluster, p=300)
     cluster.add(machine("b"))
@@ -280,7 +283,7 @@ def test_with_automatic_off_nothing_moves_by_itself() -> None:
 
 
 def test_that_nothing_can_move_is_said_once_for_each_reason() -> None:
-    """And once more when the host is over its limit again, not every ten seconds."""
+    """The reason is recorded again when the host exceeds its limit again, not every ten seconds."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, p=300)
     cluster.machines["a"].busy["memory"] = 0.6
@@ -294,7 +297,7 @@ def test_that_nothing_can_move_is_said_once_for_each_reason() -> None:
 
 
 def test_a_move_goes_to_the_largest_margin() -> None:
-    """The same order as for a new process."""
+    """The order of hosts is the same as for a new process."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, p=100)
     cluster.add(machine("b", memory=0.4))
@@ -305,7 +308,7 @@ def test_a_move_goes_to_the_largest_margin() -> None:
 
 @pytest.mark.parametrize("resource", ["memory", "cpu"])
 def test_what_leaves_is_counted_as_it_was_seen(resource: str) -> None:
-    """Relief is the usage that was seen, not what was once declared."""
+    """The relief is the measured usage, not the declared needs."""
     cluster = cluster_of(machine("a"))
     cluster.machines["a"].shown["p"] = {"memory": 300 * MIB, "cpu": 1.6}
     cluster.machines["a"].shown["q"] = {"memory": 10 * MIB, "cpu": 0.1}
@@ -319,7 +322,7 @@ def test_what_leaves_is_counted_as_it_was_seen(resource: str) -> None:
 
 
 def test_what_no_host_has_a_probe_for_keeps_nobody_where_it_is() -> None:
-    """Slaves say what each process uses of the CPU, also where no probe reads it."""
+    """Slaves report CPU usage per process even where no probe measures the host's CPU."""
     memory = (ResourceDescription("memory", "B", 16 * GIB),)
     cluster = Cluster(*(Machine(name, resources=memory) for name in ("a", "b")))
     for machine in cluster.machines.values():

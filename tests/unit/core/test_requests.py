@@ -1,4 +1,4 @@
-"""Submit, cancel, restart: all or nothing, in every phase."""
+"""Submit, cancel and restart in every phase, each request as a whole."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from tests.unit.core.cluster import Cluster, Machine, job, movable, node, proces
 
 
 def test_a_submission_is_taken_as_a_whole() -> None:
-    """The answer counts them."""
+    """The reply has the number of processes."""
     cluster = Cluster("a")
     reply = cluster.submit(process("p"), process("q"))
     assert (reply.accepted, reply.message) == (True, "2 processes queued")
 
 
 def test_a_name_that_is_given_twice_refuses_all() -> None:
-    """Nothing was queued."""
+    """No process was queued."""
     cluster = Cluster("a")
     reply = cluster.submit(process("p"), process("q"), process("p"))
     assert (reply.accepted, reply.code) == (False, "name_taken")
@@ -38,7 +38,7 @@ def test_a_name_that_is_given_twice_refuses_all() -> None:
 
 
 def test_the_name_of_a_live_process_refuses_all() -> None:
-    """In any phase in which it is not over."""
+    """The name is taken in each phase that is not terminal."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     reply = cluster.submit(process("q"), process("p"))
@@ -51,7 +51,7 @@ def test_the_name_of_a_live_process_refuses_all() -> None:
 
 
 def test_every_name_that_is_in_use_is_named() -> None:
-    """Those of live processes, and those whose processes are being cancelled, with the reason."""
+    """The refusal lists live processes and those being cancelled, with the reason."""
     cluster = Cluster("a")
     cluster.submit(*(process(name) for name in "pqrs"))
     cluster.detach(cluster.machines["a"])
@@ -64,7 +64,7 @@ def test_every_name_that_is_in_use_is_named() -> None:
 
 
 def test_the_name_of_a_process_that_is_over_can_be_used_again() -> None:
-    """It is a new process, the newest in the listing."""
+    """The new process is the last in the listing."""
     cluster = Cluster("a")
     cluster.submit(job("p"), job("q"))
     cluster.machines["a"].finish("p", cluster.now)
@@ -75,7 +75,7 @@ def test_the_name_of_a_process_that_is_over_can_be_used_again() -> None:
 
 
 class Choosy:
-    """Moves nothing, and says so or fails to."""
+    """Strategy that refuses every process, with a reason or by an exception."""
 
     def propose(self, move: Move) -> Plan:
         raise ValueError("it does not")
@@ -87,7 +87,7 @@ class Choosy:
 
 
 def test_processes_that_put_one_node_into_the_graph_are_mentioned() -> None:
-    """Taken nonetheless: ROS 2 lets both live."""
+    """The submission is accepted nonetheless, because ROS 2 allows it."""
     cluster = Cluster("a")
     alias = ("--ros-args", "-r", "__node:=p", "-r", "__ns:=/robot")
     cluster.submit(node("p", namespace="/robot"))
@@ -105,7 +105,7 @@ def test_processes_that_put_one_node_into_the_graph_are_mentioned() -> None:
 
 
 def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
-    """With its reason; one that raises is named."""
+    """The refusal has the strategy's reason; a strategy that raises is named."""
     cluster = Cluster("a", strategies={"choosy": Choosy()})
 
     def message(name: str, **options: int) -> str:
@@ -118,7 +118,7 @@ def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
 
 
 def test_an_unknown_migration_strategy_refuses_all() -> None:
-    """With those that are selected."""
+    """The refusal lists the selected strategies."""
     cluster = Cluster("a")
     reply = cluster.submit(process("q"), process("p", migration=MigrationPolicy("teleport")))
     assert (reply.accepted, reply.code) == (False, "invalid")
@@ -130,7 +130,7 @@ def test_an_unknown_migration_strategy_refuses_all() -> None:
 
 
 def test_cancel_of_one_that_waits_takes_it_out_of_the_queue() -> None:
-    """Those behind it move up."""
+    """The processes behind it move up."""
     cluster = Cluster()
     cluster.submit(process("p"), process("q"))
     assert cluster.cancel("p").message == "1 process cancelled"
@@ -148,7 +148,7 @@ def test_cancel_of_one_that_was_set_aside_ends_it() -> None:
 
 
 def test_cancel_of_one_that_runs_stops_it() -> None:
-    """Its end, whatever its exit code, is a cancellation."""
+    """Any exit code then counts as a cancellation."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.cancel("p")
@@ -156,7 +156,7 @@ def test_cancel_of_one_that_runs_stops_it() -> None:
 
 
 def test_cancel_of_one_that_is_on_its_way_keeps_it_from_starting() -> None:
-    """The order to stop may overtake the assignment."""
+    """The stop order may overtake the assignment."""
     cluster = Cluster("a")
     cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
     machine = cluster.machines["a"]
@@ -168,7 +168,7 @@ def test_cancel_of_one_that_is_on_its_way_keeps_it_from_starting() -> None:
 
 
 def test_cancel_of_one_that_does_not_end_is_asked_again() -> None:
-    """Until the slave says that it has ended."""
+    """The stop order repeats until the slave reports the end."""
     cluster = Cluster("a", order_retry=2.0)
     cluster.machines["a"].stubborn.add("p")
     cluster.submit(process("p"))
@@ -182,7 +182,7 @@ def test_cancel_of_one_that_does_not_end_is_asked_again() -> None:
 
 
 def test_cancel_of_one_whose_host_is_lost_ends_when_the_host_is_back() -> None:
-    """Until then it shows as being stopped."""
+    """The process shows as being stopped until its host rejoins."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.machines["a"].connected = False
@@ -195,7 +195,7 @@ def test_cancel_of_one_whose_host_is_lost_ends_when_the_host_is_back() -> None:
 
 
 def test_cancel_of_one_that_is_over_says_so() -> None:
-    """And cancels the others."""
+    """The other processes are cancelled."""
     cluster = Cluster("a")
     cluster.submit(job("p"), process("q"))
     cluster.machines["a"].finish("p", cluster.now)
@@ -205,7 +205,7 @@ def test_cancel_of_one_that_is_over_says_so() -> None:
 
 
 def test_an_unknown_name_refuses_the_whole_request() -> None:
-    """Nothing is cancelled or restarted."""
+    """No process is cancelled or restarted."""
     cluster = Cluster("a")
     cluster.submit(process("talker"))
     for ask in (cluster.cancel, cluster.restart):
@@ -219,7 +219,7 @@ def test_an_unknown_name_refuses_the_whole_request() -> None:
 
 @pytest.mark.parametrize("overlap", [True, False])
 def test_cancel_of_one_that_moves_ends_both_instances(overlap: bool) -> None:
-    """The move turns back at once; nothing is started again only to be stopped."""
+    """The move is undone at once, and no fallback is started."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     spec = movable("p", overlap=overlap, ros=True)
     cluster.submit(spec)
@@ -239,7 +239,7 @@ def test_cancel_of_one_that_moves_ends_both_instances(overlap: bool) -> None:
 
 
 def test_restart_of_one_that_runs_happens_where_it_is() -> None:
-    """The same instance, on the same host, ready again."""
+    """The instance and the host stay the same, and the process becomes ready again."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     before = cluster.machines["a"].programs[cluster.machines["a"].find("p")].pid
@@ -250,7 +250,7 @@ def test_restart_of_one_that_runs_happens_where_it_is() -> None:
 
 
 def test_restart_of_one_that_is_over_queues_it_anew() -> None:
-    """At the end of the line, and on any host."""
+    """The process goes to the end of the queue, and may go to any host."""
     cluster = Cluster("a")
     cluster.submit(job("p"))
     cluster.machines["a"].finish("p", cluster.now, code=3)
@@ -261,7 +261,7 @@ def test_restart_of_one_that_is_over_queues_it_anew() -> None:
 
 
 def test_restart_of_one_that_is_on_its_way_does_not_keep_it_from_starting() -> None:
-    """There is nothing to restart yet."""
+    """An instance that has not started needs no restart."""
     cluster = Cluster("a")
     cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
     assert cluster.restart("p").accepted
@@ -270,7 +270,7 @@ def test_restart_of_one_that_is_on_its_way_does_not_keep_it_from_starting() -> N
 
 @pytest.mark.parametrize("code", [0, 3])
 def test_restart_of_one_whose_end_is_on_its_way_is_not_lost(code: int) -> None:
-    """The slave told of the end before it heard of the restart: the process is queued again."""
+    """The end was reported before the restart order arrived: the process is queued again."""
     cluster = Cluster("a")
     cluster.submit(job("p"))
     cluster.machines["a"].finish("p", cluster.now, code=code)
@@ -280,7 +280,7 @@ def test_restart_of_one_whose_end_is_on_its_way_is_not_lost(code: int) -> None:
 
 
 def test_an_end_after_a_restart_is_an_end() -> None:
-    """The restart was carried out: what comes of it counts."""
+    """The restart was carried out, so a later end counts."""
     cluster = Cluster("a")
     cluster.submit(job("p"))
     cluster.restart("p")
@@ -290,7 +290,10 @@ def test_an_end_after_a_restart_is_an_end() -> None:
 
 
 def test_the_oldest_of_what_is_over_is_forgotten() -> None:
-    """`keep_ended` of them are kept, in memory and in the journal; what goes on always is."""
+    """The newest `keep_ended` terminal processes stay in memory and journal.
+
+    All processes that are not terminal stay, too.
+    """
     cluster = Cluster("a", keep_ended=2)
     cluster.submit(job("first"), process("lives"), job("second"), job("third"), job("fourth"))
     for name in ("second", "first", "fourth", "third"):
@@ -303,12 +306,12 @@ def test_the_oldest_of_what_is_over_is_forgotten() -> None:
 
 
 def test_what_is_over_is_kept_while_something_of_it_is_being_stopped() -> None:
-    """Its name must not be given to another one meanwhile."""
+    """Its name must not be given to another process until then."""
     cluster = Cluster("a", keep_ended=1)
     cluster.submit(process("p"), job("q"))
     cluster.cancel("p")
     assert cluster.phase("p") == "cancelled"
-    # A late word of the slave: something of it runs on.
+    # A late status shows that an instance of p still runs.
     machine = cluster.machines["a"]
     late = InstanceStatus(InstanceId("p", 77), InstanceState.RUNNING, pid=5)
     machine.stubborn.add("p")
@@ -321,7 +324,7 @@ def test_what_is_over_is_kept_while_something_of_it_is_being_stopped() -> None:
 
 
 def test_one_that_runs_again_is_not_among_those_that_are_over() -> None:
-    """Restarted or submitted anew, it is the youngest when it ends again."""
+    """A process that was restarted or submitted again counts as newest at its next end."""
     cluster = Cluster("a", keep_ended=1)
     cluster.submit(job("p"))
     cluster.machines["a"].finish("p", cluster.now)
@@ -337,7 +340,7 @@ def test_one_that_runs_again_is_not_among_those_that_are_over() -> None:
 
 
 def test_restart_is_refused_where_it_makes_no_sense() -> None:
-    """Waiting, being stopped, moving, out of reach: with the reason, and nothing is restarted."""
+    """The refusal has the reason: waiting, stopping, moving or unreachable. Nothing restarts."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.machines["a"].stubborn.add("stops")
     cluster.submit(process("stops"), movable("moves", ros=True), process("huge", memory=1e6))
@@ -353,7 +356,7 @@ def test_restart_is_refused_where_it_makes_no_sense() -> None:
 
 
 def test_restart_of_one_out_of_reach_is_refused() -> None:
-    """Its host would not hear of it."""
+    """Its host would not receive the order."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.machines["a"].connected = False
@@ -365,7 +368,7 @@ def test_restart_of_one_out_of_reach_is_refused() -> None:
 
 
 def test_a_job_that_exits_with_0_has_finished_one_that_does_not_has_failed() -> None:
-    """With its exit code."""
+    """The listing shows the exit code."""
     cluster = Cluster("a")
     cluster.submit(job("good"), job("bad"))
     cluster.machines["a"].finish("good", cluster.now)
@@ -376,7 +379,7 @@ def test_a_job_that_exits_with_0_has_finished_one_that_does_not_has_failed() -> 
 
 
 def test_a_node_runs_once_it_is_seen_in_the_graph() -> None:
-    """Until then it is starting."""
+    """A node counts as starting until the graph shows it."""
     cluster = Cluster("a")
     cluster.submit(node("p"))
     assert cluster.phase("p") == "starting"
@@ -386,7 +389,7 @@ def test_a_node_runs_once_it_is_seen_in_the_graph() -> None:
 
 
 def test_a_node_that_is_never_seen_fails() -> None:
-    """By its slave, after its time-out."""
+    """Its slave reports the failure after the readiness time-out."""
     cluster = Cluster("a")
     cluster.submit(node("p"))
     cluster.wait(21.0)
@@ -405,7 +408,7 @@ def test_a_host_that_cannot_start_it_is_left_out_and_another_tried() -> None:
 
 
 def test_one_that_every_host_refuses_has_failed() -> None:
-    """With each host's reason; a host that its labels forbid does not count."""
+    """The reason lists each host's reason; hosts excluded by labels do not count."""
     cluster = Cluster(*[
         Machine(name, labels={"x": "y"} if name != "c" else {}, refuses={"p": f"not on {name}"})
         for name in "abc"
@@ -420,7 +423,7 @@ def test_one_that_every_host_refuses_has_failed() -> None:
 
 
 def test_equal_refusals_are_said_once_and_their_details_only_where_asked_for() -> None:
-    """The details are on further lines; events and the explanation have them in one line."""
+    """The reply has the details on further lines; events and the explanation have one line."""
     refusal = "program 'p' is not on the PATH\nthe PATH is /bin"
     cluster = Cluster(*[Machine(name, refuses={"p": refusal}) for name in "abcd"])
     cluster.submit(process("p"))
@@ -433,11 +436,11 @@ def test_equal_refusals_are_said_once_and_their_details_only_where_asked_for() -
 
 
 def test_a_slave_that_was_started_anew_may_find_what_it_lacked() -> None:
-    """Its former refusal is forgotten."""
+    """The new run of the slave clears the former refusal."""
     a = Machine("a", refuses={"p": "no such package"})
     cluster = Cluster(a, Machine("b", max_processes=1, labels={"x": "y"}))
     cluster.submit(process("filler", required_labels={"x": "y"}), process("p"))
-    assert cluster.queue() == ["p"]  # b may take it, once it has room
+    assert cluster.queue() == ["p"]  # b may take it once it has room
     a.refuses.clear()
     a.connected = False
     cluster.wait(2.0)
@@ -448,10 +451,10 @@ def test_a_slave_that_was_started_anew_may_find_what_it_lacked() -> None:
 
 
 def test_an_assignment_that_is_not_taken_up_is_withdrawn() -> None:
-    """After the delivery time-out the process goes back to its place, and elsewhere."""
+    """After the delivery time-out the process returns to its place, and goes to another host."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}), delivery_timeout=5.0)
     cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
-    cluster.machines["a"].connected = False  # hears nothing, but its readings come
+    cluster.machines["a"].connected = False  # cut off, though its readings arrive
     for _ in range(60):
         cluster.now += 0.1
         cluster.tell(cluster.readings([cluster.machines["a"], cluster.machines["b"]]))
@@ -464,7 +467,7 @@ def test_an_assignment_that_is_not_taken_up_is_withdrawn() -> None:
 
 
 def test_one_that_was_fetched_and_never_heard_of_is_stopped_before_it_goes_elsewhere() -> None:
-    """Its refusal then is no reason against its host."""
+    """A later refusal by its host does not exclude that host."""
     cluster = Cluster(
         "a", Machine("b", busy={"memory": 0.5}), delivery_timeout=5.0, order_retry=9.0
     )
@@ -479,7 +482,7 @@ def test_one_that_was_fetched_and_never_heard_of_is_stopped_before_it_goes_elsew
 
 
 def test_one_that_shows_up_after_it_was_withdrawn_is_stopped_and_queued_again() -> None:
-    """It is never active twice."""
+    """The late instance is stopped first, so that two are never active."""
     cluster = Cluster("a", delivery_timeout=5.0)
     cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
     machine = cluster.machines["a"]
@@ -499,11 +502,14 @@ def test_one_that_shows_up_after_it_was_withdrawn_is_stopped_and_queued_again() 
     assert cluster.phase("p") == "running"
 
 
-# --- who asked --------------------------------------------------------------------------------
+# --- requester --------------------------------------------------------------------------------
 
 
 def test_the_record_of_a_request_names_its_requester() -> None:
-    """In the message and as `by` of the facts; moves name it in their cause."""
+    """The message and `by` of the facts name the requester.
+
+    Records of moves name it in their cause.
+    """
     cluster = Cluster("a")
     by = "anna@desk:42"
     cluster.ask(happened.SubmissionReceived, (movable("p"), process("q")), by)
@@ -521,7 +527,7 @@ def test_the_record_of_a_request_names_its_requester() -> None:
 
 
 def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ended() -> None:
-    """Until then it is being cancelled, as that instance runs."""
+    """The process shows as being cancelled while that instance runs."""
     cluster = Cluster("a")
     cluster.machines["a"].stubborn.add("p")
     cluster.submit(process("p"))
@@ -540,7 +546,7 @@ def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ende
 
 
 def test_a_job_that_has_begun_runs() -> None:
-    """Only a service is ready for others."""
+    """Only a service becomes ready for others."""
     cluster = Cluster("a")
     cluster.submit(process("p"), job("q"))
     assert cluster.told("ready") == ["p is ready on a"]
@@ -548,7 +554,7 @@ def test_a_job_that_has_begun_runs() -> None:
 
 
 def test_a_process_that_is_not_in_the_graph_yet_says_what_it_waits_for() -> None:
-    """With the node's full name and the longest time; then it has nothing to say."""
+    """The reason has the node's full name and the time-out; once the node appears, it is empty."""
     cluster = Cluster("a")
     cluster.submit(node("p", namespace="/robot"))
     waits = "waits for its node /robot/p in the ROS graph, for at most 20 s"
@@ -561,7 +567,10 @@ def test_a_process_that_is_not_in_the_graph_yet_says_what_it_waits_for() -> None
 
 
 def test_an_explanation_says_what_to_do_next() -> None:
-    """Of a failed process its logs and a restart, of one out of reach the start of its slave."""
+    """The reason names `logs` and `restart` for a failed process.
+
+    For an unreachable one it names the slave to start.
+    """
     cluster = Cluster("a")
     cluster.submit(process("p", restart=RestartPolicy("never")), process("q"))
     cluster.machines["a"].finish("p", cluster.now, code=2)

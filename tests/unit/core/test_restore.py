@@ -1,4 +1,4 @@
-"""A master that comes up again from its journal: the same intent, and nothing started twice."""
+"""Restore of the master from its journal: the same intent, and no process started twice."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
 
 
 def test_the_queue_keeps_its_order() -> None:
-    """Priorities and places in the line, also of those that were set aside."""
+    """Priorities and places are kept, also of processes that were set aside."""
     cluster = Cluster(Machine("a", memory=1000 * MIB, busy={"memory": 0.79}))
     cluster.submit(process("aside", required_labels={"x": "y"}), process("p", memory=100))
     cluster.submit(process("urgent", memory=100, priority=3), process("q", memory=100))
@@ -27,7 +27,7 @@ def test_the_queue_keeps_its_order() -> None:
 
 
 def test_what_is_set_aside_stays_so_while_the_hosts_come_back() -> None:
-    """With its reason and its age, as no host whose limits are known may take it."""
+    """Reason and age are kept, because no host with known limits may take it."""
     cluster = Cluster(Machine("a", memory=1000 * MIB))
     cluster.submit(process("p", memory=900))
     reason, since = cluster["p"].reason, cluster["p"].since
@@ -40,7 +40,7 @@ def test_what_is_set_aside_stays_so_while_the_hosts_come_back() -> None:
 
 
 def test_the_reason_of_what_is_set_aside_follows_the_hosts() -> None:
-    """Of a host that comes later too."""
+    """The reason includes hosts that register later."""
     cluster = Cluster("a")
     cluster.submit(process("p", required_labels={"x": "y"}))
     cluster.add("b")
@@ -50,7 +50,7 @@ def test_the_reason_of_what_is_set_aside_follows_the_hosts() -> None:
 
 
 def test_what_runs_runs_on_and_is_not_started_twice() -> None:
-    """A process is expected on its host, and found there."""
+    """The process is expected on its host, and its slave reports it."""
     cluster = Cluster("a", "b")
     cluster.submit(process("p"), process("q"))
     pids = {n: m.programs[next(iter(m.programs))].pid for n, m in cluster.machines.items()}
@@ -64,7 +64,7 @@ def test_what_runs_runs_on_and_is_not_started_twice() -> None:
 
 
 def test_what_ended_meanwhile_is_heard_of() -> None:
-    """Its slave tells when it registers."""
+    """The slave reports ended instances when it registers."""
     cluster = Cluster("a")
     cluster.submit(job("good"), job("bad"))
     cluster.kill_master()
@@ -76,7 +76,7 @@ def test_what_ended_meanwhile_is_heard_of() -> None:
 
 @pytest.mark.parametrize("spec", [process("p"), job("p"), movable("p")], ids=lambda one: one.kind)
 def test_what_a_slave_ended_while_the_master_was_away_is_queued_again(spec) -> None:
-    """The slave was stopped by Ctrl-C: its processes were asked for, and did not fail."""
+    """Ctrl-C on the slave ended the processes without a failure, so they are queued again."""
     cluster = Cluster("a")
     cluster.submit(spec)
     machine = cluster.machines["a"]
@@ -90,7 +90,7 @@ def test_what_a_slave_ended_while_the_master_was_away_is_queued_again(spec) -> N
 
 
 def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled() -> None:
-    """The cancel is on record, and had not reached the slave."""
+    """The cancel is in the journal, though it had not reached the slave."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     cluster.journal(cluster.decide(happened.CancelRequested(9, ("p",))))
@@ -103,7 +103,7 @@ def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled(
 
 
 def test_since_when_and_where_outlive_the_master() -> None:
-    """The start of the phase and the host of what runs, of what waits and of what has ended."""
+    """Start of the phase and host are kept, for running, waiting and ended processes."""
     cluster = Cluster("a")
     cluster.submit(process("runs"), process("waits", memory=1e6), job("ends"))
     cluster.machines["a"].finish("ends", cluster.now, code=4)
@@ -114,7 +114,7 @@ def test_since_when_and_where_outlive_the_master() -> None:
     cluster.kill_master()
     unseen = listing.process_row(cluster.state, cluster["runs"], cluster.now)
     assert (unseen.state, unseen.since) == ("unreachable", 0.0)
-    cluster.restart_master()  # killed once more, before any slave registered
+    cluster.restart_master()  # killed again, before any slave registered
     after = {row.name: row for row in listing.process_rows(cluster.state, cluster.now)}
     for name, row in after.items():
         told = (row.state, row.host, row.exit_code)
@@ -135,17 +135,18 @@ def test_one_that_was_started_again_out_of_sight_runs_since_then() -> None:
 
 
 def test_an_assignment_that_was_not_delivered_is_given_again() -> None:
-    """It was made durable and never sent: its host knows nothing of it."""
+    """The assignment was durable but never sent, so its host does not report it."""
     cluster = Cluster("a")
     commands = cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
     cluster.journal(commands)
     cluster.restart_master()
     assert cluster.phase("p") == "running"
-    assert cluster["p"].owner == 1001  # numbers are reserved by the thousand, none is used again
+    # numbers are reserved by the thousand, and none is used again
+    assert cluster["p"].owner == 1001
 
 
 def test_an_outcome_that_was_not_made_durable_never_was() -> None:
-    """Killed before the journal was written: nothing had been answered either."""
+    """The master was killed before the write and had not replied to the request."""
     cluster = Cluster("a")
     cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
     cluster.restart_master()
@@ -154,7 +155,7 @@ def test_an_outcome_that_was_not_made_durable_never_was() -> None:
 
 
 def test_hosts_keep_their_number_and_what_people_decided_about_them() -> None:
-    """Cordoned stays cordoned, drained stays drained."""
+    """Cordoned and drained hosts stay so."""
     cluster = Cluster("a", "b", "c")
     cluster.set_host("b", "cordon")
     cluster.set_host("c", "drain")
@@ -168,7 +169,7 @@ def test_hosts_keep_their_number_and_what_people_decided_about_them() -> None:
 
 
 def test_what_was_learned_is_known() -> None:
-    """Needs of earlier runs outlive the master."""
+    """Learned needs of earlier runs outlive the master."""
     cluster = Cluster("a")
     cluster.machines["a"].shown["first"] = {"memory": 160 * MIB}
     cluster.submit(job("first"))
@@ -180,7 +181,7 @@ def test_what_was_learned_is_known() -> None:
 
 
 def test_a_cancel_that_was_answered_is_carried_out() -> None:
-    """Of one that runs, and of one that waits."""
+    """A running process and a queued one end as cancelled."""
     cluster = Cluster("a")
     cluster.submit(process("runs"), process("waits", memory=1e6))
     commands = cluster.decide(happened.CancelRequested(9, ("runs", "waits")))
@@ -192,7 +193,7 @@ def test_a_cancel_that_was_answered_is_carried_out() -> None:
 
 
 def test_a_host_that_never_comes_back_is_lost_after_its_lease() -> None:
-    """And who can only go there does not block the queue for ever."""
+    """Processes that fit only there do not block the queue forever."""
     cluster = Cluster("a", Machine("b", labels={"x": "y"}))
     cluster.submit(process("p", required_labels={"x": "y"}))
     cluster.machines["b"].connected = False
@@ -209,7 +210,7 @@ def test_a_host_that_never_comes_back_is_lost_after_its_lease() -> None:
 @pytest.mark.parametrize("first", ["a", "b"])
 @pytest.mark.parametrize("ready", [True, False])
 def test_a_move_that_was_under_way_goes_on(overlap: bool, first: str, ready: bool) -> None:
-    """Whoever registers first, before or after the commit: one owner, and it runs."""
+    """Whichever slave registers first, before or after the commit, one owner runs in the end."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", overlap=overlap, ros=True))
     cluster.machines["a"].seen_in_graph("p", cluster.now)
@@ -240,7 +241,7 @@ def test_a_move_that_was_under_way_goes_on(overlap: bool, first: str, ready: boo
 
 
 def test_how_long_a_move_took_counts_from_its_beginning() -> None:
-    """Also when the master was killed on the way, and was away for a while."""
+    """The duration includes the time in which the master was away."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", ros=True))
     cluster.machines["a"].seen_in_graph("p", cluster.now)
@@ -256,7 +257,7 @@ def test_how_long_a_move_took_counts_from_its_beginning() -> None:
 
 
 def test_a_source_that_was_told_to_stop_has_not_finished() -> None:
-    """The master died after the order: that the source exits with 0 is not its own end."""
+    """The master died after the stop order, so the source's exit code 0 is not its own end."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", overlap=False))
     cluster.machines["a"].stubborn.add("p")
@@ -270,7 +271,7 @@ def test_a_source_that_was_told_to_stop_has_not_finished() -> None:
 
 
 def test_a_number_that_is_held_somewhere_is_not_given_again_by_a_lost_journal() -> None:
-    """What is said of the instance that had it would be taken for the new one's."""
+    """Otherwise statuses of the old instance would apply to the new one."""
     cluster = Cluster("a")
     cluster.submit(process("p"), process("q"))
     held = max(instance.number for instance in cluster.machines["a"].programs)
@@ -282,7 +283,7 @@ def test_a_number_that_is_held_somewhere_is_not_given_again_by_a_lost_journal() 
 
 
 def test_what_is_said_of_a_namesake_in_number_is_not_taken_for_an_instance() -> None:
-    """A process of another life of the cluster: it is stopped, and harms nobody."""
+    """An instance of another process with the same number is stopped, without effect on p."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
     machine, number = cluster.machines["a"], cluster["p"].owner

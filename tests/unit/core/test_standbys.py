@@ -1,4 +1,4 @@
-"""Standbys: one shadow on another host, which goes on when the primary has ended."""
+"""Standbys: one shadow on another host, which takes over when the primary ends."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ STANDBY = StandbyPolicy(wanted=True)
 
 
 def with_standby(*others: str | Machine, **fields: Any) -> Cluster:
-    """P runs on a, and has a ready standby on b."""
+    """Return a cluster where p runs on a and has a ready standby on b."""
     cluster = Cluster("a", *(others or ("b",)))
     for machine in list(cluster.machines.values())[1:]:
         machine.busy["memory"] = 0.5
     cluster.wait(0.5)
     cluster.submit(stateful(standby=STANDBY, **fields))
-    cluster.wait(11.0)  # somebody has been heard for a whole lease
+    cluster.wait(11.0)  # the master has had contact with some host for a whole lease
     return cluster
 
 
@@ -32,7 +32,7 @@ def lose(cluster: Cluster, name: str, seconds: float = 12.0) -> None:
 
 
 def test_a_process_gets_a_standby_on_another_host() -> None:
-    """Silent, ready, and said so."""
+    """The standby is silent and ready, and is recorded."""
     cluster = with_standby()
     assert (cluster.where("p"), cluster.active()) == (["a", "b"], ["a"])
     assert cluster.told("standby_ready") == ["the standby of p is ready on b"]
@@ -41,7 +41,7 @@ def test_a_process_gets_a_standby_on_another_host() -> None:
 
 
 def test_without_a_second_host_it_waits_for_one_and_says_so_once() -> None:
-    """The process itself runs all the while."""
+    """The process itself keeps running."""
     cluster = Cluster("a")
     cluster.submit(stateful(standby=STANDBY))
     cluster.wait(30.0)
@@ -55,7 +55,7 @@ def test_without_a_second_host_it_waits_for_one_and_says_so_once() -> None:
 
 @pytest.mark.parametrize("then", ["wait", "elsewhere"])
 def test_when_the_host_is_lost_the_standby_goes_on(then: str) -> None:
-    """At once, whatever else was to become of the process; the old one is fenced later."""
+    """Under every host-loss policy the standby takes over at once; the primary is fenced later."""
     cluster = with_standby(host_loss=HostLossPolicy(then))
     lose(cluster, "a", 10.5)
     assert (cluster.phase("p"), cluster.active()) == ("running", ["a", "b"])
@@ -67,7 +67,7 @@ def test_when_the_host_is_lost_the_standby_goes_on(then: str) -> None:
 
 
 def test_a_new_standby_follows() -> None:
-    """On a third host, or on the first one when it is back."""
+    """The next standby is on a third host, or on the first one after its rejoin."""
     cluster = with_standby()
     lose(cluster, "a")
     cluster.machines["a"].connected = True
@@ -78,10 +78,10 @@ def test_a_new_standby_follows() -> None:
 
 @pytest.mark.parametrize("when", ["never", "on-failure"])
 def test_when_the_primary_crashes_the_standby_goes_on(when: str) -> None:
-    """It is not started again beside it, whatever its restart policy."""
+    """Under every restart policy the standby takes over, and the primary is not restarted."""
     cluster = with_standby(restart=RestartPolicy(when))
     machine = cluster.machines["a"]
-    if when == "on-failure":  # its supervisor waits before it starts it again
+    if when == "on-failure":  # its supervisor waits before the restart
         status = machine.slave.held[machine.find("p")].status
         del machine.programs[machine.find("p")]
         machine.ends[status.instance] = status
@@ -98,7 +98,7 @@ def test_when_the_primary_crashes_the_standby_goes_on(when: str) -> None:
 
 
 def test_a_standby_that_is_not_ready_does_not_go_on() -> None:
-    """The process is queued again instead, and the shadow stopped first."""
+    """The process is queued again, after the shadow was stopped."""
     cluster = Cluster("a", "b")
     cluster.machines["b"].busy["memory"] = 0.5
     cluster.wait(0.5)
@@ -112,7 +112,7 @@ def test_a_standby_that_is_not_ready_does_not_go_on() -> None:
 
 
 def test_one_that_gave_up_is_replaced_after_a_while() -> None:
-    """Ever later."""
+    """The delay grows with each failed standby."""
     cluster = Cluster("a", "b")
     cluster.wait(0.5)
     cluster.submit(stateful(standby=STANDBY))
@@ -129,7 +129,7 @@ def test_one_that_gave_up_is_replaced_after_a_while() -> None:
 
 
 def test_the_standby_keeps_apart_by_a_label() -> None:
-    """Another rack; a host without the label is not known to be one."""
+    """Another rack qualifies; a host without the label does not."""
     one, two = {"rack": "1"}, {"rack": "2"}
     cluster = Cluster(Machine("a", labels=one))
     cluster.submit(stateful(standby=StandbyPolicy(True, ("rack",))))
@@ -143,7 +143,7 @@ def test_the_standby_keeps_apart_by_a_label() -> None:
 
 
 def test_a_move_takes_the_standby_away_and_another_one_follows() -> None:
-    """It followed the source; the destination of a move is another."""
+    """The old standby followed the source, so the destination gets a new one."""
     cluster = with_standby("b", "c")
     assert cluster.migrate("p").accepted
     cluster.wait(8.0)
@@ -154,7 +154,7 @@ def test_a_move_takes_the_standby_away_and_another_one_follows() -> None:
 
 
 def test_a_drained_host_keeps_no_standby() -> None:
-    """Another host takes it."""
+    """The standby is placed on another host."""
     cluster = with_standby("b", "c")
     (host,) = [name for name in cluster.where("p") if name != "a"]
     cluster.set_host(host, "drain")
@@ -164,7 +164,7 @@ def test_a_drained_host_keeps_no_standby() -> None:
 
 
 def test_cancel_ends_both() -> None:
-    """And nothing is left on the books."""
+    """No instance is left in the state of the master."""
     cluster = with_standby()
     cluster.cancel("p")
     cluster.wait(1.0)
@@ -173,7 +173,7 @@ def test_cancel_ends_both() -> None:
 
 
 def test_a_restarted_master_finds_the_standby() -> None:
-    """The same one; it takes over when its primary is lost."""
+    """The same standby takes over when its primary is lost."""
     cluster = with_standby()
     cluster.restart_master()
     cluster.wait(11.0)
@@ -183,7 +183,7 @@ def test_a_restarted_master_finds_the_standby() -> None:
 
 
 def test_a_restart_on_order_costs_the_standby_and_brings_a_new_one() -> None:
-    """The primary starts afresh where it is: nobody has failed."""
+    """The primary restarts on its host without a failover."""
     cluster = with_standby()
     cluster.restart("p")
     cluster.wait(1.0)
@@ -192,7 +192,7 @@ def test_a_restart_on_order_costs_the_standby_and_brings_a_new_one() -> None:
 
 
 def test_a_move_that_fails_leaves_the_standby() -> None:
-    """The same one, and as ready as before."""
+    """The same standby stays ready."""
     cluster = with_standby("b", "c")
     (other,) = [name for name in ("b", "c") if name not in cluster.where("p")]
     cluster.machines[other].quirks["p"].add("never ready")
@@ -219,11 +219,11 @@ def test_a_source_that_is_lost_in_its_move_is_followed_by_its_standby() -> None:
 
 
 def test_a_primary_that_is_heard_while_its_standby_takes_over_is_fenced() -> None:
-    """Before the commit too: its successor may be active at any moment."""
+    """The fence comes before the commit, because the successor may be active at any moment."""
     cluster = with_standby("b", "c")
     cluster.machines["a"].connected = False
     cluster.wait(9.5)
-    cluster.machines["b"].connected = False  # it does not hear that it is to take over
+    cluster.machines["b"].connected = False  # it does not receive the order to take over
     cluster.wait(0.8)
     assert (cluster.phase("p"), cluster["p"].owner) == ("migrating", 1)
     cluster.machines["a"].connected = True

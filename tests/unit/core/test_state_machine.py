@@ -1,8 +1,8 @@
-"""Whatever happens, in whatever order: the promises of the master's core hold.
+"""State machine test of the master's core: invariants under random events.
 
-Hypothesis plays users, machines, processes and the network: it submits, cancels, moves, cuts wires,
-loses, repeats and delays what travels, kills slaves and the master. What really runs is kept by
-`Machine`, apart from the books of the core; after every step the two are held against the promises.
+Hypothesis plays users, machines, processes and the network. It submits, cancels, moves, cuts wires,
+loses, repeats and delays messages, and kills slaves and the master. `Machine` records the processes
+that really run, independently of the core's state. After every step the invariants compare the two.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ TWINS = [f"{name}x" for name in NAMES]
 HOSTS = ["a", "b", "c"]
 LABELLED = "c"
 
-# Few of them are met often: so that much befalls the same one.
+# Few names are frequent, so that many events hit the same process.
 names = st.sampled_from([*NAMES[:1] * 4, *NAMES[:2] * 2, *NAMES])
 hosts = st.sampled_from(HOSTS)
 ways = st.sampled_from(
@@ -49,14 +49,14 @@ ways = st.sampled_from(
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
-#: Which of the things that are there at the moment; `Play.pick` takes it modulo their number.
+#: Index of one of the present things; `Play.pick` takes it modulo their number.
 which_one = st.integers(0, 11)
-#: Seconds for which a host is heard until nothing runs there any more beside a successor.
+#: Seconds of contact with a host after which no fenced instance runs there any more.
 FENCED_WITHIN = 1.0
 
 
 def is_open(hosts: HostTable, column: int) -> bool:
-    """Return True if a host may take work at all, said apart from the filters."""
+    """Return True if a host may take work at all; independent of the filters."""
     is_up = hosts.condition[column] == HostCondition.UP and not hosts.closed[column]
     has_told = not hosts.untold[column] and not hosts.stale[column]
     return bool(is_up and has_told and hosts.accepting[column] and hosts.asking[column])
@@ -66,7 +66,7 @@ def spec(
     name: str, kind: str, memory: int, moves: str, special: bool, priority: int,
     loss: str = "wait",
 ) -> ProcessSpec:  # fmt: skip
-    """One of a few sorts of process."""
+    """Draw one of a few sorts of process."""
     word = moves.partition(",")[0]
     strategy = word if word in ("handoff", "criu") else "relaunch"
     migration = MigrationPolicy(strategy, overlap=moves == "overlap") if moves else None
@@ -84,7 +84,7 @@ def spec(
 
 
 class OneOther:
-    """Keeps states on one other host, the same one as long as that is there."""
+    """Checkpoint policy with one replica, on the same host as long as that is up."""
 
     def choose(self, view: CheckpointView) -> CheckpointChoice:
         there = [name for name in (*view.kept_on, *sorted(view.hosts)) if name in view.hosts]
@@ -92,7 +92,7 @@ class OneOther:
 
 
 class Play(RuleBasedStateMachine):
-    """The rules of the play; the promises are its invariants."""
+    """Rules of the state machine; its invariants are the guarantees of the core."""
 
     @initialize(
         backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2), first=ways, second=ways,
@@ -118,33 +118,33 @@ class Play(RuleBasedStateMachine):
                 max_processes=slots if name == "b" else 0,
             )  # fmt: skip
             self.cluster.add(machine)
-        #: Names whose newest process has come to its end by itself, well or badly.
+        #: Names whose newest process has ended by its own exit, with success or failure.
         self.completed: set[str] = set()
         self.failed: set[str] = set()
-        #: Process and host where it could not be started at some time.
+        #: Process and host where a start was impossible at some time.
         self.missing: set[tuple[str, str]] = set()
         self.late: list[happened.Event] = []
         self.left: set[int] = set()
         self.cluster.air.left = self.left
-        #: Since when a host is heard, and nothing from or to it is on its way or was lost.
+        #: Start of the contact with each host, without any lost or pending message.
         self.heard: dict[str, float] = {}
         self.records_seen = 0
-        #: What each host has told this run of the master that it keeps, by name.
+        #: Snapshots that each host has reported to this run of the master, by name.
         self.told_kept: dict[str, tuple[KeptState, ...]] = {}
-        #: Of the present life of each name: the instance that it began with, and its newest state.
+        #: For the present submission of each name: its first instance, and its newest snapshot.
         self.newest: dict[str, tuple[int, tuple[int, int]]] = {}
         self.prompt = True
-        # Something to play with from the beginning.
+        # Processes that run from the beginning.
         for name, moves in (("p0", first), ("p1", second)):
             self.cluster.submit(spec(name, "node", 100, moves, False, 0, loss))
             for machine, running in self.programs():
                 machine.seen_in_graph(running, self.cluster.now)
         self.cluster.settle()
 
-    # --- carrying out --------------------------------------------------------------------
+    # --- execution -----------------------------------------------------------------------
 
     def tell(self, event: happened.Event) -> list[Command]:
-        """One step of the core, looked at closely."""
+        """Take one step of the core and check its commands."""
         commands = self.cluster.decide(event)
         self.cluster.journal(commands)
         self.look_at_assignments(commands)
@@ -171,7 +171,7 @@ class Play(RuleBasedStateMachine):
         self.look_at_states(given)
 
     def look_at_states(self, given: list[Assign]) -> None:
-        """Nobody begins from nothing while a host that is heard has said that it keeps a state."""
+        """Check that no process starts from nothing if a connected host reported its snapshot."""
         for assign in given:
             one = assign.assignment
             keepers = {
@@ -186,7 +186,7 @@ class Play(RuleBasedStateMachine):
                 assert keepers <= set(one.kept_on), "assigned to begin from less than is kept"
 
     def look_at_order(self, given: list[Assign]) -> None:
-        """Nobody was passed by one of its equals (without backfill: by anybody)."""
+        """Check that no process was passed by an equal one (without backfill: by any)."""
         state = self.cluster.state
         for assign in given:
             chosen = state.processes[assign.assignment.instance.process]
@@ -220,7 +220,7 @@ class Play(RuleBasedStateMachine):
         return things[which % len(things)]
 
     def movable(self) -> list[str]:
-        """Processes that run and have a strategy."""
+        """Return the processes that run and have a strategy."""
         return [
             process.name
             for process in self.cluster.state.processes.values()
@@ -228,7 +228,7 @@ class Play(RuleBasedStateMachine):
         ]
 
     def programs(self) -> list[tuple[Machine, str]]:
-        """What really runs, with its machine."""
+        """Return each process that really runs, with its machine."""
         return [
             (machine, instance.process)
             for machine in self.cluster.machines.values()
@@ -242,12 +242,12 @@ class Play(RuleBasedStateMachine):
         return [one for one in self.cluster.machines.values() if one.said and one.connected]
 
     def flow(self) -> None:
-        """While the network is prompt, all that was said arrives at once."""
+        """Deliver all messages at once while the network is prompt."""
         if self.prompt:
             self.everything_arrives()
 
     def known(self, machine: Machine) -> bool:
-        """The master knows this run of the slave."""
+        """Return True if the master knows this run of the slave."""
         find = self.cluster.state.hosts.find
         return machine.connected and find(machine.host_id, machine.incarnation) is not None
 
@@ -326,7 +326,7 @@ class Play(RuleBasedStateMachine):
     # --- nodes ---------------------------------------------------------------------------
 
     def nodes(self, *strategies: str) -> list[tuple[Machine, Node]]:
-        """Those of processes that move by these strategies; with their state, if none are named."""
+        """Return nodes of processes that move by these strategies; default: all with state."""
         return [
             (machine, node)
             for machine, node in self.cluster.air.nodes()
@@ -337,7 +337,7 @@ class Play(RuleBasedStateMachine):
     @precondition(lambda self: self.nodes())
     @rule(which=which_one, what=st.sampled_from([*QUIRKS, "none"]))
     def node_changes(self, which: int, what: str) -> None:
-        """It keeps to the protocol or not."""
+        """Change a node's violation of the protocol, or remove it."""
         _, node = self.pick(self.nodes(), which)
         node.quirks.clear()
         if what != "none":
@@ -367,7 +367,7 @@ class Play(RuleBasedStateMachine):
     def migrate_with_state(
         self, which: int, until: str, fate: str, seconds: float, quirk: str
     ) -> None:
-        """A handoff goes until this was said, and then something befalls it."""
+        """Run a handoff until a message was published, and then inject a fault."""
         _, node = self.pick(self.nodes(), which)
         name = node.instance.process
         for machine in self.cluster.machines.values():
@@ -387,7 +387,7 @@ class Play(RuleBasedStateMachine):
             self.time_passes(seconds, quiet=False)
 
     def go_on_until(self, name: str, word: str) -> None:
-        """From SWITCH on the master hears nothing."""
+        """Deliver messages until one was published; from SWITCH on none reaches the master."""
         for _ in range(40):
             phases = {one.phase.name for one in self.cluster.air.latched if one.process == name}
             said = {
@@ -464,12 +464,12 @@ class Play(RuleBasedStateMachine):
     @precondition(lambda self: self.late)
     @rule(which=which_one)
     def something_arrives_late(self, which: int) -> None:
-        """A reading that was overtaken, or a status batch once more."""
+        """Deliver a reading that was overtaken, or a status batch a second time."""
         self.tell(self.late.pop(which % len(self.late)))
 
     @rule(host=hosts)
     def everything_is_asked_for(self, host: str) -> None:
-        """A report that arrives now, and perhaps late once more."""
+        """Request a full report, which arrives now and perhaps again later."""
         machine = self.machine(host)
         if self.known(machine):
             machine.tell(reducer.ReportRequested(), self.cluster.now)
@@ -502,7 +502,7 @@ class Play(RuleBasedStateMachine):
         what=st.sampled_from(["stubborn", "tame", "missing", "there", "large", "small"]),
     )  # fmt: skip
     def program_changes(self, which: int, host: str, name: str, what: str) -> None:
-        """It ignores signals or not, is installed there or not, uses much or little."""
+        """Change a program: signals ignored, executable missing, or usage."""
         machine = self.machine(host)
         if self.programs() and what != "missing":
             machine, name = self.pick(self.programs(), which)
@@ -548,7 +548,7 @@ class Play(RuleBasedStateMachine):
         ),
     )
     def host_changes(self, host: str, what: str) -> None:
-        """Its wire, its slave, or how busy others keep it."""
+        """Change a host: its wire, its slave, or its load by others."""
         machine = self.machine(host)
         if what in ("cut", "mended"):
             machine.connected = what == "mended"
@@ -560,7 +560,7 @@ class Play(RuleBasedStateMachine):
             for instance in list(machine.programs):
                 machine.tell(reducer.StopOrdered(instance), self.cluster.now)
         elif what == "is detached" and self.known(machine):
-            # Until it is killed, or all is well, no slave is there.
+            # No slave runs until it is killed or `all_is_well`.
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation, machine.begun())
             machine.restart_slave(self.cluster.now)
         elif what in ("leaves unheard", "loses power"):
@@ -579,7 +579,7 @@ class Play(RuleBasedStateMachine):
         self.flow()
 
     def lose_power(self, machine: Machine) -> None:
-        """All that runs there has failed, and what its policy starts again runs when it is back."""
+        """End everything on the host; restart policies start processes again after the rejoin."""
         for instance in list(machine.programs):
             if machine.programs[instance].restart.when == "never":
                 self.failed.add(instance.process)
@@ -587,7 +587,7 @@ class Play(RuleBasedStateMachine):
 
     @rule()
     def all_is_well(self) -> None:
-        """Every host is connected, up, open, and asks for work."""
+        """Connect and open every host and let it request work."""
         for machine in self.cluster.machines.values():
             machine.connected = True
             machine.busy["memory"] = 0.1
@@ -606,7 +606,7 @@ class Play(RuleBasedStateMachine):
         return self.condition(machine) in ("UP", "SUSPECT")
 
     def condition(self, machine: Machine) -> str:
-        """As the master has it."""
+        """Return the condition of a host in the state of the master."""
         table = self.cluster.state.hosts
         return table.condition_of(table.by_name[machine.name]).name
 
@@ -631,7 +631,7 @@ class Play(RuleBasedStateMachine):
         self.everything_arrives()
 
     def nodes_talk(self, *, heard: bool = True) -> bool:
-        """Something arrives at a node, and a report at the master."""
+        """Deliver one message to a node, and one report to the master."""
         arrivals, reports = self.cluster.air.waiting(), self.cluster.air.next_reports()
         for arrive in arrivals[:1]:
             arrive()
@@ -654,7 +654,7 @@ class Play(RuleBasedStateMachine):
 
     @rule(registering=st.lists(hosts, unique=True, max_size=3))
     def master_is_killed(self, registering: list[str]) -> None:
-        """It comes up again from its journal, and some slaves register."""
+        """Kill the master, restore it from its journal and register some slaves."""
         self.late.clear()
         self.told_kept.clear()
         self.cluster.kill_master()
@@ -662,12 +662,12 @@ class Play(RuleBasedStateMachine):
         for host in registering:
             self.register(self.machine(host))
 
-    # --- kept states ---------------------------------------------------------------------
+    # --- snapshots -----------------------------------------------------------------------
 
     @precondition(lambda self: self.nodes())
     @rule(which=which_one, told=chance)
     def state_is_kept(self, which: int, told: bool) -> None:
-        """By the node on its own host, and by its slave where that was told to ship it."""
+        """Publish a snapshot on the node's host; its slave sends replicas if ordered to."""
         self.keep_a_state(*self.pick(self.nodes(), which), told=told)
         self.flow()
 
@@ -685,7 +685,7 @@ class Play(RuleBasedStateMachine):
     @precondition(lambda self: self.nodes())
     @rule(which=which_one, comes_back=chance, stubborn=chance)
     def host_is_lost_with_a_state(self, which: int, comes_back: bool, stubborn: bool) -> None:
-        """A process goes on from what is kept elsewhere, while its old host is cut off."""
+        """Cut off the host of a process, which then continues from a replica elsewhere."""
         machine, node = self.pick(self.nodes(), which)
         self.all_is_well()
         self.time_passes(1.0, quiet=False)
@@ -694,7 +694,7 @@ class Play(RuleBasedStateMachine):
         if stubborn:
             machine.stubborn.add(node.instance.process)
         self.keep_a_state(machine, node, told=True)
-        self.time_passes(1.0, quiet=False)  # its slave is told where to ship the next one
+        self.time_passes(1.0, quiet=False)  # the slave receives the hosts of the next replica
         if node.instance in machine.programs:
             self.keep_a_state(machine, node, told=True)
         machine.connected = False
@@ -718,7 +718,7 @@ class Play(RuleBasedStateMachine):
 
     @rule(name=names, durable=chance)
     def master_is_killed_in_the_act(self, name: str, durable: bool) -> None:
-        """After the core decided: before or after its outcome became durable."""
+        """Kill the master after a decision, before or after the write to the journal."""
         one = spec(name, "service", 100, "", False, 0)
         commands = self.cluster.decide(happened.SubmissionReceived(0, (one,)))
         if durable:
@@ -728,11 +728,11 @@ class Play(RuleBasedStateMachine):
                 self.failed.discard(name)
         self.master_is_killed([])
 
-    # --- promises ------------------------------------------------------------------------
+    # --- invariants ----------------------------------------------------------------------
 
     @invariant()
     def no_process_is_lost(self) -> None:
-        """Each is in exactly one place, and its phase says which."""
+        """Check that each process is in exactly one place that matches its phase."""
         if not hasattr(self, "cluster"):
             return
         state = self.cluster.state
@@ -754,7 +754,7 @@ class Play(RuleBasedStateMachine):
 
     @invariant()
     def the_books_balance(self) -> None:
-        """What counts against a host is the sum over its instances, and never negative."""
+        """Check that the load of each host is the sum over its instances and not negative."""
         if not hasattr(self, "cluster"):
             return
         state = self.cluster.state
@@ -777,9 +777,9 @@ class Play(RuleBasedStateMachine):
             assert (state.hosts.load[:, host.column] >= 0.0).all()
 
     def given_up(self) -> set[int]:
-        """Instances that may run on lost hosts, beside a successor that nobody there hears of.
+        """Return instances that may run on lost hosts, unaware of their successors.
 
-        Not for long once their host is heard again.
+        An instance is removed shortly after its host rejoins.
         """
         self.note_given_up()
         for machine in self.cluster.machines.values():
@@ -796,7 +796,7 @@ class Play(RuleBasedStateMachine):
         self.records_seen = len(self.cluster.records)
 
     def is_heard_well(self, machine: Machine) -> bool:
-        """For so long that everything there has been told."""
+        """Return True if the contact was long enough to report all instances there."""
         calm = self.known(machine) and self.is_up(machine)
         if not calm or machine.ordered or machine.said or machine.polled:
             self.heard.pop(machine.name, None)
@@ -807,7 +807,7 @@ class Play(RuleBasedStateMachine):
 
     @invariant()
     def never_two_active(self) -> None:
-        """In truth: one instance of a process, two only where its spec declares an overlap."""
+        """Check that one instance of a process really runs; two only with a declared overlap."""
         if not hasattr(self, "cluster"):
             return
         left = self.given_up()
@@ -822,7 +822,7 @@ class Play(RuleBasedStateMachine):
             overlap = all(one.spec.migration.overlap and one.spec.migration.strategy
                           for one in running)  # fmt: skip
             strategies = {one.spec.migration.strategy for one in running}
-            silent = strategies in ({"handoff"}, {"criu"})  # all but one of them, see below
+            silent = strategies in ({"handoff"}, {"criu"})  # all but one node are silent, see below
             most = 2 if overlap or silent else 1
             most += any(one.spec.standby.wanted for one in running)
             assert len(running) <= most, [str(one.instance) for one in running]
@@ -836,7 +836,7 @@ class Play(RuleBasedStateMachine):
 
     @invariant()
     def what_was_cancelled_runs_nowhere(self) -> None:
-        """In truth: a `cancelled` process has ended, unless a fence sees to its end."""
+        """Check that a `cancelled` process has really ended, or that a fence will end it."""
         if not hasattr(self, "cluster"):
             return
         left = self.given_up()
@@ -853,7 +853,7 @@ class Play(RuleBasedStateMachine):
 
     @invariant()
     def the_newest_state_of_a_life_is_not_dropped(self) -> None:
-        """What a process may go on from lies somewhere until it has finished or was cancelled."""
+        """Check that the newest snapshot of a process exists until it finished or was cancelled."""
         if not hasattr(self, "cluster"):
             return
         for process in self.cluster.state.processes.values():
@@ -873,7 +873,7 @@ class Play(RuleBasedStateMachine):
 
     @invariant()
     def an_end_is_told_as_it_was(self) -> None:
-        """Nothing has finished or failed that did not end so by itself."""
+        """Check that each finished or failed process really ended so."""
         if not hasattr(self, "cluster"):
             return
         for process in self.cluster.state.processes.values():
@@ -887,7 +887,7 @@ class Play(RuleBasedStateMachine):
                 assert host_lost or process.name in self.failed | missing
 
     def teardown(self) -> None:
-        """Once everything works again, everything that was asked for comes to its end."""
+        """Check that all processes reach their end once all faults are repaired."""
         if not hasattr(self, "cluster"):
             return
         cluster = self.cluster

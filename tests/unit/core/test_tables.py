@@ -1,4 +1,4 @@
-"""The tables in the docstrings of master's and slave's reducer are the tables that run."""
+"""Transition tables in the docstrings of master's and slave's reducer match the code."""
 
 from __future__ import annotations
 

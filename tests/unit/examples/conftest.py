@@ -1,4 +1,4 @@
-"""What the tests of the examples share."""
+"""Shared fixtures of the examples' tests."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # as the examples run: one process, one core
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as in the examples: one process, one core
 
 import pytest
 
@@ -18,7 +18,7 @@ from rosrm_examples.errors import DriveError
 
 @pytest.fixture(scope="session")
 def kitti0001() -> Drive:
-    """KITTI's drive 0001, where this machine has it."""
+    """Return KITTI's drive 0001, where this machine has it."""
     try:
         return load_drive("kitti0001")
     except DriveError as error:
@@ -27,7 +27,10 @@ def kitti0001() -> Drive:
 
 @pytest.fixture(scope="session")
 def street() -> Callable[[int], Drive]:
-    """The simulated street of so many scans; each of them is made once, and nobody changes it."""
+    """Return a function that loads the simulated street with a number of scans.
+
+    Each scan is made once and read-only.
+    """
 
     @functools.cache
     def load(scans: int) -> Drive:

@@ -1,4 +1,4 @@
-"""The files of the examples are what rosrm takes; the demo's arguments and its folder."""
+"""Files of the examples, which rosrm accepts; arguments and folder of the demo."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def test_the_holders_are_of_the_papers_sizes(registry):
     )
 
 
-# --- the demo's own edge ------------------------------------------------------------------------
+# --- command line of the demo -------------------------------------------------------------------
 
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """Runs the demo's main up to where it would start; gives exit status and what it said."""
+    """Run the demo's main up to its start; return exit status and output."""
     monkeypatch.setattr(demo_frame, "StopSignals", lambda: None)
 
     def run_main(*arguments):

@@ -1,4 +1,4 @@
-"""What the demo runs, and when."""
+"""Processes of the demo, and their start times."""
 
 from __future__ import annotations
 

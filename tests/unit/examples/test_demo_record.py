@@ -1,4 +1,4 @@
-"""What is kept of a demo, its files, its figures, its picture and its lines."""
+"""Record of a demo: its files, figures, picture and lines."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def event(sequence, elapsed, kind, name="", on="", **facts):
 
 @pytest.fixture
 def record():
-    """One piece, and one holder that moves from host1 to host2."""
+    """Return a record with one piece, and one holder that moves from host1 to host2."""
     made = Record(HOSTS, {"memory": 0.8}, budget=1000)
     made.events = [
         event(1, 2.0, "submitted", "piece_01"),
@@ -93,7 +93,7 @@ def test_the_instance_that_owned_a_process_last(record):
     assert record.last_instance("piece_01") == ("host2", 1)
     assert record.last_instance("holder_01") == ("host2", 3)
     assert record.last_instance("nobody") is None
-    del record.events[6:]  # the move has not come to its end
+    del record.events[6:]  # the move has not ended
     assert record.last_instance("holder_01") == ("host1", 2)
 
 

@@ -1,4 +1,4 @@
-"""Scans and poses as ROS messages: the same numbers on either side."""
+"""Scans and poses as ROS messages: equal numbers on both sides."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def over_the_wire(message):
 
 @pytest.mark.parametrize("points", [0, 1, 11000])
 def test_a_cloud_keeps_every_bit(points) -> None:
-    """Also NaN, which scanners send for "no echo"."""
+    """NaN is kept, too; scanners send it for "no echo"."""
     given = cloud(points)
     given[:1] = np.nan
     message = over_the_wire(cloud_message(given, 1317042146.25, "lidar"))
@@ -43,7 +43,7 @@ def test_a_cloud_keeps_every_bit(points) -> None:
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_a_cloud_of_a_real_driver(order) -> None:
-    """Further fields, an image of rows that are padded, either byte order."""
+    """The cloud has further fields, an image of padded rows, and either byte order."""
     given = cloud(6).reshape(2, 3, 3)
     layout = np.dtype(
         {
@@ -69,7 +69,7 @@ def test_a_cloud_of_a_real_driver(order) -> None:
 
 
 def test_a_cloud_that_is_none_is_refused() -> None:
-    """It says what it lacks."""
+    """The error has the missing part."""
     good = cloud_message(cloud(2), 0.0, "lidar")
     flat = cloud_message(cloud(2), 0.0, "lidar")
     flat.fields = list(good.fields)[:2]
@@ -89,7 +89,7 @@ def test_a_cloud_that_is_none_is_refused() -> None:
 
 @pytest.mark.parametrize("t", [0.0, 0.1, 0.30000000000000004, 1317042146.1416936, 2.0**31 - 1.5])
 def test_a_stamp_is_the_time_to_the_nanosecond(t) -> None:
-    """And what comes of a stamp gives the same stamp."""
+    """A stamp converted to a time and back is the same stamp."""
     stamp = stamp_of(t)
     assert seconds_of(stamp) == pytest.approx(t, abs=1e-9)
     assert stamp_of(seconds_of(stamp)) == stamp
@@ -102,7 +102,7 @@ def test_a_time_just_below_a_second() -> None:
 
 
 def test_odometry_keeps_pose_and_velocity() -> None:
-    """Up to what a quaternion can tell."""
+    """The accuracy is that of a quaternion."""
     pose = make_pose(rotation_from_vector(np.array([0.3, -0.2, 2.9])), np.array([1e3, -2.0, 0.1]))
     velocity = np.arange(6) / 7
     message = over_the_wire(odometry_message(pose, velocity, 12.5))
@@ -113,7 +113,7 @@ def test_odometry_keeps_pose_and_velocity() -> None:
 
 
 def test_a_drive_is_played_in_its_own_time_or_evenly() -> None:
-    """Scaled, or so many scans a second."""
+    """The pace is scaled, or a number of scans a second."""
     times = np.array([5.0, 5.1, 5.3])
     assert schedule(times, 2.0, None) == pytest.approx([0.0, 0.05, 0.15])
     assert schedule(times, 1.0, 50.0) == pytest.approx([0.0, 0.02, 0.04])

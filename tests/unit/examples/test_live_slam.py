@@ -1,4 +1,4 @@
-"""The state of the live SLAM over the wire, and what each instance says it mapped itself."""
+"""State of the live SLAM in messages, and the part that each instance maps."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Instance:
 
 @pytest.mark.parametrize("reverse", [False, True], ids=["in order", "in reverse"])
 def test_with_the_full_state_it_goes_on_exactly(drive, unmigrated, reverse) -> None:
-    """Whatever it had followed before is overwritten, in whatever order the parts come."""
+    """An earlier state is overwritten, in any order of the parts."""
     source, destination = Instance("full"), Instance("full")
     for at in range(12):
         source.go_on(drive, at, at + 1)
@@ -74,9 +74,9 @@ def test_with_the_full_state_it_goes_on_exactly(drive, unmigrated, reverse) -> N
     ("scans_of", "step"), [("drive", 1), ("kitti0001", 4)], ids=["street", "kitti0001"]
 )
 def test_with_the_full_state_it_goes_on_exactly_from_any_scan(request, scans_of, step) -> None:
-    """After one scan more it knows what the original knows; so it does after all the others.
+    """After one more scan its knowledge is the original's, and so after all the others.
 
-    Tried after each scan of the street, and after every fourth of 60 of a real drive.
+    This is tried after each scan of the street, and after every fourth of 60 of a real drive.
     """
     drive = request.getfixturevalue(scans_of).part(0, 60)
     source = Instance("full")
@@ -95,12 +95,12 @@ def test_with_the_full_state_it_goes_on_exactly_from_any_scan(request, scans_of,
 
 
 def knowledge(one: Instance):
-    """All that the next pose depends on."""
+    """Return everything that the next pose depends on."""
     return one.live.slam.motion_state(newest=1), one.live.slam.map_state()
 
 
 def test_with_the_pose_alone_it_goes_on_within_a_tenth_of_a_metre(drive, unmigrated) -> None:
-    """The last scan is what the new map begins with."""
+    """The new map begins with the last scan."""
     source, destination = Instance("pose"), Instance("pose")
     for at in range(12):
         source.go_on(drive, at, at + 1)
@@ -114,7 +114,7 @@ def test_with_the_pose_alone_it_goes_on_within_a_tenth_of_a_metre(drive, unmigra
 
 @pytest.mark.parametrize("state", STATES)
 def test_a_successor_takes_over_before_the_first_scan(drive, unmigrated, state) -> None:
-    """Nothing is known yet, and that is what it begins with; it had followed another before."""
+    """The empty state replaces an earlier one, though nothing is known yet."""
     source, destination, other = Instance(state), Instance(state), Instance(state)
     other.go_on(drive, 0, 5)
     destination.follow(other)
@@ -126,7 +126,7 @@ def test_a_successor_takes_over_before_the_first_scan(drive, unmigrated, state) 
 
 @pytest.mark.parametrize("state", STATES)
 def test_from_hand_to_hand(drive, unmigrated, state) -> None:
-    """Five instances, each the destination and then the source of a move."""
+    """Each of five instances is the destination and then the source of a move."""
     instances = [Instance(state) for _ in range(5)]
     ends = [0, 3, 4, 11, 17, SCANS]
     for number, instance in enumerate(instances):
@@ -141,7 +141,7 @@ def test_from_hand_to_hand(drive, unmigrated, state) -> None:
 
 
 def test_the_map_travels_only_when_it_has_changed(drive) -> None:
-    """And always from one who has taken it over: nobody has heard it of him."""
+    """An instance publishes a map that it has taken over, because it has not done so before."""
     source, destination = Instance("full"), Instance("full")
     source.go_on(drive, 0, 3)
     saves = {topic.name: topic.save for topic in source.topics}
@@ -152,7 +152,7 @@ def test_the_map_travels_only_when_it_has_changed(drive) -> None:
 
 
 def test_the_trajectory_does_not_make_the_state_grow(drive) -> None:
-    """What moves with every scan stays as small as it is."""
+    """The part that changes with every scan keeps its small size."""
     source = Instance("full")
     source.go_on(drive, 0, 2)
     before = len(source.published["~/state"])
@@ -177,7 +177,7 @@ def test_a_part_has_what_its_instance_mapped_and_no_more(drive) -> None:
 
 
 def test_a_scan_that_comes_twice_is_refused_and_counted(drive) -> None:
-    """It changes nothing."""
+    """The repeated scan changes nothing."""
     instance = Instance("full")
     instance.go_on(drive, 0, 3)
     with pytest.raises(ValueError, match="must be later"):
@@ -187,7 +187,7 @@ def test_a_scan_that_comes_twice_is_refused_and_counted(drive) -> None:
 
 
 def test_parts_are_read_in_the_order_of_the_drive(drive, tmp_path: Path) -> None:
-    """Whatever their names are."""
+    """Their names make no difference."""
     source, destination = Instance("full"), Instance("full")
     source.go_on(drive, 0, 4)
     destination.follow(source)

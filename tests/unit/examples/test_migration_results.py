@@ -1,4 +1,4 @@
-"""What the migration demo says of a run, and that it sees what went wrong."""
+"""Results of the migration demo, and detection of errors in a run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def part(host: str, first: int, end: int, refused: int = 0) -> MapPart:
 
 
 def run() -> LiveRun:
-    """All went well: three scans here, three there, the fourth 30 ms late."""
+    """Return a run without errors: three scans here, three there, the fourth 30 ms late."""
     late = [0.0, 0.0, 0.0, 0.03, 0.0, 0.0]
     heard = [
         Heard(100.0 + PERIOD * index + late[index], index * 100_000_000, pose)
@@ -77,14 +77,14 @@ def test_poses_out_of_order() -> None:
     heard = [*seen.heard[:4], seen.heard[5], seen.heard[4]]
     late = replace(seen, heard=heard)
     assert summarise(late, POSES, 1)["out_of_order"] == 1
-    assert wrong(late) == []  # two writers: what DDS has to send again comes late
+    assert wrong(late) == []  # with two writers, repeated DDS messages arrive late
 
 
 def test_no_migration() -> None:
     seen = replace(run(), parts=[part("a", 0, 6)])
     assert summarise(seen, POSES, 0)["gap_ms"] is None
     assert wrong(seen, migrations=0)[0] == "migrations is 0, not 1"
-    assert wrong(seen) == ["no successor was heard right after its source"]  # it moved too late
+    assert wrong(seen) == ["no successor was heard right after its source"]  # the move was too late
 
 
 def test_a_part_that_was_not_written() -> None:
@@ -107,7 +107,7 @@ def test_nothing_was_heard() -> None:
 
 
 def test_only_the_slam_moves_and_only_off_the_fast_disk(tmp_path) -> None:
-    """What holds the scanner, and what needs the disk, stays; the SLAM fits on either big host."""
+    """Only the SLAM may move, and it fits on either big host."""
     live = LiveDrive(DRIVE, 1.0, "full", tmp_path, tmp_path / "report", tmp_path)
     slam, recorder = slam_spec(live), recorder_spec()
     assert slam.migration.strategy == "handoff"

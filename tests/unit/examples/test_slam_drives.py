@@ -1,4 +1,4 @@
-"""Where drives come from, and what is said when they do not."""
+"""Sources of drives, and errors of unreadable ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EARTH_RADIUS_M = 6378137.0
 
 
 def write_npz(path: Path, **changes: object) -> Path:
-    """Writes a thinned drive of two scans with 2 and 1 points; `changes` spoil it."""
+    """Write a thinned drive of two scans with 2 and 1 points; `changes` spoil it."""
     arrays = {
         "xyz_cm": np.array([[100, 200, -300], [0, 0, 50], [7, 8, 9]], np.int16),
         "count": np.array([2, 1], np.int32),
@@ -33,7 +33,7 @@ def write_npz(path: Path, **changes: object) -> Path:
 
 
 def write_raw(root: Path, numbers: tuple[int, ...] = (0, 1, 2)) -> Path:
-    """Writes a raw drive that goes 10 m north in each step, facing north."""
+    """Write a raw drive that goes 10 m north in each step, facing north."""
     folder = root / "2011_09_26" / "2011_09_26_drive_0042_sync"
     scans, packets = folder / "velodyne_points" / "data", folder / "oxts" / "data"
     scans.mkdir(parents=True)

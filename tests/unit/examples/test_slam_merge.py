@@ -1,4 +1,4 @@
-"""Joining mapped pieces, and what is written of them."""
+"""Merge of mapped pieces, and its output files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosrm_examples.slam import Slam
 
 
 def perfect_pieces(drive: Drive, of: int) -> list[MapPiece]:
-    """Pieces as a SLAM without any error would map them."""
+    """Return pieces as a SLAM without any error would map them."""
     pieces = []
     for number in range(1, of + 1):
         part = drive.piece(number, of)
@@ -30,7 +30,7 @@ def perfect_pieces(drive: Drive, of: int) -> list[MapPiece]:
 
 
 def mapped_pieces(drive: Drive, of: int) -> list[MapPiece]:
-    """Pieces as SLAM really maps them."""
+    """Return pieces as SLAM really maps them."""
     pieces = []
     for number in range(1, of + 1):
         part = drive.piece(number, of)

@@ -1,4 +1,4 @@
-"""NDT matching and the voxel map below it."""
+"""NDT matching, and the voxel map that it uses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rosrm_examples.voxels import thin, voxel_centres, voxel_keys
 
 
 def bumpy_room(seed: int, count: int = 4000) -> Floats:
-    """(N, 3) points on a bumpy floor and two walls, metres."""
+    """Return (N, 3) points on a bumpy floor and two walls, metres."""
     rng = np.random.default_rng(seed)
     across = rng.uniform(-12, 12, (count, 3))
     floor, wall = across[: count // 2], across[count // 2 :]
@@ -29,14 +29,14 @@ def bumpy_room(seed: int, count: int = 4000) -> Floats:
 
 @pytest.fixture
 def room() -> NdtMap:
-    """A map of the room with 2 m cells."""
+    """Return a map of the room with 2 m cells."""
     ndt = NdtMap(2.0)
     ndt.insert(bumpy_room(seed=1))
     return ndt
 
 
 def a_little_off() -> Pose:
-    """A pose near the one that the room was mapped from."""
+    """Return a pose near the one that the room was mapped from."""
     return move(np.eye(4), np.array([0.21, -0.13, 0.08, 0.01, -0.015, 0.03]))
 
 
@@ -56,7 +56,7 @@ def test_the_gradient_is_the_slope_of_the_score(room: NdtMap) -> None:
 
 def test_the_hessian_is_the_curvature_of_the_score(room: NdtMap) -> None:
     """The analytic Hessian equals second differences of the score."""
-    # No point may change its cell within a step, or the score jumps: keep those well inside.
+    # Keep points well inside their cells: the score jumps where a point changes its cell.
     points, pose, step = bumpy_room(seed=2), a_little_off(), 1e-4
     inside = np.abs(transform(pose, points) / room.cell % 1 - 0.5).max(axis=1) < 0.49
     points = points[inside]

@@ -1,4 +1,4 @@
-"""SLAM as a whole: how true it is, and that its state is all of it."""
+"""SLAM as a whole: accuracy, and completeness of its state."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rosrm_examples.slam import Slam, SlamSettings
 
 
 def go_on(slam: Slam, drive: Drive) -> Floats:
-    """Feeds a drive's scans; returns all poses so far, (S, 4, 4)."""
+    """Feed a drive's scans; return all poses so far, (S, 4, 4)."""
     for points, t in zip(drive.scans(), drive.times, strict=True):
         slam.add_scan(points, t)
     return np.array(slam.poses)
 
 
 def over_the_wire(state: Arrays) -> Arrays:
-    """Writes and reads a state as npz, without pickle."""
+    """Write and read a state as npz, without pickle."""
     wire = io.BytesIO()
     np.savez(wire, allow_pickle=False, **state)
     wire.seek(0)
@@ -52,7 +52,7 @@ def test_the_street_is_mapped_truly() -> None:
 
 
 def test_mapping_may_start_anywhere_and_fast(street) -> None:
-    """With no motion known yet, 20 m/s are found at once, wherever on the street it starts."""
+    """Without a known motion, SLAM finds 20 m/s at once, at any start on the street."""
     drive = street(60)
     assert drive.truth is not None
     for start in range(0, 56, 4):
@@ -79,7 +79,7 @@ def test_a_restored_slam_goes_on_to_the_last_bit(street, at: int) -> None:
 
 
 def test_a_saved_state_stays_what_it_was(street) -> None:
-    """The original goes on without changing the state that was taken from it."""
+    """The original continues without a change of the saved state."""
     drive = street(8)
     slam = Slam()
     go_on(slam, drive.part(0, 4))
@@ -91,7 +91,7 @@ def test_a_saved_state_stays_what_it_was(street) -> None:
 
 
 def test_the_state_without_the_map_is_small_and_nearly_as_good(street) -> None:
-    """Pose and motion alone let the drive go on within 0.1 m, with the last scan as a new map."""
+    """Pose and motion alone continue the drive within 0.1 m, with the last scan as a new map."""
     drive = street(20)
     scans = list(drive.scans())
     expected = go_on(Slam(), drive)
@@ -130,7 +130,7 @@ def test_a_scan_from_the_past_is_refused() -> None:
 
 
 def test_a_scan_without_points_goes_on_as_before(street) -> None:
-    """An empty scan is no trouble: the pose is the predicted one."""
+    """The pose of an empty scan is the predicted one."""
     drive = street(3)
     slam = Slam()
     poses = go_on(slam, drive)
@@ -141,7 +141,7 @@ def test_a_scan_without_points_goes_on_as_before(street) -> None:
 
 @pytest.mark.parametrize("vector", [[0, 0, 0], [1e-10, 0, 0], [0.3, -0.2, 1.1], [0, 3.0, 0]])
 def test_rotations_go_back_and_forth(vector: list[float]) -> None:
-    """A rotation vector, its matrix and its quaternion say the same."""
+    """A rotation vector, its matrix and its quaternion describe the same rotation."""
     given = np.array(vector)
     rotation = rotation_from_vector(given)
     assert vector_from_rotation(rotation) == pytest.approx(given, abs=1e-12)

@@ -1,4 +1,4 @@
-"""What a process on a host inherits of the terminal."""
+"""Environment of a process on a lab host."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rosrm_lab.host import host_environment
 
 
 def test_discovery_reaches_the_lab_whatever_the_terminal_says():
-    """A caller who stays on loopback outside would find nobody inside."""
+    """A caller's restriction to loopback would make discovery inside the lab fail."""
     caller = {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOCALHOST_ONLY": "1",
@@ -31,18 +31,18 @@ def test_discovery_reaches_the_lab_whatever_the_terminal_says():
     ],
 )
 def test_the_settings_of_a_dds_are_not_handed_on(variable):
-    """They may name interfaces, peers or transports that reach nobody in a lab."""
+    """Such settings may name interfaces, peers or transports that do not exist in a lab."""
     assert variable not in host_environment({variable: "x"}, "host1")
 
 
 def test_the_rest_is_the_terminals():
-    """PATH, the domain, and what else a user has set."""
+    """PATH, the domain and other variables of the user are kept."""
     caller = {"PATH": "/opt/bin:/bin", "ROS_DOMAIN_ID": "7", "MINE": "x"}
     assert caller.items() <= host_environment(caller, "host1").items()
 
 
 def test_what_is_written_goes_to_the_disk_of_the_host():
-    """States, temporary files and logs."""
+    """Snapshots, temporary files and logs are on that disk."""
     inside = host_environment({"ROS_LOG_DIR": "/root/logs", "TMPDIR": "/tmp/x"}, "host1")
     assert {inside[name] for name in ("XDG_STATE_HOME", "TMPDIR", "ROS_HOME")} == {
         "/run/data/state",
@@ -53,5 +53,5 @@ def test_what_is_written_goes_to_the_disk_of_the_host():
 
 
 def test_a_slave_measures_the_host_without_being_told():
-    """By the variable that gives the default of `scope`."""
+    """The variable that gives the default of `scope` selects the host."""
     assert host_environment({}, "host1")["ROSRM_SCOPE"] == "cgroup"

@@ -17,7 +17,7 @@ V2 = "30 23 0:26 / /sys/fs/cgroup{at} rw shared:9 - cgroup2 cgroup2 rw,nsdelegat
 
 
 def tree(root, *mounts, controllers=None, at=""):
-    """A machine with these control groups mounted."""
+    """Create a machine with these control groups mounted."""
     (root / "proc/self").mkdir(parents=True)
     (root / "proc/self/mountinfo").write_text("".join(f"{line}\n" for line in mounts))
     for line in mounts:
@@ -36,7 +36,7 @@ def test_version_2_has_all_in_one_place(tmp_path):
 
 
 def test_version_1_has_them_apart(tmp_path):
-    """Also where two controllers are mounted together."""
+    """This holds also where two controllers are mounted together."""
     root = tree(tmp_path, V1.format(n=1, name="memory"), V1.format(n=2, name="cpu,cpuacct"))
     assert find_hierarchies(root) == [
         Hierarchy(1, root / "sys/fs/cgroup/memory", ("memory",)),
@@ -45,7 +45,7 @@ def test_version_1_has_them_apart(tmp_path):
 
 
 def test_version_1_goes_first_where_both_are_mounted(tmp_path):
-    """A hybrid: version 2 has what version 1 has not."""
+    """In a hybrid, version 2 has the controllers that version 1 lacks."""
     lines = [V2.format(at="/unified"), V1.format(n=1, name="memory")]
     root = tree(tmp_path, *lines, controllers="cpu", at="/unified")
     found = {one.version: one.controllers for one in find_hierarchies(root)}
@@ -60,7 +60,7 @@ def test_version_1_goes_first_where_both_are_mounted(tmp_path):
     ],
 )
 def test_a_missing_controller_is_named(tmp_path, mounts, missing):
-    """And how a container gets it."""
+    """The error also has the way to enable it in a container."""
     with pytest.raises(LabError, match=rf"with {missing} is mounted.*--privileged"):
         find_hierarchies(tree(tmp_path, *mounts))
 
@@ -78,7 +78,7 @@ def test_limits_of_version_1():
 
 
 def test_limits_of_version_2():
-    """The same in its words."""
+    """The limits are those of version 1 in other files."""
     assert list(limits(Hierarchy(2, Path("/m"), ("memory", "cpu")), HOST)) == [
         ("memory.max", str(GIB)),
         ("memory.swap.max", "0"),
@@ -88,7 +88,7 @@ def test_limits_of_version_2():
 
 @pytest.mark.parametrize("cpu", [0.01, 0.02, 0.049, 0.05, 0.3, 7.5])
 def test_the_kernel_takes_every_quota(cpu):
-    """It refuses a quota below 1 ms; the share is what was asked for."""
+    """The kernel refuses a quota below 1 ms; the share is as requested."""
     ((_, text),) = limits(Hierarchy(2, Path("/c"), ("cpu",)), HostPlan("a", cpu=cpu))
     quota, period = map(int, text.split())
     assert quota >= 1000
@@ -101,7 +101,7 @@ def test_a_host_without_limits_gets_none():
 
 
 def test_version_2_hands_the_controllers_down_to_the_leaves(tmp_path, monkeypatch):
-    """Each group above switches them on for those below; the limits stand in one leaf."""
+    """Each group above enables them for those below; the limits are in one leaf."""
     root = tree(tmp_path, V2.format(at=""), controllers="cpu memory")
     real = Path.mkdir
 
@@ -122,7 +122,7 @@ def test_version_2_hands_the_controllers_down_to_the_leaves(tmp_path, monkeypatc
     assert (limited / "cpu.max").read_text() == "10000 20000"
     assert (limited / "memory.max").read_text() == str(GIB)
     assert not (free / "memory.max").exists()
-    assert not (limited / "cgroup.subtree_control").read_text()  # processes are in here
+    assert not (limited / "cgroup.subtree_control").read_text()  # this group has processes
     assert groups.doors([hierarchy], "lab", "host1", "limited") == [limited / "cgroup.procs"]
 
 
@@ -157,7 +157,7 @@ def test_a_group_that_holds_processes_is_explained(tmp_path, monkeypatch):
 
 
 def test_memory_in_use_is_without_cache(tmp_path):
-    """As the probe has it."""
+    """The value equals the probe's."""
     group = tmp_path / "rosrm-lab/lab/host1/limited"
     group.mkdir(parents=True)
     (group / "memory.current").write_text("1000\n")
@@ -186,7 +186,7 @@ def test_memory_in_use_is_without_cache(tmp_path):
     ],
 )
 def test_what_a_container_may_still_use(tmp_path, version, files, left):
-    """Its limit less what is used; the machine's own group of version 2 has no such file."""
+    """The result is the limit less the usage; the machine's own group of version 2 has no limit."""
     for name, content in files.items():
         (tmp_path / f"memory.{name}").write_text(f"{content}\n")
     cpu = Hierarchy(1, tmp_path / "cpu", ("cpu",))

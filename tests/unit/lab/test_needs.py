@@ -1,4 +1,4 @@
-"""What is missing on a machine is said before anything is made."""
+"""Requirements of a lab on its machine, checked before anything is made."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def status(effective):
 
 
 def test_with_all_rights_nothing_is_said():
-    """More than those needed do no harm."""
+    """More rights than required are fine."""
     needs.check_rights(status=status(ALL | 1))
 
 
 @pytest.mark.parametrize("name", needs.CAPABILITIES)
 def test_the_missing_right_is_named_and_no_other(name):
-    """With what it is needed for."""
+    """The error has the purpose of the right."""
     bit, reason = needs.CAPABILITIES[name]
     with pytest.raises(LabError, match=f"missing: {name} {reason}\\. ") as raised:
         needs.check_rights(status=status(ALL & ~(1 << bit)))
@@ -34,7 +34,7 @@ def test_the_missing_right_is_named_and_no_other(name):
 
 
 def test_an_ordinary_user_is_told_of_sudo_and_of_slices(monkeypatch):
-    """The slices have the sizes that were asked for."""
+    """The slices have the requested sizes."""
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     hosts = uniform(3, memory=512 * MIB, cpu=0.5, disk=GIB)
     with pytest.raises(LabError) as raised:
@@ -48,11 +48,11 @@ def test_root_of_a_container_is_told_of_privileges(monkeypatch):
     """`sudo` would not help there."""
     monkeypatch.setattr("os.geteuid", lambda: 0)
     with pytest.raises(LabError, match="docker run --privileged"):
-        needs.check_rights(status=status(0xA80425FB))  # what Docker gives
+        needs.check_rights(status=status(0xA80425FB))  # rights that Docker gives
 
 
 def test_the_slice_that_is_offered_is_a_good_file(tmp_path):
-    """Who follows the advice gets a slave's configuration."""
+    """A slave's configuration file can be copied from the advice."""
     from rosrm.config import load_host
 
     with pytest.raises(LabError) as raised:
@@ -65,7 +65,7 @@ def test_the_slice_that_is_offered_is_a_good_file(tmp_path):
 
 @pytest.mark.parametrize("command", needs.COMMANDS)
 def test_a_missing_command_is_named_with_its_package(monkeypatch, command):
-    """Of Debian and Ubuntu."""
+    """The package is that of Debian and Ubuntu."""
     monkeypatch.setattr("shutil.which", lambda name, path: None)
     package = needs.COMMANDS[command]
     with pytest.raises(LabError, match=f"'{command}' is missing.*apt-get install {package}"):
@@ -73,7 +73,7 @@ def test_a_missing_command_is_named_with_its_package(monkeypatch, command):
 
 
 def test_too_little_memory_is_refused(monkeypatch):
-    """What there is, and what was asked for."""
+    """The error has the available and the requested memory."""
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=GIB))
     hosts = uniform(3, memory=512 * MIB, disk=16 * MIB)
     with pytest.raises(LabError, match="1536 MiB of memory together, and 1024 MiB are available"):
@@ -81,7 +81,7 @@ def test_too_little_memory_is_refused(monkeypatch):
 
 
 def test_a_container_has_no_more_memory_than_its_own_limit(monkeypatch, tmp_path):
-    """However much the machine has; where the machine has less, that counts."""
+    """A smaller amount on the machine takes precedence."""
     (tmp_path / "memory.max").write_text(f"{2 * GIB}\n")
     (tmp_path / "memory.current").write_text(f"{GIB}\n")
     (tmp_path / "memory.stat").write_text("inactive_file 0\n")
@@ -99,7 +99,7 @@ def test_a_container_has_no_more_memory_than_its_own_limit(monkeypatch, tmp_path
 
 
 def test_hosts_without_a_limit_ask_for_no_memory(monkeypatch):
-    """They share what there is."""
+    """They share the memory of the machine."""
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=GIB))
     monkeypatch.setattr(needs, "find_command", lambda name: name)
     monkeypatch.setattr(Path, "exists", lambda path: True)
@@ -107,7 +107,7 @@ def test_hosts_without_a_limit_ask_for_no_memory(monkeypatch):
 
 
 def test_too_little_disk_is_refused(monkeypatch, tmp_path):
-    """The folder need not be there yet."""
+    """The folder need not exist yet."""
     monkeypatch.setattr(needs, "find_command", lambda name: name)
     monkeypatch.setattr(needs, "_DEVICE", tmp_path)
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=GIB))
@@ -118,7 +118,7 @@ def test_too_little_disk_is_refused(monkeypatch, tmp_path):
 
 
 def test_a_machine_without_loop_devices_is_told_how_to_get_them(monkeypatch, tmp_path):
-    """The disks of the hosts are files that are mounted."""
+    """The disks of the hosts are mounted files."""
     monkeypatch.setattr(needs, "find_command", lambda name: name)
     monkeypatch.setattr(needs, "_DEVICE", tmp_path / "none")
     with pytest.raises(LabError, match=r"no loop devices.*modprobe loop"):
@@ -126,7 +126,7 @@ def test_a_machine_without_loop_devices_is_told_how_to_get_them(monkeypatch, tmp
 
 
 def test_more_cores_than_there_are_is_only_noted(monkeypatch):
-    """It is a fair wish, and slow."""
+    """Overbooked cores are slow, but allowed."""
     monkeypatch.setattr("psutil.cpu_count", lambda: 2)
     assert needs.overbooked(uniform(4, cpu=0.5)) == ""
     assert "may use 2.5 cores together and this machine has 2" in needs.overbooked(

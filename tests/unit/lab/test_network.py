@@ -1,4 +1,4 @@
-"""What a kernel or a container refuses is said in words."""
+"""Errors of a lab's network: refusals of the kernel or of a container."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PLAN = LabPlan("lab", tuple(uniform(2)), IPv4Network("10.9.8.0/24"))
 
 
 class Kernel:
-    """A netlink connection to a kernel that has neither bridges nor cables."""
+    """Fake netlink connection to a kernel that has neither bridges nor cables."""
 
     def __init__(self, **_):
         pass
@@ -38,7 +38,7 @@ class Kernel:
     ],
 )
 def test_a_kernel_without_bridges_is_told_how_to_get_them(monkeypatch, change, said):
-    """With the kernel's own words, and what to do."""
+    """The error has the kernel's own message and the remedy."""
     monkeypatch.setattr(network.netns, "create", lambda name: None)
     monkeypatch.setattr(network, "IPRoute", Kernel)
     with pytest.raises(
@@ -55,7 +55,7 @@ def test_a_kernel_without_bridges_is_told_how_to_get_them(monkeypatch, change, s
     ],
 )
 def test_a_container_that_forbids_namespaces_is_told_of_privileges(monkeypatch, refusal, said):
-    """Whether its rules refuse a system call or kill who tries."""
+    """The container's rules may refuse a system call or kill the caller."""
 
     def refuse(name):
         raise refusal

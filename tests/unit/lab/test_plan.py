@@ -1,4 +1,4 @@
-"""What a lab consists of: names, addresses, sizes."""
+"""Plan of a lab: names, addresses, sizes."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ def test_no_two_hosts_share_an_address_or_a_cable(number, base, prefix):
     assert lab.subnet.broadcast_address not in addresses
     assert len({lab.mac(name) for name in lab.names}) == number
     assert len({lab.port(name) for name in lab.names}) == number
-    assert all(len(lab.port(name)) <= 15 for name in lab.names)  # what Linux allows
+    assert all(len(lab.port(name)) <= 15 for name in lab.names)  # limit of Linux
 
 
 def test_a_hardware_address_is_one_that_anybody_may_choose():
-    """Locally administered and unicast."""
+    """The address is locally administered and unicast."""
     first = int(plan().mac("host1").split(":", 1)[0], 16)
     assert first & 0b11 == 0b10
 
 
 def test_a_subnet_that_is_too_small_is_refused():
-    """The network's own address and the broadcast address are nobody's."""
+    """The network's own address and the broadcast address cannot be used."""
     assert plan(2, IPv4Network("10.9.8.0/30"))
     with pytest.raises(ConfigError, match=r"10.9.8.0/30 has 2 addresses for 3 hosts"):
         plan(3, IPv4Network("10.9.8.0/30"))
@@ -73,7 +73,7 @@ def test_the_same_host_twice_is_refused():
 
 @pytest.mark.parametrize("number", [0, 251, -1])
 def test_a_wrong_number_of_hosts_is_refused(number):
-    """One at least, and no more than a /24 holds."""
+    """The number is one at least, and no more than a /24 holds."""
     with pytest.raises(ConfigError, match=f"{number} hosts; allowed are 1 to 250"):
         uniform(number)
 
@@ -97,19 +97,19 @@ def test_a_name_that_no_host_can_have_is_refused(name):
     ],
 )
 def test_a_limit_that_leaves_no_room_is_refused(limits, said):
-    """Nothing could start on such a host."""
+    """No process could start on such a host."""
     with pytest.raises(ConfigError, match=said):
         HostPlan("host1", **limits)
 
 
 def test_an_unknown_host_is_named_with_those_there_are():
-    """So that the right one is seen."""
+    """The list helps to find the right name."""
     with pytest.raises(ConfigError, match="no host 'host9'; it has: host1, host2, host3"):
         plan().address("host9")
 
 
 def test_a_plan_survives_its_file():
-    """Nothing of it is lost on the way."""
+    """Every field is restored."""
     lab = LabPlan("x", (HostPlan("a", GIB, 0.5, 2 * GIB), HostPlan("b")), NET)
     assert LabPlan.from_plain(lab.to_plain()) == lab
 
@@ -128,7 +128,7 @@ def test_when_all_ranges_are_taken_that_is_said():
 
 
 def test_a_range_in_use_is_refused_with_its_owner():
-    """Who has it tells what to choose instead."""
+    """The owner helps to choose another range."""
     taken = [(IPv4Network("10.9.0.0/16"), "eth0")]
     check_free(IPv4Network("10.8.0.0/24"), taken)
     with pytest.raises(ConfigError, match=r"10.9.8.0/24 is in use: eth0 has 10.9.0.0/16"):
@@ -146,7 +146,7 @@ def test_a_range_in_use_is_refused_with_its_owner():
     ],
 )
 def test_a_range_with_addresses_that_no_host_can_have_is_refused(subnet, what):
-    """Also a larger one around it; said before anything is made, and with what to choose."""
+    """A larger range around it is refused, too, before anything is made, with an alternative."""
     with pytest.raises(ConfigError, match=f"{subnet} cannot be a lab's: .*{what}.*10.9.0.0/24"):
         check_usable(IPv4Network(subnet))
     with pytest.raises(ConfigError, match="cannot be a lab's"):
@@ -154,14 +154,14 @@ def test_a_range_with_addresses_that_no_host_can_have_is_refused(subnet, what):
 
 
 def test_the_ranges_of_hosts_are_usable():
-    """Private or not."""
+    """Private and public ranges are usable."""
     for text in ("10.9.0.0/24", "192.168.0.0/16", "126.0.0.0/8", "128.0.0.0/8", "223.255.255.0/24"):
         check_usable(IPv4Network(text))
 
 
 @pytest.mark.parametrize("text", ["10.9.8.7/24", "fe80::/64", "hallo", "10.9.8.0/33", ""])
 def test_what_is_no_range_is_refused(text):
-    """Host bits, IPv6 and nonsense."""
+    """Host bits, IPv6 and invalid text are refused."""
     with pytest.raises(ConfigError, match="give an IPv4 range such as"):
         parse_subnet(text)
 

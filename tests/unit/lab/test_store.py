@@ -1,4 +1,4 @@
-"""What is kept of a lab, and the locks."""
+"""Stored records of labs, and their locks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosrm_lab.wires import Link
 
 @pytest.fixture(autouse=True)
 def folders(monkeypatch, tmp_path):
-    """Nothing of the machine's own labs."""
+    """Use folders without the machine's own labs."""
     monkeypatch.setattr(store, "RUN", tmp_path / "run" / "rosrm-lab")
     monkeypatch.setattr(store, "IMAGES", tmp_path / "lib" / "rosrm-lab")
     (tmp_path / "run").mkdir()
@@ -32,14 +32,14 @@ def record(name="lab"):
 
 
 def test_a_record_is_read_as_it_was_written():
-    """Nothing of it is lost on the way."""
+    """Every field is restored."""
     store.write(record())
     assert store.read("lab") == record()
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"version": 2}', '{"version": 1}', "null"])
 def test_a_damaged_record_is_as_good_as_none(damage):
-    """What is on the machine can be removed without it."""
+    """The parts of a lab can be removed without its record."""
     store.write(record())
     (store.RUN / "lab" / "lab.json").write_text(damage)
     assert store.read("lab") is None
@@ -47,7 +47,7 @@ def test_a_damaged_record_is_as_good_as_none(damage):
 
 
 def test_what_is_forgotten_leaves_no_folder():
-    """The one above goes with the last lab."""
+    """The folder above is removed with the last lab."""
     store.write(record("a"))
     store.write(record("b"))
     store.image("a", "host1").parent.mkdir(parents=True)
@@ -60,14 +60,14 @@ def test_what_is_forgotten_leaves_no_folder():
 
 
 def test_a_process_is_not_taken_for_a_later_one():
-    """The number alone does not tell."""
+    """The pid alone does not identify a process."""
     mine = Birth.of(os.getpid())
     assert mine.alive
     assert not Birth(mine.pid, mine.started - 1).alive
 
 
 def test_a_lock_is_held_by_one():
-    """The second says what it waits for."""
+    """The second process waits and names the holder."""
     at_work = pytest.raises(LabError, match="another command is at work on lab 'x'")
     with store.lock("x"), at_work, store.lock("x", timeout=0.1):
         pytest.fail("held twice")
@@ -76,7 +76,7 @@ def test_a_lock_is_held_by_one():
 
 
 def test_a_lock_ends_with_who_held_it():
-    """A killed command hinders nobody."""
+    """A killed command blocks no other."""
     code = (
         "import os, signal\nfrom rosrm_lab import store\n"
         "with store.lock('test-killed'): os.kill(os.getpid(), signal.SIGKILL)"

@@ -1,4 +1,4 @@
-"""What is wrong with a network, in words and as firewall rules."""
+"""Network faults: descriptions and firewall rules."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def rules(**links):
 
 
 def test_what_a_host_hears_leaves_the_switch_through_its_port():
-    """`in` is seen from the host, the rule from the switch."""
+    """`in` is the host's view; the rule applies at the switch."""
     assert rules(port1=Link().changed("in", cut=True)) == ['oifname "port1" drop']
 
 
 def test_what_is_heard_of_a_host_enters_the_switch_through_its_port():
-    """And nothing is said of the other direction."""
+    """The other direction has no rule."""
     assert rules(port1=Link().changed("out", cut=True)) == ['iifname "port1" drop']
 
 
@@ -44,7 +44,7 @@ def test_a_loss_of_everything_is_a_cut():
 
 
 def test_a_cut_says_all_that_loss_would():
-    """One rule for a direction."""
+    """Each direction has one rule."""
     link = Link().changed("both", loss=0.5).changed("out", cut=True)
     assert rules(port1=link) == [
         'oifname "port1" numgen random mod 1000000 < 500000 drop',
@@ -53,7 +53,7 @@ def test_a_cut_says_all_that_loss_would():
 
 
 def test_addresses_can_be_asked_for_during_a_cut():
-    """Else a cut in one direction would soon be one in both."""
+    """Otherwise a cut in one direction would soon be one in both."""
     text = ruleset({"port1": Link().changed("in", cut=True)})
     assert text.index("ether type arp accept") < text.index("drop")
 
@@ -80,27 +80,27 @@ def test_a_link_in_words(link, words):
 
 
 def test_a_healed_link_is_a_new_one():
-    """Nothing stays behind."""
+    """No fault is left."""
     bad = Link().changed("in", cut=True, loss=0.2).changed("out", delay=1.0)
     assert bad.changed("both", cut=False, loss=0.0, delay=0.0) == Link()
 
 
 def test_what_is_no_direction_is_refused():
-    """Nothing is changed by a word that is not understood."""
+    """An unknown word changes nothing."""
     with pytest.raises(ConfigError, match="'sideways'; allowed: in, out, both"):
         Link().changed("sideways", cut=True)
 
 
 @pytest.mark.parametrize("share", [-0.01, 1.01, float("nan"), float("inf")])
 def test_a_loss_that_is_no_fraction_is_refused(share):
-    """Nan compares with nothing, and is refused too."""
+    """NaN is refused, too."""
     with pytest.raises(ConfigError, match=r"not within 0..1"):
         check_loss(share)
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 61.0, float("nan")])
 def test_a_delay_that_cannot_be_is_refused(seconds):
-    """The kernel's limits, and sense."""
+    """The bounds are the kernel's, and positive."""
     with pytest.raises(ConfigError, match=r"not within 0..60 s"):
         check_delay(seconds)
 
@@ -110,7 +110,7 @@ wires = st.tuples(st.booleans(), st.floats(0, 1), st.floats(0, 60))
 
 @given(wires, wires)
 def test_links_survive_their_file(into, out):
-    """Nothing of them is lost on the way."""
+    """Every field is restored."""
     names = ("cut", "loss", "delay")
     link = Link().changed("in", **dict(zip(names, into, strict=True)))
     links = {"a": link.changed("out", **dict(zip(names, out, strict=True))), "b": Link()}

@@ -1,4 +1,4 @@
-"""A plugin that keeps the master from its work uses up the time-out of no step."""
+"""Slow plugins: time spent in them does not count against the time-out of a step."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rosrm.master.runtime import MasterRuntime
 
 
 class Clock:
-    """Stands for the monotonic clock; a decision and its plugins take as long as a test says."""
+    """Fake monotonic clock; a decision and its plugins take the time set by the test."""
 
     def __init__(self, takes: float, plugins: float) -> None:
         self.now, self.takes, self.plugins = 100.0, takes, plugins
-        self.spent = 0.0  # as `Deadlines` has it
+        self.spent = 0.0  # as in `Deadlines`
         self.decided: list[float] = []
 
     def step(self, _state, _event, now: float) -> list:
@@ -30,7 +30,7 @@ class Clock:
     ("takes", "plugins", "passed"), [(14.0, 14.0, 0.05), (0.1, 0.1, 0.15), (14.0, 0.1, 14.05)]
 )
 def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes, plugins, passed):
-    """No answer is taken in while a plugin is slow; that of quick ones and of a disk counts."""
+    """No answer is handled while a plugin is slow. Time of quick plugins and of a disk counts."""
     clock, events = Clock(takes, plugins), [[happened.TimePassed()], []]
     monkeypatch.setattr(runtime, "step", clock.step)
     master = MasterRuntime.__new__(MasterRuntime)

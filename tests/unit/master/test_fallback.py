@@ -1,4 +1,4 @@
-"""Which scoring policy decides where the chosen one fails."""
+"""Fallback of the scoring policy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm.master.fallback_policy import fallback_of
 
 
 def registry_of(**policies):
-    """Policies by name, each with what makes it."""
+    """Return a registry of policies, each with its factory."""
 
     @hookimpl
     def register_scoring_policies():
@@ -25,18 +25,18 @@ def broken(options):
 
 
 def test_the_default_policy_stands_in_for_another() -> None:
-    """It is made with its own default options."""
+    """The fallback gets its own default options."""
     weighted = SimpleNamespace(score=None)
     registry = registry_of(weighted=lambda options: weighted, other=lambda options: object())
     assert fallback_of(registry, "other") == ("weighted", weighted)
 
 
 def test_nothing_stands_in_for_the_default_policy_itself() -> None:
-    """It would fail in the same way."""
+    """The default policy would fail in the same way."""
     assert fallback_of(registry_of(weighted=lambda options: object()), "weighted") is None
 
 
 def test_a_default_policy_that_is_not_there_or_broken_is_not_missed() -> None:
-    """The chosen one goes on without: hosts that fit are then taken in order."""
+    """The chosen policy has no fallback: on its failure, hosts that fit are taken in order."""
     assert fallback_of(registry_of(other=lambda options: object()), "other") is None
     assert fallback_of(registry_of(other=broken, weighted=broken), "other") is None

@@ -1,4 +1,4 @@
-"""A plugin that does not come back is ended, named, and left alone for a while."""
+"""Deadline of plugin calls: a hanging plugin is interrupted, named, and skipped for a while."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def spin():
 
 
 def swallow():
-    """Takes no notice of what ends it, at first."""
+    """Catch the first interrupt and continue."""
     for _ in range(3):
         with contextlib.suppress(Exception):
             spin()
@@ -32,7 +32,7 @@ def swallow():
 
 
 def test_one_that_answers_is_passed_on() -> None:
-    """With its answer or its error, and no alarm rings afterwards."""
+    """The caller gets its answer or error, and no alarm follows."""
     ask = deadlines()
     assert ask(SLOW, lambda: "scores") == "scores"
     with pytest.raises(ZeroDivisionError):
@@ -42,7 +42,7 @@ def test_one_that_answers_is_passed_on() -> None:
 
 @pytest.mark.parametrize("act", [spin, lambda: time.sleep(100), swallow])
 def test_one_that_hangs_is_ended(act) -> None:
-    """Also one that sleeps, and one that swallows the error."""
+    """The deadline also ends a plugin that sleeps or swallows the error."""
     ask = deadlines()
     began = time.monotonic()
     with pytest.raises(TimeoutError, match=r"longer than 0\.1 s"):
@@ -52,7 +52,7 @@ def test_one_that_hangs_is_ended(act) -> None:
 
 
 def test_one_that_hung_is_left_alone_for_a_while() -> None:
-    """It costs its deadline once, not once for every reading that comes."""
+    """The plugin costs its deadline once, not once for every reading."""
     ask, asked = deadlines(pause=1.0), []
 
     def hangs():
@@ -70,7 +70,7 @@ def test_one_that_hung_is_left_alone_for_a_while() -> None:
 
 
 def test_each_plugin_has_its_own_deadline() -> None:
-    """One that was late does not keep another from being asked, or from being ended."""
+    """A late plugin neither excludes another one nor disables its deadline."""
     ask = deadlines(pause=30.0)
     for late in (("scoring", "a"), ("checkpoint", "b"), ("migration", "a")):
         with pytest.raises(TimeoutError):

@@ -1,4 +1,4 @@
-"""The rows of plugins that a master shows: failing ones with their last error."""
+"""Plugin rows of the master: failing plugins with their last error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")
 
 
 def rows(cluster: Cluster, *, failing: bool = False) -> list[PluginRow]:
-    """The rows of `rosrm plugins`, or those that `rosrm status` asks for."""
+    """Return the rows of `rosrm plugins`, or those that `rosrm status` requests."""
     reading = Reading(
         "m", cluster.state, SimpleNamespace(last_sequence=0), [SELECTED],
         uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
@@ -32,14 +32,14 @@ def named(cluster: Cluster, name: str) -> PluginRow:
 
 
 def test_a_plugin_that_works_is_shown_as_the_registry_has_it() -> None:
-    """With its summary, and a probe with its scope."""
+    """The row has its summary, and for a probe its scope."""
     cluster = Cluster("a")
     assert named(cluster, "eq1") == SELECTED
     assert (named(cluster, "cpu").state, named(cluster, "cpu").host) == ("selected", "a")
 
 
 def test_a_policy_that_fails_is_shown_as_failing() -> None:
-    """With the hook and the last error."""
+    """The row has the hook and the last error."""
     cluster = Cluster("a")
     with pytest.raises(PluginError):
         cluster.state.plugins.ask("scoring", "eq1", "score", lambda: 1 / 0)
@@ -51,7 +51,7 @@ def test_a_policy_that_fails_is_shown_as_failing() -> None:
 
 
 def test_a_probe_that_fails_is_shown_as_failing_on_its_host() -> None:
-    """With the reason that the slave reports, until the next report is without it."""
+    """The row has the slave's reason until a report without it."""
     cluster = Cluster("a", "b")
     machine = cluster.machines["a"]
     for failing, state in (({"cpu": "probe cpu: unplugged"}, "failing"), ({}, "selected")):

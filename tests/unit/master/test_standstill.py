@@ -1,4 +1,4 @@
-"""While nothing can be made durable: what is noted, turned away, kept for later, and let go."""
+"""Journal stall: events that are noted, refused, queued or dropped until writes succeed."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def statuses(sequence: int) -> happened.StatusesReceived:
 
 
 def test_every_event_has_its_place() -> None:
-    """A new kind of event must be thought of here."""
+    """A new kind of event needs an entry here."""
     known = REFUSED | KEPT | NEWEST | DROPPED | {happened.ReadingsReceived}
     assert known == set(get_args(happened.Event))
 
 
 def test_requests_are_turned_away_with_the_reason() -> None:
-    """Under a code of their own, by which a slave knows that it may ask again."""
+    """The refusal has its own code, so that a slave knows that a retry may succeed."""
     held = still()
     (reply,) = take(held, happened.CancelRequested(7, ("p",)))
     assert (reply.request, reply.accepted, reply.code) == (7, False, "journal")
@@ -57,7 +57,7 @@ def test_requests_are_turned_away_with_the_reason() -> None:
 
 
 def test_what_happened_is_kept_in_order_and_of_requests_for_work_the_newest() -> None:
-    """An end that was heard is not lost; a slave that asks again asks once."""
+    """A reported end is not lost; of a slave's repeated requests for work only one is kept."""
     held = still()
     left = happened.HostLeft(9, 3, 4)
     events = [
@@ -69,7 +69,7 @@ def test_what_happened_is_kept_in_order_and_of_requests_for_work_the_newest() ->
 
 
 def test_what_is_kept_is_bounded(monkeypatch) -> None:
-    """Slaves are asked again for statuses that were let go."""
+    """The slaves send dropped statuses again on request."""
     monkeypatch.setattr(journal_stall, "_MOST_STATUSES", 3)
     held = still()
     take(held, *(statuses(n) for n in range(10)))
@@ -77,12 +77,12 @@ def test_what_is_kept_is_bounded(monkeypatch) -> None:
 
 
 def test_no_host_falls_silent_by_it() -> None:
-    """Readings are noted; a minute later no deadline has passed, and what is lost is asked for."""
+    """Readings are noted: no deadline passes within a minute, and lost statuses are requested."""
     cluster = Cluster("a", "b", lease=10.0, suspect=1.0)
     cluster.submit(process("p"), process("q"))
     held = still(cluster.now)
     machine = cluster.machines["a"]
-    machine.batches += 1  # a status batch that was let go
+    machine.batches += 1  # a status batch that was dropped
     machine.busy["memory"] = 0.7
     take(held, cluster.readings(list(cluster.machines.values())), cluster=cluster)
     column = cluster.state.hosts.by_name["a"].column
@@ -95,7 +95,10 @@ def test_no_host_falls_silent_by_it() -> None:
 
 
 def test_a_suspect_host_that_is_heard_is_so_no_more() -> None:
-    """Beats say so: else what runs there alone would have to stop. A lost one stays lost."""
+    """Beats must report the contact; otherwise the host's fenced processes would stop.
+
+    A lost host stays lost.
+    """
     cluster = Cluster("a", "b", "c", lease=10.0, suspect=1.0)
     cluster.machines["b"].connected = False
     cluster.wait(12.0)

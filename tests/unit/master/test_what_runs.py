@@ -1,4 +1,4 @@
-"""The last line of the master tells what keeps running apart from what slaves still stop."""
+"""Last log line of the master: processes that keep running, apart from those being stopped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ AGAIN = "start the master again to manage them"
 
 
 def test_processes_of_hosts_that_leave_do_not_keep_running() -> None:
-    """Their slaves stop them; the user starts the master again for the others alone."""
+    """Their slaves stop them; the user starts the master again only for the others."""
     cluster = Cluster("a", "b", "c")
     assert what_runs(cluster.state) == "no processes keep running"
     cluster.submit(*(process(name) for name in "pqr"))

@@ -1,4 +1,4 @@
-"""Arrays travel as npz; nothing is pickled, and nothing received is unpickled."""
+"""Arrays in messages: npz without pickle, in both directions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosrm_msgs.msg import Arrays
 
 
 def test_arrays_come_back_with_their_types_and_shapes():
-    """Bit by bit, whatever they are called."""
+    """Arrays are equal bit by bit, under any names."""
     arrays = {
         "poses": np.random.default_rng(1).normal(size=(3, 4, 4)),
         "file": np.array([1, 2, 3], dtype=np.int16),
@@ -28,13 +28,13 @@ def test_arrays_come_back_with_their_types_and_shapes():
 
 
 def test_python_objects_are_refused():
-    """They would be pickled."""
+    """Numpy would pickle them."""
     with pytest.raises(ValueError, match="'map' holds Python objects"):
         arrays_message({"map": np.array([{}, 1], dtype=object)})
 
 
 def test_what_is_pickled_is_not_read():
-    """Whoever sends it: unpickling runs code."""
+    """Unpickling runs code of the sender."""
     packed = io.BytesIO()
     np.savez(packed, evil=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match="no npz of arrays"):
@@ -42,6 +42,6 @@ def test_what_is_pickled_is_not_read():
 
 
 def test_what_is_no_npz_is_refused():
-    """With a word, and no traceback of zipfile's."""
+    """The error is one sentence, without a traceback of zipfile."""
     with pytest.raises(ValueError, match="these 3 bytes are no npz"):
         arrays_of(Arrays(npz=array("B", b"abc")))

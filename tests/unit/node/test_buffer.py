@@ -1,4 +1,4 @@
-"""The inputs that are kept for a successor: none lost, none processed twice."""
+"""Buffer of inputs for a successor: no message is lost or processed twice."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def filled(*messages, limit=100):
 
 
 def test_messages_come_out_in_the_order_in_which_they_came_in():
-    """Across inputs too."""
+    """The order holds across inputs, too."""
     messages = [(A, 3), (B, 9), (A, 4), (B, 10)]
     assert drained(filled(*messages)) == messages
 
@@ -36,7 +36,7 @@ def test_what_a_state_covers_is_dropped():
 
 
 def test_a_message_may_come_after_the_state_that_covers_it():
-    """Marks and inputs take different ways."""
+    """Marks and inputs arrive on different topics."""
     buffer = filled()
     buffer.cover(A, [5], single=False, now=0.0)
     assert buffer.add(A, Sent(5), None, 0.0)
@@ -45,21 +45,21 @@ def test_a_message_may_come_after_the_state_that_covers_it():
 
 
 def test_what_one_publisher_said_before_the_newest_covered_was_passed_over():
-    """The source never had it: it is not made up for, out of order."""
+    """The source never had it, and a late process would break the order."""
     buffer = filled((A, 1), (A, 2), (A, 3))
     buffer.cover(A, [2], single=True, now=0.0)
     assert drained(buffer) == [(A, 3)]
 
 
 def test_the_clocks_of_several_publishers_are_not_compared():
-    """A robot whose clock is behind is not taken for covered."""
+    """A robot's clock that is behind does not make its messages covered."""
     buffer = filled((A, 1000), (A, 3))
     buffer.cover(A, [1000], single=False, now=0.0)
     assert drained(buffer) == [(A, 3)]
 
 
 def test_a_publisher_that_moves_to_a_clock_behind_is_not_taken_for_covered():
-    """Seen by its own time stamps, or by those that the source has processed."""
+    """Both the publisher's time stamps and those processed by the source show the change."""
     buffer = filled((A, 1000))
     buffer.cover(A, [1000], single=True, now=0.0)
     assert buffer.add(A, Sent(3), None, 0.0)
@@ -71,7 +71,7 @@ def test_a_publisher_that_moves_to_a_clock_behind_is_not_taken_for_covered():
 
 
 def test_a_publisher_that_is_alone_again_is_not_measured_by_one_that_left():
-    """Its clock may have been ahead."""
+    """The clock of the publisher that left may have been ahead."""
     buffer = filled()
     buffer.cover(A, [10, 1000], single=False, now=0.0)
     buffer.cover(A, [11], single=True, now=0.0)
@@ -80,7 +80,7 @@ def test_a_publisher_that_is_alone_again_is_not_measured_by_one_that_left():
 
 
 def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
-    """Told by the numbers of its publisher."""
+    """The sequence numbers of its publisher show the gap."""
     buffer = InputBuffer(10, ROOM, 0.0)
     for stamp, number in ((10, 1), (20, 2), (40, 4)):
         assert not buffer.misses_one(A)
@@ -88,13 +88,13 @@ def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
     assert buffer.misses_one(A)
     assert not buffer.misses_one(B)
     buffer.cover(A, [10, 20, 30], single=True, now=0.0)
-    assert buffer.misses_one(A)  # 40 may be the second that is missing
+    assert buffer.misses_one(A)  # 40 may be the second missing message
     buffer.cover(A, [40], single=True, now=0.0)
     assert not buffer.misses_one(A)
 
 
 def test_numbers_of_several_publishers_say_nothing_of_a_loss():
-    """Nor do those of one that was started again."""
+    """Numbers of a restarted publisher do not show a loss either."""
     buffer = InputBuffer(10, ROOM, 0.0)
     buffer.cover(A, [5], single=False, now=0.0)
     for stamp, number in ((10, 1), (20, 70), (30, 2)):
@@ -106,7 +106,7 @@ def test_numbers_of_several_publishers_say_nothing_of_a_loss():
 
 
 def test_the_buffer_is_bounded_for_each_input():
-    """One that floods does not push out another."""
+    """A flood on one input does not push out another's messages."""
     buffer = filled((A, 1), (A, 2), limit=2)
     assert not buffer.add(A, Sent(3), None, 0.0)
     assert buffer.add(B, Sent(3), None, 0.0)
@@ -116,7 +116,7 @@ def test_the_buffer_is_bounded_for_each_input():
 
 
 def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
-    """Whichever came first."""
+    """The order of the two makes no difference."""
     buffer = filled((A, 5))
     buffer.cover(A, [4], single=True, now=0.0)
     assert not buffer.overlaps(A)
@@ -129,7 +129,7 @@ def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
 
 
 def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
-    """From the beginning of the buffer on."""
+    """The time counts from the beginning of the buffer."""
     buffer = InputBuffer(10, ROOM, 100.0)
     assert not buffer.is_idle(A, 100.5, 0.0, 1.0)
     assert buffer.is_idle(A, 101.0, 0.0, 1.0)
@@ -141,7 +141,7 @@ def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
 
 
 def test_an_input_that_the_source_is_sent_is_not_idle():
-    """Though nothing comes here: a reliable reader may wait for what was lost on its way."""
+    """A reliable reader may still wait for a message that was lost on its way."""
     buffer = InputBuffer(10, ROOM, 100.0)
     buffer.cover(A, [1, 2], single=True, now=102.0)
     assert not buffer.is_idle(A, 102.5, 0.0, 1.0)
@@ -153,9 +153,9 @@ def test_an_input_that_the_source_is_sent_is_not_idle():
 
 @given(st.data())
 def test_source_and_successor_together_process_each_message_once(data):
-    """However the ways of messages and marks interleave, and wherever the source stops."""
+    """This holds for any interleaving of messages and marks, and any stop of the source."""
     total = data.draw(st.integers(1, 12))
-    joined = data.draw(st.integers(0, total))  # the shadow hears messages from here on
+    joined = data.draw(st.integers(0, total))  # the shadow receives messages from here on
     stopped = data.draw(st.integers(joined, total))  # the source processes those before it
     messages = [("message", stamp) for stamp in range(joined, total)]
     marks = [("mark", covered) for covered in range(stopped + 1)]

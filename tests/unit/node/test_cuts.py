@@ -1,4 +1,4 @@
-"""States are put together from marks and parts; a cut is consistent or it is none."""
+"""Assembly of snapshots from marks and parts: a cut is consistent or dropped."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def assembler(*topics):
 
 
 def test_a_state_is_complete_with_its_mark_and_all_parts():
-    """In whichever order they come."""
+    """Mark and parts may arrive in any order."""
     cuts = assembler(A, B)
     cuts.add_part(A, b"a1")
     cuts.add_mark(mark(1, a=b"a1", b=b"b1"), 7.0)
@@ -40,7 +40,7 @@ def test_a_state_is_complete_with_its_mark_and_all_parts():
 
 
 def test_a_part_that_did_not_change_counts_for_later_states():
-    """It is not published again."""
+    """An unchanged part is not published again."""
     cuts = assembler(A, B)
     cuts.add_part(A, b"a1")
     for sequence in (1, 2, 3):
@@ -61,7 +61,7 @@ def test_parts_of_different_cycles_are_never_mixed():
 
 
 def test_no_more_is_kept_than_the_state_in_use_and_what_may_come():
-    """A state of megabytes every cycle would fill the memory."""
+    """A snapshot of megabytes in every cycle would fill the memory."""
     cuts = assembler(A)
     for sequence in range(100):
         cuts.add_part(A, b"%d" % sequence)
@@ -73,7 +73,7 @@ def test_no_more_is_kept_than_the_state_in_use_and_what_may_come():
 
 @given(st.data())
 def test_any_order_of_arrival_ends_at_the_last_state(data):
-    """Each topic by itself is in order; a value may come back."""
+    """Each single topic is in order; a value may occur again."""
     states = data.draw(
         st.lists(
             st.tuples(st.sampled_from([b"x", b"y"]), st.sampled_from([b"x", b"y"])), min_size=1

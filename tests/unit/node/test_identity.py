@@ -1,4 +1,4 @@
-"""Whether rosrm started this process, and as what."""
+"""Identity of a process started by rosrm, from its environment."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ FULL = {
 
 
 def test_a_slave_tells_who_a_process_is():
-    """Also one whose name has a slash."""
+    """A process whose name has a slash has its identity, too."""
     identity = identity_from(FULL)
     assert identity == Identity("robot/p", 12, "/ns/p", "/rosrm/state_config", "lab", 4, False)
 
 
 def test_a_shadow_is_told_so():
-    """Only with the very word."""
+    """Only the exact value makes a shadow."""
     assert identity_from({**FULL, "ROSRM_SHADOW": "1"}).shadow
     assert not identity_from({**FULL, "ROSRM_SHADOW": ""}).shadow
 
 
 @pytest.mark.parametrize("missing", ["ROSRM_INSTANCE", "ROSRM_STATE_CONFIG"])
 def test_without_rosrm_there_is_no_identity(missing):
-    """The node is then rclpy's and nothing else."""
+    """The node is then a plain rclpy node."""
     assert identity_from({**FULL, missing: ""}) is None
     assert identity_from({}) is None

@@ -1,4 +1,4 @@
-"""What is said of a state that cannot be saved."""
+"""Errors of a state that cannot be saved."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from rosrm.node.handoff.state_parts import Part, StateError
 
 
 def part(*answers):
-    """One whose author's function answers so, in turn."""
+    """Return a part whose author's function gives these answers in turn."""
     left = iter(answers)
     return Part("/state", Int64, lambda: next(left), lambda message: None)
 
 
 def test_what_was_wrong_is_said_again_while_nothing_has_changed():
-    """Not that it was never saved: who hears of it a second time hears the cause."""
+    """A later call names the original cause, instead of a state that was never saved."""
     one = part(Int64(data=7), None, None)
     for _ in range(3):
         with pytest.raises(StateError, match="has 12 bytes, more than the 4"):
@@ -23,7 +23,7 @@ def test_what_was_wrong_is_said_again_while_nothing_has_changed():
 
 
 def test_a_state_that_is_well_again_may_be_unchanged():
-    """And a new fault is its own."""
+    """A later fault is a new one."""
     one = part(String(), Int64(data=7), None, String())
     with pytest.raises(StateError, match="returned a String"):
         one.refresh(100)
@@ -34,6 +34,6 @@ def test_a_state_that_is_well_again_may_be_unchanged():
 
 
 def test_unchanged_before_anything_was_saved_is_a_fault():
-    """It speaks of what nobody has."""
+    """The author's function refers to a state that does not exist."""
     with pytest.raises(StateError, match="before it had returned any state"):
         part(None).refresh(100)

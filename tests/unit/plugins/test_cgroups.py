@@ -1,4 +1,4 @@
-"""Finding the control groups of a process, and what bounds it there."""
+"""Control groups of a process, and the limits that they set."""
 
 import shutil
 from pathlib import Path
@@ -19,7 +19,7 @@ GIB = 2.0**30
 
 @pytest.fixture
 def tree(tmp_path):
-    """Copies a recorded tree, so that a test may change it."""
+    """Copy a recorded tree, so that a test may change it."""
 
     def copy(name):
         return Path(shutil.copytree(TREES / name, tmp_path / name))
@@ -36,7 +36,7 @@ def grow_cpu(directory, seconds):
 
 
 def test_memory_of_a_container():
-    """The container's limit is the capacity, and page cache that is inactive is not usage."""
+    """The container's limit is the capacity, and inactive page cache is not usage."""
     gauge = CgroupMemory.find(TREES / "docker")
     assert gauge.capacity == 2 * GIB
     assert gauge.usage() == pytest.approx(600 * MIB / (2 * GIB))
@@ -75,13 +75,13 @@ def test_least_room_above_counts_for_cpu(tree):
 
 
 def test_unlimited_group_is_none():
-    """Without any limit the machine is what counts."""
+    """Without any limit the machine's capacity counts."""
     assert CgroupMemory.find(TREES / "unlimited") is None
     assert CgroupCpu.find(1.0, TREES / "unlimited") is None
 
 
 def test_limit_of_the_whole_machine_is_none(tree):
-    """A limit at or above what the machine has bounds nothing."""
+    """A limit at or above the machine's capacity has no effect."""
     root = tree("docker")
     (root / "sys/fs/cgroup/memory.max").write_text(f"{16 * 2**30}\n")
     (root / "sys/fs/cgroup/cpu.max").write_text("800000 100000\n")
@@ -90,7 +90,7 @@ def test_limit_of_the_whole_machine_is_none(tree):
 
 
 def test_container_without_a_namespace_of_its_own():
-    """Where only a part of the hierarchy is mounted, the path of the group starts outside it."""
+    """If only a part of the hierarchy is mounted, the path of the group starts outside it."""
     root = TREES / "kubernetes"
     assert find_group("memory", root).directory == root / "sys/fs/cgroup"
     assert CgroupMemory.find(root).capacity == GIB
@@ -166,13 +166,13 @@ def test_group_that_cannot_be_seen(tmp_path):
 
 
 def test_no_control_groups(tmp_path):
-    """A machine without any is no error: the machine is what counts."""
+    """Without control groups the machine's capacity counts, and no error is raised."""
     assert find_group("memory", tmp_path) is None
 
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_every_recorded_tree_reads(name):
-    """Whatever was recorded, the gauges are there with sane values, or the machine counts."""
+    """Each recorded tree gives gauges with sane values, or the machine's."""
     for gauge in (CgroupMemory.find(TREES / name), CgroupCpu.find(1.0, TREES / name)):
         if gauge is not None:
             assert gauge.capacity > 0
@@ -203,14 +203,14 @@ def test_another_group_is_measured_instead_of_the_own():
 
 
 def test_another_group_that_is_not_there_is_refused():
-    """A group that cannot be seen must not silently become the one above it."""
+    """A missing group must not silently become the one above it."""
     with pytest.raises(ConfigError, match=r"no control group '/robot\.slice/jobs' under"):
         CgroupMemory.find(TREES / "systemd", "/robot.slice/jobs")
 
 
 @pytest.mark.parametrize("options", [MemoryOptions, CpuOptions])
 def test_a_group_goes_with_no_other_scope(options):
-    """A probe is told one thing to measure."""
+    """A probe has one scope; the option `group` contradicts any other."""
     with pytest.raises(ValueError, match="goes with the scope 'cgroup', not with 'slice'"):
         options(scope="slice", group="/a")
     with pytest.raises(ValueError, match="does not begin with '/'"):

@@ -1,4 +1,4 @@
-"""The probe `gpu`, on a driver that the test plays."""
+"""The probe `gpu`, with a fake driver."""
 
 import ctypes
 import sys
@@ -15,7 +15,7 @@ GIB = 2**30
 
 
 class FakeNvml:
-    """As much of `pynvml` as the probe uses; for each GPU (percent busy, bytes used, total)."""
+    """The part of `pynvml` that the probe uses; for each GPU (percent busy, bytes used, total)."""
 
     class NVMLError(Exception):
         pass
@@ -58,21 +58,21 @@ def capacities(probe):
 
 
 def test_one_gpu():
-    """Utilisation in fractions, memory against its size."""
+    """Utilisation is a fraction, and memory is relative to its size."""
     probe = GpuProbe(GpuOptions(), FakeNvml((40, 20 * GIB, 80 * GIB)))
     assert capacities(probe) == {"gpu": 1.0, "gpu_memory": 80.0 * GIB}
     assert readings(probe) == pytest.approx({"gpu": 0.4, "gpu_memory": 0.25})
 
 
 def test_of_several_the_fullest_counts():
-    """What fits then fits on whichever GPU it lands."""
+    """A process that fits the fullest GPU fits whichever GPU it gets."""
     probe = GpuProbe(GpuOptions(), FakeNvml((10, 8 * GIB, 16 * GIB), (90, 8 * GIB, 80 * GIB)))
     assert capacities(probe) == {"gpu": 1.0, "gpu_memory": 16.0 * GIB}
     assert readings(probe) == pytest.approx({"gpu": 0.9, "gpu_memory": 0.5})
 
 
 def test_of_several_the_mean():
-    """For processes that spread by themselves, capacity and usage are those of all together."""
+    """For processes that use several GPUs, capacity and usage are those of all together."""
     nvml = FakeNvml((10, 8 * GIB, 16 * GIB), (90, 0, 16 * GIB))
     probe = GpuProbe(GpuOptions(combine="mean"), nvml)
     assert capacities(probe) == {"gpu": 2.0, "gpu_memory": 32.0 * GIB}
@@ -80,13 +80,13 @@ def test_of_several_the_mean():
 
 
 def test_chosen_devices_only():
-    """The others are somebody else's."""
+    """Devices that were not chosen are not measured."""
     probe = GpuProbe(GpuOptions(devices=(1,)), FakeNvml((100, 1, 1), (20, 4, 8)))
     assert readings(probe) == pytest.approx({"gpu": 0.2, "gpu_memory": 0.5})
 
 
 def test_unknown_device_is_refused():
-    """With those that there are."""
+    """The error lists the existing devices."""
     with pytest.raises(ConfigError, match=r"devices \[3\] do not exist; there are 2: 0 to 1"):
         GpuProbe(GpuOptions(devices=(0, 3)), FakeNvml((0, 0, 1), (0, 0, 1)))
 
@@ -100,7 +100,7 @@ def test_what_a_gpu_does_not_tell_is_left_out():
 
 
 def test_no_driver_is_absent_with_the_reason(monkeypatch):
-    """The library is looked for before the module is imported."""
+    """The probe searches for the library before the import of the module."""
 
     def missing(name):
         raise OSError(f"{name}: cannot open shared object file")
@@ -113,7 +113,7 @@ def test_no_driver_is_absent_with_the_reason(monkeypatch):
 
 @pytest.fixture
 def driver(monkeypatch):
-    """Puts a driver onto this machine."""
+    """Install a fake driver on this machine."""
 
     def install(nvml):
         monkeypatch.setattr(ctypes, "CDLL", lambda name: None)
@@ -124,7 +124,7 @@ def driver(monkeypatch):
 
 
 def test_driver_that_does_not_run_is_absent(driver):
-    """As in a container to which no GPU was given."""
+    """A container without a GPU has such a driver."""
     nvml = driver(FakeNvml())
 
     def refuse():
@@ -136,7 +136,7 @@ def test_driver_that_does_not_run_is_absent(driver):
 
 
 def test_driver_without_a_gpu_is_absent_and_let_go(driver):
-    """What was opened is closed again."""
+    """The driver is closed again."""
     nvml = driver(FakeNvml())
     with pytest.raises(SkipPlugin, match="sees no GPU"):
         gpu.create(GpuOptions(), probe_context())
@@ -144,7 +144,7 @@ def test_driver_without_a_gpu_is_absent_and_let_go(driver):
 
 
 def test_close_lets_go_of_the_driver(driver):
-    """Once."""
+    """The driver is closed once."""
     nvml = driver(FakeNvml((0, 0, 1)))
     gpu.create(GpuOptions(), probe_context()).close()
     assert nvml.shut_down == 1

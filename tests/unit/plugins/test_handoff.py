@@ -1,4 +1,4 @@
-"""The strategy `handoff`: its alias, the options of a process, and the paper's protocol."""
+"""The strategy `handoff`: alias, options of a process, and the protocol of the paper."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PAPER = {"protocol": "paper", "state": "/counter/state", "type": "std_msgs/msg/I
 
 
 def move(name: str = "counter", source_node: str = "counter", **options: Any) -> Move:
-    """A node moves from a to b."""
+    """Return the move of a node from a to b."""
     spec = ProcessSpec(
         name, command=("run",), ros=True, migration=MigrationPolicy("handoff", options=options),
         stop=StopPolicy(1.0, 2.0),
@@ -30,18 +30,18 @@ def move(name: str = "counter", source_node: str = "counter", **options: Any) ->
 
 
 def of_kind(plan: Plan, kind: type) -> Any:
-    """The only step of a kind."""
+    """Return the only step of a kind."""
     (step,) = (step for step in plan.steps if isinstance(step, kind))
     return step
 
 
 def test_the_alias_carries_the_time() -> None:
-    """As the paper has it."""
+    """The alias has the time as a suffix, as in the paper."""
     assert alias_of(move()) == "counter_1700000000"
 
 
 def test_the_alias_differs_from_the_name_of_the_source() -> None:
-    """Also when two handoffs follow within a second."""
+    """This holds also for two handoffs within a second."""
     assert alias_of(move(source_node="counter_1700000000")) == "counter_1700000001"
     assert alias_of(move("n_1700000000", "n_1700000000")) == "n_1700000000_1700000000"
 
@@ -54,7 +54,7 @@ def test_a_long_name_is_cut() -> None:
 
 
 def test_options_of_a_process_go_over_those_of_the_cluster() -> None:
-    """The others stay."""
+    """The other options keep the cluster's values."""
     asked = with_options(move(ready_timeout=60.0), OFFER, start_timeout=3.0, ready_timeout=4.0)
     plan = Handoff(HandoffOptions()).propose(asked)
     waits = {step.phase.name: step.timeout for step in plan.steps if isinstance(step, Configure)}
@@ -64,7 +64,7 @@ def test_options_of_a_process_go_over_those_of_the_cluster() -> None:
 
 
 def test_the_papers_protocol_listens_and_declares_its_overlap() -> None:
-    """The destination's slave hears when a second publisher speaks; nobody is asked for silence."""
+    """The destination's slave watches for a second publisher; no node is asked to fall silent."""
     plan = Handoff(HandoffOptions()).propose(move(**PAPER))
     listen = of_kind(plan, Execute)
     assert (listen.executor, listen.host) == ("handoff_watch", "b")
@@ -80,7 +80,7 @@ def test_the_papers_protocol_listens_and_declares_its_overlap() -> None:
 
 
 def test_a_state_below_the_nodes_own_name_stays_there_under_the_alias() -> None:
-    """Other topics are where they are."""
+    """Other topics keep their names."""
     plan = Handoff(HandoffOptions()).propose(move(**PAPER))
     assert of_kind(plan, Start).remappings == {"~/state": "/counter/state"}
     elsewhere = Handoff(HandoffOptions()).propose(move(**{**PAPER, "state": "/other/state"}))
@@ -101,7 +101,7 @@ def test_a_state_below_the_nodes_own_name_stays_there_under_the_alias() -> None:
     ],
 )
 def test_nonsense_is_refused_when_the_process_is_submitted(given: Any, said: str) -> None:
-    """By the master, which merges the options before it asks the strategy anything."""
+    """The master merges the options and refuses them, before it calls the strategy."""
     cluster = Cluster("a", strategies={"handoff": Handoff(HandoffOptions())})
     policy = MigrationPolicy("handoff", options=given)
     reply = cluster.submit(process("counter", ros=True, migration=policy))
@@ -111,13 +111,13 @@ def test_nonsense_is_refused_when_the_process_is_submitted(given: Any, said: str
 
 
 def test_what_is_no_node_has_no_alias() -> None:
-    """And so cannot be moved so."""
+    """A process without a node cannot be moved by `handoff`."""
     spec = replace(move().spec, ros=False)
     assert "set `ros: true`" in Handoff(HandoffOptions()).spec_fault(spec)
 
 
 def test_the_papers_protocol_needs_an_overlap() -> None:
-    """A process that may never run twice cannot be moved by it."""
+    """The protocol cannot move a process that may never run twice."""
     spec = move(**PAPER).spec
     spec = replace(spec, migration=replace(spec.migration, overlap=False))
     assert "`overlap: false`" in Handoff(HandoffOptions()).spec_fault(spec)

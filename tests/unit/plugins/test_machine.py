@@ -9,13 +9,13 @@ from rosrm_resources.memory import MachineMemory
 
 
 def write_times(proc, *ticks, cores=2):
-    """A /proc/stat: user nice system idle iowait irq softirq steal guest guest_nice."""
+    """Write a /proc/stat: user nice system idle iowait irq softirq steal guest guest_nice."""
     line = " ".join(map(str, ticks))
     (proc / "stat").write_text(f"cpu  {line}\n" + f"cpu0 {line}\n" * cores + "intr 1 2\n")
 
 
 def test_cpu_is_all_but_idle_and_waiting(tmp_path):
-    """Of 200 ticks of two cores in a second, 100 were idle or waited for a disk."""
+    """With 100 of 200 ticks idle or waiting for a disk, usage is one half."""
     write_times(tmp_path, 1000, 0, 0, 1000, 0, 0, 0, 0, 0, 0)
     gauge = MachineCpu(1.0, tmp_path)
     assert gauge.capacity == 2.0
@@ -25,7 +25,7 @@ def test_cpu_is_all_but_idle_and_waiting(tmp_path):
 
 
 def test_first_cpu_reading_of_a_busy_machine_is_not_idle(tmp_path, monkeypatch):
-    """Until there are two counts, the load average tells."""
+    """Until there are two counts, the load average gives the usage."""
     monkeypatch.setattr("os.getloadavg", lambda: (1.5, 0.0, 0.0))
     write_times(tmp_path, 1000, 0, 0, 1000, 0, 0, 0, 0, 0, 0)
     gauge = MachineCpu(1.0, tmp_path)
@@ -34,7 +34,7 @@ def test_first_cpu_reading_of_a_busy_machine_is_not_idle(tmp_path, monkeypatch):
 
 
 def test_cores_are_those_of_psutil():
-    """An independent count of the same machine."""
+    """The number equals an independent count of the same machine."""
     assert machine_cores() == psutil.cpu_count()
 
 

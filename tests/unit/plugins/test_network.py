@@ -1,4 +1,4 @@
-"""The probe `network`, on interfaces that the test plays."""
+"""The probe `network`, with fake interfaces."""
 
 from types import SimpleNamespace
 
@@ -11,7 +11,7 @@ from rosrm_resources.network import NetworkOptions, NetworkProbe, links
 
 
 class Machine:
-    """Interfaces by name: speed in Mbit/s (0: not known), up or not, physical or not."""
+    """Interfaces by name: speed in Mbit/s (0: unknown), up or not, physical or not."""
 
     def __init__(self, path, monkeypatch):
         self.path, self.stats, self.counters = path, {}, {}
@@ -37,7 +37,7 @@ def machine(tmp_path, monkeypatch):
 
 
 def test_physical_interfaces_that_are_up_count(machine):
-    """Not bridges, not the loopback, not what is unplugged; 1000 Mbit/s are 125 MB/s."""
+    """Bridges, the loopback and unplugged interfaces do not count; 1000 Mbit/s are 125 MB/s."""
     machine.put("eth0", 1000)
     machine.put("eth1", 100, up=False)
     machine.put("docker0", 10000, physical=False)
@@ -46,7 +46,7 @@ def test_physical_interfaces_that_are_up_count(machine):
 
 
 def test_unknown_speed_is_absent_with_the_way_out(machine):
-    """A wireless link tells no speed; the option gives it."""
+    """A wireless link reports no speed; the option sets it."""
     machine.put("wlan0", 0)
     with pytest.raises(SkipPlugin, match="speed of wlan0 is not known; the option `capacity`"):
         machine.links()
@@ -54,14 +54,14 @@ def test_unknown_speed_is_absent_with_the_way_out(machine):
 
 
 def test_no_interface_is_absent(machine):
-    """A machine without any network is no error."""
+    """A machine without any network raises no error."""
     machine.put("lo", physical=False)
     with pytest.raises(SkipPlugin, match="no physical network interface is up"):
         machine.links()
 
 
 def test_chosen_interface_must_exist_and_have_a_speed(machine):
-    """What was chosen by name is refused, not passed over."""
+    """An interface chosen by name is refused, not skipped."""
     machine.put("eth0")
     machine.put("tun0", 0, physical=False)
     with pytest.raises(ConfigError, match="interfaces eth9 do not exist; there are: eth0, tun0"):

@@ -1,4 +1,4 @@
-"""The rate of a counter over a sliding window."""
+"""Rate of a counter over a sliding window."""
 
 import pytest
 from hypothesis import given, settings
@@ -24,7 +24,7 @@ def test_forgets_what_is_older_than_its_window():
 
 
 def test_too_short_a_time_repeats_the_last_rate():
-    """Two counts within a clock tick of the kernel tell nothing."""
+    """Two counts within a clock tick of the kernel give no rate."""
     rate = Rate(1.0, at=0.0, count=0.0, guess=0.7)
     assert rate.update(0.001, 1.0) == 0.7
 
@@ -38,7 +38,7 @@ def test_fallen_counter_begins_anew():
 
 
 def test_nonsense_raises():
-    """A counter that says NaN is no reading."""
+    """A NaN count is refused."""
     with pytest.raises(ValueError, match="nan"):
         Rate(1.0, 0.0, 0.0).update(1.0, float("nan"))
 
@@ -46,7 +46,7 @@ def test_nonsense_raises():
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 5), st.floats(0, 1e6)), max_size=60))
 def test_never_negative_nor_above_the_fastest(steps):
-    """Whatever the counter does and however unevenly it is read, the rate stays within its own."""
+    """For any counter and any reading times, the rate stays between 0 and the fastest step."""
     rate, at, count, fastest = Rate(1.0, 0.0, 0.0), 0.0, 0.0, 0.0
     begun = 0.0
     for seconds, grown in steps:

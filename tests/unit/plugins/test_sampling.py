@@ -1,4 +1,4 @@
-"""Probes are read in the background: none can delay the loop or the readings of another."""
+"""Background reading of probes: no probe delays the loop or another probe's readings."""
 
 import threading
 import time
@@ -14,7 +14,7 @@ TICK = 0.1
 
 
 class Rig:
-    """A sampler with its clock, called as the slave's 10 Hz loop calls it."""
+    """Sampler with its clock, called like in the slave's 10 Hz loop."""
 
     def __init__(self, **probes):
         self.clock = FakeClock()
@@ -26,7 +26,7 @@ class Rig:
         self.reports = []
 
     def tick(self, count=1, *, settle=True):
-        """Cycles of the loop; with `settle` every read under way may end after each."""
+        """Run cycles of the loop; with `settle` every pending read may end after each cycle."""
         for _ in range(count):
             sample = self.sampler.latest(self.clock.advance(TICK))
             self.reports += [str(report) for report in sample.reports]
@@ -40,7 +40,7 @@ class Rig:
 
 @pytest.fixture
 def rig():
-    """Makes rigs, and lets every hanging probe go in the end."""
+    """Make rigs, and release every hanging probe in the end."""
     rigs = []
     before = {thread.ident for thread in threading.enumerate()}
 
@@ -63,7 +63,7 @@ def rig():
 
 
 def test_readings_lie_in_the_slots_of_their_resources(rig):
-    """The order of probes and resources gives the slots; the others are 0 and not present."""
+    """The order of probes and resources defines the slots; unused ones are 0 and not present."""
     made = rig(a=FakeProbe(cpu=0.25, memory=0.5), b=FakeProbe(disk=0.75))
     sample = made.sampler.first()
     assert [resource.name for resource in made.sampler.resources] == ["cpu", "memory", "disk"]
@@ -72,7 +72,7 @@ def test_readings_lie_in_the_slots_of_their_resources(rig):
 
 
 def test_full_and_stale_before_the_first_reading(rig):
-    """A host that has not been measured does not look empty."""
+    """An unmeasured host does not look empty."""
     probe = FakeProbe(cpu=0.1)
     probe.gate.clear()
     sample = rig(a=probe).tick(settle=False)
@@ -80,7 +80,7 @@ def test_full_and_stale_before_the_first_reading(rig):
 
 
 def test_sample_is_not_changed_by_later_ones(rig):
-    """A sample that was taken stays what it was."""
+    """A sample that was taken does not change."""
     probe = FakeProbe(cpu=0.1)
     made = rig(a=probe)
     sample = made.sampler.first()
@@ -107,7 +107,7 @@ def test_sample_is_not_changed_by_later_ones(rig):
     ],
 )
 def test_nonsense_makes_the_reading_stale_not_zero(rig, answer, reason):
-    """A probe that answers nonsense keeps its last value, is stale, and is reported once."""
+    """The probe keeps its last value, is stale, and is reported once."""
     probe = FakeProbe(cpu=0.25)
     made = rig(bad=probe, good=FakeProbe(memory=0.5))
     made.tick(2)
@@ -120,7 +120,7 @@ def test_nonsense_makes_the_reading_stale_not_zero(rig, answer, reason):
 
 
 def test_two_readings_of_one_resource_are_nonsense(rig):
-    """Which of the two would be right is not guessed."""
+    """The reading is refused, because either value may be wrong."""
     probe = FakeProbe(cpu=0.25)
     probe.read = lambda: [Reading("cpu", 0.1), Reading("cpu", 0.2)]
     made = rig(bad=probe)
@@ -130,7 +130,7 @@ def test_two_readings_of_one_resource_are_nonsense(rig):
 
 @pytest.mark.parametrize("fault", [OSError("no such device"), SystemExit(3), AssertionError()])
 def test_raising_probe_is_stale_and_recovers(rig, fault):
-    """Whatever it raises, its readings are stale until it answers again; both are reported."""
+    """After any exception the readings are stale until the next answer; both are reported."""
     probe = FakeProbe(cpu=0.25)
     made = rig(bad=probe)
     made.tick(2)
@@ -151,7 +151,7 @@ def test_raising_probe_is_stale_and_recovers(rig, fault):
     ],
 )
 def test_an_answer_that_holds_no_readings_is_named(rig, answer, reason):
-    """Forgetting `return`, or the `Reading`, gives a sentence and no AttributeError."""
+    """A missing `return` or `Reading` gives a message and no AttributeError."""
     probe = FakeProbe(cpu=0.25)
     probe.read = lambda: answer
     made = rig(bad=probe)
@@ -160,7 +160,7 @@ def test_an_answer_that_holds_no_readings_is_named(rig, answer, reason):
 
 
 def test_the_place_at_which_a_probe_raised_is_reported(rig):
-    """The plugin's own file and line."""
+    """The report has the plugin's own file and line."""
     probe = FakeProbe(cpu=0.25)
 
     def read():
@@ -175,7 +175,7 @@ def test_the_place_at_which_a_probe_raised_is_reported(rig):
 
 
 def test_generator_that_raises_midway_changes_nothing(rig):
-    """Values are used all together or not at all."""
+    """All values of a read are used, or none."""
     probe = FakeProbe(cpu=0.25, memory=0.5)
     made = rig(bad=probe)
     made.tick(2)
@@ -191,7 +191,7 @@ def test_generator_that_raises_midway_changes_nothing(rig):
 
 
 def test_hanging_probe_is_late_after_its_deadline(rig):
-    """Until the deadline its last reading counts; from then on it is stale; then it comes back."""
+    """The last reading counts until the deadline; then it is stale until the probe answers."""
     probe = FakeProbe(cpu=0.25)
     made = rig(slow=probe)
     made.tick(2)
@@ -205,7 +205,7 @@ def test_hanging_probe_is_late_after_its_deadline(rig):
 
 
 def test_hanging_probe_is_not_asked_again(rig):
-    """It costs one thread and one read, however long it hangs."""
+    """A hanging probe costs one thread and one read, however long it hangs."""
     probe = FakeProbe(cpu=0.25)
     made = rig(slow=probe)
     made.tick(2)
@@ -219,7 +219,7 @@ def test_hanging_probe_is_not_asked_again(rig):
 
 @pytest.mark.parametrize("trusted", [False, True])
 def test_hanging_probe_delays_no_other(rig, trusted):
-    """Also where all share a thread: the others miss one cycle and are read in the next."""
+    """In a shared thread the others miss one cycle, and are read in the next."""
     slow, before, after = FakeProbe(slow=0.1), FakeProbe(before=0.1), FakeProbe(after=0.1)
     made = rig(before=before, slow=slow, after=after)
     made.tick(TRUSTED_AFTER + 2 if trusted else 1)
@@ -249,13 +249,13 @@ def test_latest_never_waits(rig):
         begun = time.perf_counter()
         made.tick(1, settle=False)
         times.append(time.perf_counter() - begun)
-    # Far above what it takes, far below what a wait would; a busy machine may stall us a few times.
+    # The bound is far above a call and far below a wait; a busy machine may stall a few calls.
     assert sorted(times)[40] < 0.05, times
     _wait_for(lambda: made.threads() <= len(probes) + 1)
 
 
 def test_quick_probes_come_to_share_a_thread(rig):
-    """After some quick reads there is one thread, and so one wake-up a cycle, for all."""
+    """After some quick reads one thread, and so one wake-up a cycle, serves all probes."""
     made = rig(**{name: FakeProbe(**{name: 0.1}) for name in "abcd"})
     made.tick(1)
     assert made.threads() == 4
@@ -264,7 +264,7 @@ def test_quick_probes_come_to_share_a_thread(rig):
 
 
 def test_slow_read_costs_the_place_in_the_shared_thread(rig):
-    """A read that took long without anyone waiting is enough."""
+    """One long read is enough, even if no other probe waited."""
 
     class Slow(FakeProbe):
         seconds = 0.0
@@ -286,7 +286,7 @@ def test_slow_read_costs_the_place_in_the_shared_thread(rig):
 
 
 def test_late_answer_is_kept_but_stale(rig):
-    """An answer after the deadline is better than an older one, but no reading in time."""
+    """A late answer replaces an older value, but counts as stale."""
 
     class Late(FakeProbe):
         def read(self):
@@ -300,7 +300,7 @@ def test_late_answer_is_kept_but_stale(rig):
 
 
 def test_a_failure_is_reported_at_once_however_often_the_probe_changed(rig):
-    """Recoveries are held back, failures never: one that fails for good is shown as stale."""
+    """Only recoveries are delayed, so a probe that fails for good is shown as stale."""
     probe = FakeProbe(cpu=0.25)
     made = rig(bad=probe)
     made.tick(2)
@@ -313,7 +313,7 @@ def test_a_failure_is_reported_at_once_however_often_the_probe_changed(rig):
 
 
 def test_another_error_is_reported_after_a_while(rig):
-    """The newest one, so that the listing does not show one that was corrected long ago."""
+    """The newest error is reported, so that the listing shows no corrected one."""
     probe = FakeProbe(cpu=0.25)
     made = rig(bad=probe)
     made.tick(2)
@@ -328,7 +328,10 @@ def test_another_error_is_reported_after_a_while(rig):
 
 
 def test_a_probe_that_could_not_be_made_is_full_and_stale(rig):
-    """As one that never gave a reading; where others read all of its resources it only fails."""
+    """Its readings are as before a first answer.
+
+    If others read all of its resources, it only fails.
+    """
     lidar = FailedProbe([ResourceDescription("lidar", "1", 1.0)], "plugin 'acme': no `read`")
     made = rig(lidar=lidar, none=FailedProbe([], "plugin 'acme': reads 'cpu', as ..."))
     sample = made.tick(3)
@@ -355,9 +358,9 @@ def test_probe_is_read_once_a_period():
 
 
 def test_flapping_probe_floods_nothing(rig):
-    """Of a probe that fails at every second read, a few reports a minute are made.
+    """A probe that fails at every second read causes a few reports a minute.
 
-    Its readings are stale as the newest report says, so that both listings show the same.
+    Its readings are stale as the newest report states, so that both listings show the same.
     """
     probe = FakeProbe(cpu=0.25)
     made = rig(bad=probe)
@@ -378,7 +381,7 @@ def test_flapping_probe_floods_nothing(rig):
 
 
 def test_close_closes_each_probe_once():
-    """In the thread that read it, and a probe whose `close` raises stops no other."""
+    """The thread that read the probe closes it; a `close` that raises stops no other."""
     good, bad = FakeProbe(good=0.1), FakeProbe(bad=0.1)
     bad.close = lambda: 1 / 0
     sampler = Sampler([made_probe("bad", bad), made_probe("good", good)])
@@ -388,7 +391,7 @@ def test_close_closes_each_probe_once():
 
 
 def test_close_does_not_wait_for_a_hanging_probe():
-    """It is left as it is, and named."""
+    """The hanging probe stays open, and its name is returned."""
     slow, good = FakeProbe(slow=0.1), FakeProbe(good=0.1)
     slow.gate.clear()
     sampler = Sampler([made_probe("slow", slow), made_probe("good", good)])
@@ -401,7 +404,7 @@ def test_close_does_not_wait_for_a_hanging_probe():
 
 
 def test_probe_is_not_closed_under_its_own_read(rig):
-    """Not even by another thread, when it hangs in the one that the others had to leave."""
+    """A thread other than the one in which it hangs does not close it either."""
     slow, good = FakeProbe(slow=0.1), FakeProbe(good=0.1)
     made = rig(slow=slow, good=good)
     made.tick(TRUSTED_AFTER + 2)

@@ -1,4 +1,4 @@
-"""The table of a slave's sessions, on a written process tree."""
+"""Table of a slave's sessions, with a written process tree."""
 
 import os
 import shutil
@@ -12,14 +12,14 @@ PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 class Tree:
-    """A /proc with the processes that a test puts there."""
+    """A /proc with the processes of a test."""
 
     def __init__(self, path):
         self.path = path
         self.session = {}
 
     def put(self, pid, session, *, own=0.0, children=0.0, pages=0, name="sleep"):
-        """A process: its CPU seconds, those of its reaped children, its resident pages."""
+        """Add a process: its CPU seconds, those of its reaped children, its resident pages."""
         self.session[pid] = session
         fields = [
             "S", 1, pid, session, 0, -1, 0, 0, 0, 0, 0,
@@ -30,7 +30,7 @@ class Tree:
         (folder / "stat").write_text(f"{pid} ({name}) {' '.join(map(str, fields))}\n")
 
     def end(self, pid):
-        """The process has been reaped."""
+        """Remove a process that was reaped."""
         del self.session[pid]
         shutil.rmtree(self.path / str(pid))
 
@@ -52,7 +52,7 @@ def table(tree):
 
 
 def test_leader_counts_at_once_members_at_the_walk(tree, table):
-    """A session is known when it is added; who joined it, one walk later."""
+    """The leader counts once the session is added, other processes from the next walk on."""
     tree.put(10, 10)
     tree.put(11, 10)
     tree.put(12, 12)
@@ -65,7 +65,7 @@ def test_leader_counts_at_once_members_at_the_walk(tree, table):
 
 
 def test_usage_is_a_mean_between_walks(tree, table):
-    """Cores are CPU time over time passed, memory the sum of all members."""
+    """Cores are CPU time over time passed; memory is the sum over all processes."""
     tree.put(10, 10, own=5.0, pages=100)
     tree.put(11, 10, own=1.0, pages=50)
     table.add(10)
@@ -90,7 +90,7 @@ def test_child_that_was_waited_for_stays_counted(tree, table):
 
 
 def test_lost_time_is_no_negative_usage(tree, table):
-    """A member that ended as an orphan takes its time with it."""
+    """The time of an orphan is lost at its end."""
     tree.put(10, 10, own=1.0)
     tree.put(11, 10, own=100.0)
     table.add(10)
@@ -101,7 +101,7 @@ def test_lost_time_is_no_negative_usage(tree, table):
 
 
 def test_removed_session_is_gone_and_its_time_kept(tree, table):
-    """What an ended session used is kept for good; the others stay as they are."""
+    """The CPU time of a removed session is kept for good; the others do not change."""
     for leader in (10, 20):
         tree.put(leader, leader, own=1.0)
         table.add(leader)
@@ -115,25 +115,25 @@ def test_removed_session_is_gone_and_its_time_kept(tree, table):
 
 
 def test_ended_time_never_falls(table):
-    """Nonsense from the kernel or the supervisor does not take time back."""
+    """Invalid values from the kernel or the supervisor do not lower the sum."""
     table.remove(10, cpu_time=2.0)
     table.remove(11, cpu_time=-1.0)
     assert table.ended_cpu_time() == 2.0
 
 
 def test_process_that_ends_during_the_walk_is_no_error(tree, table):
-    """Listed a moment ago, gone now."""
+    """The process was listed a moment earlier."""
     tree.put(10, 10, pages=10)
     tree.put(11, 10, pages=10)
     table.add(10)
     (tree.path / "11" / "stat").unlink()
-    (tree.path / "12").mkdir()  # gone before its session could be asked for
+    (tree.path / "12").mkdir()  # ended before its session was read
     table.refresh(0.0)
     assert table.usage()[10].memory == 10 * PAGE
 
 
 def test_strange_names(tree, table):
-    """A program may call itself anything, also what looks like the end of its name."""
+    """A program may have any name, also one like the end of the name field."""
     tree.put(10, 10, pages=10, name="a) S 1 (b c")
     table.add(10)
     table.refresh(0.0)
@@ -141,7 +141,7 @@ def test_strange_names(tree, table):
 
 
 def test_without_sessions_nothing_is_walked(table, tmp_path):
-    """A slave that runs nothing pays nothing."""
+    """A slave without processes has no overhead."""
     shutil.rmtree(tmp_path)
     table.refresh(0.0)
     assert (table.pids(), dict(table.usage())) == ((), {})

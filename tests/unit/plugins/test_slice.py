@@ -19,7 +19,7 @@ PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 class Tree:
-    """A /proc with the processes that a test puts there."""
+    """A /proc with the processes of a test."""
 
     def __init__(self, path, cores=4):
         self.path = path
@@ -37,7 +37,7 @@ class Tree:
         (folder / "statm").write_text(f"9999 {pages} 10 1 0 50 0\n")
 
     def end(self, pid):
-        # A file that is kept open answers as the kernel does: nothing more.
+        # An open file must answer as in the kernel: with no content.
         for file in (self.path / str(pid)).iterdir():
             file.write_text("")
         shutil.rmtree(self.path / str(pid))
@@ -49,7 +49,7 @@ def tree(tmp_path):
 
 
 class Gauge:
-    """The CPU gauge of a slice of two cores, read ten times a second."""
+    """CPU gauge of a slice of two cores, read ten times a second."""
 
     def __init__(self, tree, *pids):
         self.clock = FakeClock()
@@ -62,7 +62,7 @@ class Gauge:
 
 
 def test_cpu_is_time_over_budget(tree):
-    """One busy process of a budget of two cores is half."""
+    """One busy process uses half of a budget of two cores."""
     tree.put(10, 10, own=50.0)
     gauge = Gauge(tree, 10)
     tree.put(10, 10, own=50.1)
@@ -70,7 +70,7 @@ def test_cpu_is_time_over_budget(tree):
 
 
 def test_cpu_of_a_budget_can_be_exceeded(tree):
-    """A budget is not enforced: more than all of it shows as more than 1."""
+    """A budget is not enforced: usage above the budget is above 1."""
     tree.put(10, 10, own=0.0)
     gauge = Gauge(tree, 10)
     tree.put(10, 10, own=0.4)
@@ -78,7 +78,7 @@ def test_cpu_of_a_budget_can_be_exceeded(tree):
 
 
 def test_cpu_of_a_waited_for_child_counts_once(tree):
-    """It moves into its parent's time: no gap and no jump."""
+    """The child's time moves into its parent's time, without a gap or a jump."""
     tree.put(10, 10, own=0.0)
     tree.put(11, 10, own=30.0)
     gauge = Gauge(tree, 10, 11)
@@ -88,7 +88,7 @@ def test_cpu_of_a_waited_for_child_counts_once(tree):
 
 
 def test_cpu_of_an_ended_session_counts_once(tree):
-    """Between its end and the word of it, its last known time is held."""
+    """The last known time counts between the session's end and the report of it."""
     tree.put(10, 10, own=60.0)
     gauge = Gauge(tree, 10)
     tree.put(10, 10, own=60.2)
@@ -101,14 +101,14 @@ def test_cpu_of_an_ended_session_counts_once(tree):
 
 
 def test_cpu_of_processes_too_short_to_be_seen_counts(tree):
-    """What began and ended between two reads shows in the time of the ended."""
+    """A process that began and ended between two reads counts in the time of ended sessions."""
     gauge = Gauge(tree)
     gauge.sessions.ended = 0.1
     assert gauge.after() == pytest.approx(0.5)
 
 
 def test_cpu_of_a_process_taken_over_is_no_burst(tree):
-    """An hour of an earlier slave's process is not load of this moment."""
+    """An hour of CPU time of a re-adopted process is no present load."""
     gauge = Gauge(tree)
     tree.put(10, 10, own=3600.0, started=999)
     gauge.sessions.members = (10,)
@@ -121,7 +121,7 @@ def test_cpu_of_a_process_taken_over_is_no_burst(tree):
 
 
 def test_cpu_of_a_process_that_is_found_late_is_bounded(tree):
-    """A session that began and was not seen for long counts as what four cores can do by then."""
+    """A session seen late counts at most as much as four cores can use in that time."""
     gauge = Gauge(tree)
     tree.put(10, 10, own=3600.0)
     gauge.sessions.members = (10,)
@@ -132,7 +132,7 @@ def test_cpu_of_a_process_that_is_found_late_is_bounded(tree):
 
 
 def test_orphan_that_ends_leaves_no_gap(tree):
-    """Its time is lost, but what the others use goes on counting at once."""
+    """The orphan's time is lost, but usage by others counts at once."""
     tree.put(10, 10, own=0.0)
     tree.put(11, 10, own=30.0)
     gauge = Gauge(tree, 10, 11)
@@ -143,7 +143,7 @@ def test_orphan_that_ends_leaves_no_gap(tree):
 
 
 def test_memory_is_the_sum_of_the_known_processes(tree):
-    """Resident pages over the budget; one that has ended counts nothing."""
+    """Usage is the resident pages over the budget; ended processes do not count."""
     tree.put(10, 10, 0.0, pages=100)
     tree.put(11, 10, 0.0, pages=50)
     sessions = FakeSessions((10, 11, 12))
@@ -157,7 +157,7 @@ def test_memory_is_the_sum_of_the_known_processes(tree):
 
 
 def test_files_of_many_processes_are_not_all_kept_open(tree):
-    """A slave with hundreds of processes stays far from the bound of open files."""
+    """A slave with hundreds of processes stays far from the limit of open files."""
     pids = tuple(range(100, 500))
     for pid in pids:
         tree.put(pid, pid, 0.0, pages=1)
@@ -181,7 +181,7 @@ def open_files():
     [(cpu, cpu.CpuOptions(), "cpu"), (memory, memory.MemoryOptions(), "memory")],
 )
 def test_slice_without_a_budget_is_refused(module, options, resource):
-    """The error says which is missing, in what unit, and what there is."""
+    """The error has the missing budget, its unit and the available amount."""
     with pytest.raises(ConfigError, match=f"needs a budget for '{resource}' in .*: disk"):
         module.create(options, probe_context("slice", budget={"disk": 1.0}))
     with pytest.raises(ConfigError, match="must be above 0"):
@@ -196,7 +196,7 @@ def test_option_overrides_the_hosts_scope():
 
 
 def test_usage_far_over_a_budget_is_bounded(tmp_path):
-    """The master takes a huge number for a mistake; ten times over says all there is to say."""
+    """The master refuses huge values; ten times the budget is informative enough."""
     (tmp_path / "log").write_bytes(b"x" * 100_000)
     context = probe_context("slice", budget={"disk": 1.0}, data_directory=tmp_path)
     probe = disk.create(disk.DiskOptions(), context)
@@ -214,7 +214,7 @@ def test_disk_of_a_slice_is_what_lies_below_its_directory(tmp_path):
 
 
 def test_disk_of_a_slice_is_walked_seldom(tmp_path):
-    """Between two walks the last result stands."""
+    """The last result counts until the next walk."""
     clock = FakeClock()
     gauge = DirectoryTree(tmp_path, 1e6, 5.0, clock)
     assert gauge.usage() == 0.0
@@ -226,7 +226,7 @@ def test_disk_of_a_slice_is_walked_seldom(tmp_path):
 
 
 def test_long_walk_makes_the_next_wait(tmp_path, monkeypatch):
-    """A directory of a million files takes no more than a hundredth of the time."""
+    """The walk of a directory of a million files takes at most a hundredth of the time."""
     clock = FakeClock()
     walks = []
 
@@ -247,7 +247,7 @@ def test_long_walk_makes_the_next_wait(tmp_path, monkeypatch):
 
 
 def test_disk_without_a_budget_is_the_file_system(tmp_path):
-    """A slice without a disk budget shares the disk, so the disk counts."""
+    """A slice without a disk budget shares the disk, so the whole disk counts."""
     context = probe_context("slice", data_directory=tmp_path / "not" / "yet")
     probe = disk.create(disk.DiskOptions(), context)
     assert probe.resources[0].scope == "machine"

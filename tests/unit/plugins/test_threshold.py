@@ -45,20 +45,20 @@ def test_veto_above_enter_counts_the_need():
 
 
 def test_in_the_band_it_costs_steeply():
-    """A host near its limit costs more than an otherwise full one that is not near its own."""
+    """A host near its own limit costs more than a fuller one with a higher limit."""
     view = host_view({"memory": [0.85, 0.79], "cpu": [0.0, 0.79]})
     value = score(view).value
     assert value[0] > value[1] + 1
 
 
 def test_the_fuller_the_costlier_within_the_band():
-    """When all hosts are in the band, the least full one goes first."""
+    """The least full host comes first if all are in the band."""
     value = score(host_view({"memory": [0.94, 0.82, 0.90]})).value
     assert list(np.argsort(value)) == [1, 2, 0]
 
 
 def test_dip_below_enter_is_not_enough_to_return():
-    """Hysteresis: a host just under the veto is not taken while another is below the band."""
+    """Hysteresis: a host just under the veto takes nothing while another is below the band."""
     for reading in (0.96, 0.94, 0.90, 0.85, 0.81):
         scores = score(host_view({"memory": [reading, 0.7], "cpu": [0.0, 0.75]}))
         assert int(np.argmin(np.where(scores.veto, np.inf, scores.value))) == 1
@@ -67,7 +67,7 @@ def test_dip_below_enter_is_not_enough_to_return():
 
 
 def test_jitter_below_the_need_lets_no_second_process_in():
-    """A host that was filled up to the threshold stays closed until it has lost a whole need."""
+    """A host filled up to the threshold stays closed until it has lost a whole need."""
     full = 0.94
     for jitter in (-0.02, -0.01, 0.0, 0.01):
         assert score(host_view({"memory": [full + jitter]}), {"memory": 0.04}).veto[0]
@@ -83,7 +83,7 @@ def test_busy_gpu_vetoes_only_who_needs_it():
 
 
 def test_reason_names_the_cost():
-    """The cost near a limit is explained by the resource that causes it."""
+    """The reason names the resource that causes the cost near a limit."""
     reason = score(host_view({"memory": [0.9], "cpu": [0.1]})).reason(0)
     assert reason.startswith("1 x memory 90.0% + 0.5 x cpu 10.0% + ")
     assert reason.endswith(", as memory would be at 90.0% of its limit")
@@ -98,7 +98,7 @@ def test_band_without_a_width_is_refused():
 @settings(deadline=None)
 @given(hosts(), needs)
 def test_rows_are_independent(view, needed):
-    """A host is judged alike alone and among others, to the last bit."""
+    """A host's score is the same alone and among others, to the last bit."""
     policy = Threshold(ThresholdOptions())
     process = process_view(view, needed)
     together = policy.score(view, process)
@@ -117,7 +117,7 @@ fills = st.tuples(st.floats(0, 1), st.floats(0, 1))
 @settings(deadline=None)
 @given(st.lists(fills, min_size=1), st.lists(fills, min_size=1), st.floats(0.01, 1))
 def test_hosts_below_the_band_go_before_hosts_within(empty, full, limit):
-    """No usage and no weight lets a host in the band go before one below it."""
+    """No usage and no weight puts a host in the band before one below it."""
     below = [(0.79 * memory, 0.79 * cpu) for memory, cpu in empty]
     within = [(0.81 + 0.13 * memory, 0.94 * cpu) for memory, cpu in full]
     memory, cpu = zip(*(below + within), strict=True)
@@ -130,6 +130,6 @@ def test_hosts_below_the_band_go_before_hosts_within(empty, full, limit):
 @settings(deadline=None)
 @given(hosts())
 def test_vetoes_exactly_what_is_above_enter(view):
-    """No host at or below the threshold is vetoed, and none above it is not."""
+    """No host at or below the threshold is vetoed, and every host above it is."""
     fill = np.nan_to_num(view.usage[:, :2], nan=0.0) / np.maximum(view.limit[:, :2], 1e-9)
     assert np.array_equal(score(view).veto, fill.max(axis=1) > 0.95)

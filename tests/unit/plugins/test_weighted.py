@@ -38,13 +38,13 @@ def test_is_equation_1():
 
 
 def test_default_weighs_memory_most():
-    """By default memory counts full, cpu half, disk nothing."""
+    """By default memory has weight 1, CPU one half and disk zero."""
     view = host_view({"memory": [0.5, 0.4], "cpu": [0.1, 0.4], "disk": [0.0, 1.0]})
     assert score(view).value == pytest.approx([0.55, 0.6])
 
 
 def test_named_weights_replace_all_defaults():
-    """A resource that is not named weighs nothing."""
+    """A resource that is not named has weight zero."""
     view = host_view({"memory": [0.5], "cpu": [0.2]})
     assert score(view, cpu=1.0).value == pytest.approx([0.2])
 
@@ -52,7 +52,7 @@ def test_named_weights_replace_all_defaults():
 @pytest.mark.parametrize("policy", [Weighted, Threshold])
 @pytest.mark.parametrize(("missing", "value"), [("worst", 1.5), ("ignore", 0.5)])
 def test_a_host_that_does_not_measure_counts_as_full_unless_that_is_ignored(policy, missing, value):
-    """So a host without a probe is not preferred to those that have it."""
+    """A host without a probe is not preferred to those that have it."""
     options = WeightedOptions if policy is Weighted else ThresholdOptions
     view = host_view({"memory": [0.5, 0.5], "gpu": [float("nan"), 0.2]})
     made = policy(options({"memory": 1.0, "gpu": 1.0}, missing=missing))
@@ -60,13 +60,13 @@ def test_a_host_that_does_not_measure_counts_as_full_unless_that_is_ignored(poli
 
 
 def test_what_is_not_measured_counts_as_full_by_default():
-    """`missing` is `worst`."""
+    """The default of `missing` is `worst`."""
     view = host_view({"memory": [0.5, 0.5], "fds": [float("nan"), 0.9]})
     assert score(view, memory=1.0, fds=0.3).value.argmin() == 1
 
 
 def test_reason_is_the_sum_written_out():
-    """The score of a host is explained by its terms."""
+    """The reason is the sum of the score's terms."""
     view = host_view({"memory": [0.5, 0.25], "cpu": [0.1, float("nan")]})
     assert score(view).reason(0) == "1 x memory 50.0% + 0.5 x cpu 10.0%"
     assert score(view).reason(1) == "1 x memory 25.0% + 0.5 x cpu 100.0% (not measured there)"
@@ -76,7 +76,7 @@ def test_reason_is_the_sum_written_out():
 @settings(deadline=None)
 @given(hosts(), weights)
 def test_rows_are_independent(view, given_weights):
-    """A host scores alike alone and among others, to the last bit."""
+    """A host's score is the same alone and among others, to the last bit."""
     policy = Weighted(WeightedOptions(given_weights))
     process = process_view(view)
     together = policy.score(view, process).value

@@ -1,4 +1,4 @@
-"""The registry: plugins are chosen by name, and each that fails is named with the reason."""
+"""Registry of plugins: choice by name, and a named reason for each failure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Options:
 
 
 class Probe:
-    """Reads nothing of interest."""
+    """Probe without a reading."""
 
     def __init__(self, *names, capacity=1.0):
         self.resources = [ResourceDescription(name, "1", capacity) for name in names]
@@ -46,7 +46,7 @@ class Probe:
 
 
 def plugin(**hooks):
-    """A plugin whose hooks answer with these offers (or raise them)."""
+    """Return a plugin whose hooks return (or raise) these offers."""
 
     def implement(name, answer):
         def hook():
@@ -69,7 +69,7 @@ def offered(name, create=None, **more):
 
 
 def failed(result: Probes) -> dict[str, str]:
-    """The probes that could not be made, and why."""
+    """Return the probes that could not be made, with the reasons."""
     return {one.name: one.probe.reason for one in result.made if isinstance(one.probe, FailedProbe)}
 
 
@@ -111,9 +111,9 @@ def test_an_unknown_name_is_refused_with_what_is_there_and_what_is_broken():
 
 
 def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
-    """By the name of its offer, or its own; of the others their number and where they stand.
+    """The plugin is found by the name of its offer or its own; others are only counted.
 
-    Where none is certainly meant, those are told that broke before they offered a name.
+    If no plugin certainly matches, the error names those that broke before they offered a name.
     """
     nameless = plugin(register_scoring_policies=OSError("no such table"))
     bare = ScoringOffer("s", lambda options: None, options=dict)
@@ -143,7 +143,7 @@ def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
     ],
 )
 def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
-    """At the start, and not at the first decision."""
+    """The refusal comes at the start, not at the first decision."""
     offer = ScoringOffer("s", lambda options: made)
     registry = Registry.of(ours=plugin(register_scoring_policies=[offer]))
     with pytest.raises(PluginError) as refused:
@@ -161,7 +161,7 @@ def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
     ],
 )
 def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
-    """The offer is broken, and says so when plugins are loaded."""
+    """The offer is broken, and is reported when plugins are loaded."""
     offer = ScoringOffer("s", lambda options: None, reads=reads)
     (broken,) = Registry.of(ours=plugin(register_scoring_policies=[offer])).broken
     assert said in broken.reason
@@ -188,7 +188,7 @@ def test_a_resource_that_no_message_can_carry_is_refused(context, described, sai
 
 
 def test_a_probe_reads_only_what_its_offer_declares(context):
-    """So that names of resources in a file can be checked before anything is made."""
+    """Names of resources in a file can thus be checked before any probe is made."""
     registry = probes(offered("fds", lambda options, context: Probe("files")))
     reason = failed(registry.probes({"fds": {}}, context))["fds"]
     assert "which its offer does not declare: say ProbeOffer(..., resources=(" in reason
@@ -292,7 +292,7 @@ def test_a_hook_with_an_argument_that_it_does_not_get_is_reported():
 
 
 def test_only_a_probe_that_says_so_is_absent_and_any_other_fault_is_an_error(context):
-    """The resources of one that fails are read, always without success: never taken for absent."""
+    """The resources of a failed probe count as read without success, never as absent."""
 
     def skip(options, context):
         raise SkipPlugin("no NVIDIA driver")
@@ -332,7 +332,7 @@ def test_an_unknown_probe_stops_the_slave_at_its_start(context):
 
 
 def described(**fields):
-    """A probe whose description cannot travel: sent so, it would end the slave's registration."""
+    """Return a probe whose description cannot be sent: it would end the slave's registration."""
     return SimpleNamespace(
         resources=[ResourceDescription(**{"name": "b", "unit": "1", "capacity": 1.0, **fields})],
         read=None,
@@ -357,7 +357,7 @@ def described(**fields):
     ],
 )
 def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_fails(context, second, said):
-    """What stands for it has the resources that it declares and no other probe reads, up to 16."""
+    """Its stand-in has its declared resources that no other probe reads, up to 16."""
     registry = probes(
         offered("first", lambda options, context: Probe("a"), resources=("a",)),
         offered(
@@ -379,7 +379,7 @@ def run(arguments):
 
 
 def moving(name, executors):
-    """A plugin with one migration strategy."""
+    """Return a plugin with one migration strategy."""
     offer = MigrationOffer(name, lambda options: None, executors=executors)
     return plugin(register_migration_strategies=[offer])
 
@@ -393,7 +393,7 @@ def test_executors_come_from_every_migration_offer():
 
 
 def test_offers_with_executors_of_one_name_are_both_broken_and_name_each_other():
-    """An order names nothing but the executor, so which one runs would be chance."""
+    """An order has only the executor's name, so the choice would be random."""
     registry = Registry.of(
         acme=moving("acme", {"rest": run, "other": run}),
         announce=moving("announce", {"rest": lambda arguments: {}}),
@@ -419,13 +419,13 @@ def test_offers_with_executors_of_one_name_are_both_broken_and_name_each_other()
     ],
 )
 def test_executors_that_cannot_be_called_break_their_offer(executors, said):
-    """When plugins are loaded, not at the first move."""
+    """The error comes when plugins are loaded, not at the first move."""
     (broken,) = Registry.of(ours=moving("m", executors)).broken
     assert said in broken.reason
 
 
 def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
-    """Otherwise every host would count as one on which the plugin is not installed."""
+    """Otherwise every host would count as one without the plugin."""
     able = SimpleNamespace(propose=None, ability="m.abel", host_fault=max)
     offer = MigrationOffer("m", lambda options: able, executors={"m.able": dict})
     registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
@@ -452,7 +452,7 @@ def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
 
 
 def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
-    """A probe fails, and what the master cannot do without is an error; nothing hangs."""
+    """A probe fails; for a part that the master needs, the error is raised. Nothing hangs."""
     monkeypatch.setattr("rosrm.extensions.registry.CREATE_LIMIT", 0.05)
 
     def hangs(*_):
@@ -473,7 +473,7 @@ def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
 
 
 def test_a_hook_that_hangs_is_named_while_it_does_and_ended(monkeypatch, caplog):
-    """With the hook, its place, and the line in which it hangs; the others go on."""
+    """The message has the hook, its place and the line of the hang; the other plugins load."""
     monkeypatch.setattr("rosrm.extensions.discovery.LOADING_LIMIT", 0.3)
     monkeypatch.setattr("rosrm.extensions.discovery.SLOW_LOADING", 0.1)
 

@@ -1,4 +1,4 @@
-"""An exception in a callback ends nothing: it is logged with its place, and counted."""
+"""Guard of ROS callbacks: exceptions are logged with their place and counted."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def bad_message() -> None:
 
 @pytest.mark.parametrize("fault", [SystemExit(3), GeneratorExit(), ZeroDivisionError("oops")])
 def test_nothing_that_a_callback_raises_gets_out(fault) -> None:
-    """Also what `except Exception` lets pass."""
+    """The guard catches exceptions that `except Exception` lets pass, too."""
 
     def callback() -> None:
         raise fault

@@ -1,4 +1,4 @@
-"""Every value survives the way through a message; what makes no sense is refused, never misread."""
+"""Conversion of values to messages and back; invalid messages are refused."""
 
 from __future__ import annotations
 
@@ -75,21 +75,21 @@ def specs(draw) -> values.ProcessSpec:
 
 
 def over_the_wire(message):
-    """As the other side gets it."""
+    """Serialise and deserialise a message."""
     return deserialize_message(serialize_message(message), type(message))
 
 
 @given(specs())
 @settings(max_examples=150, deadline=None)
 def test_spec_survives(spec) -> None:
-    """What is submitted is what arrives, in every field."""
+    """A submitted spec is received unchanged in every field."""
     assert convert.spec_from_msg(over_the_wire(convert.spec_to_msg(spec))) == spec
 
 
 @given(specs(), INSTANCES, UINT64, WORDS, st.booleans())
 @settings(max_examples=30, deadline=None)
 def test_assignment_survives(spec, instance, epoch, node_name, shadow) -> None:
-    """An order to run an instance arrives as it was given."""
+    """An assignment is received unchanged."""
     assignment = values.Assignment(instance, spec, epoch, node_name, shadow)
     assert (
         convert.assignment_from_msg(over_the_wire(convert.assignment_to_msg(assignment)))
@@ -100,7 +100,7 @@ def test_assignment_survives(spec, instance, epoch, node_name, shadow) -> None:
 @given(specs())
 @settings(max_examples=30, deadline=None)
 def test_restart_policy_survives(spec) -> None:
-    """Also apart from its spec."""
+    """The policy also survives apart from its spec."""
     message = over_the_wire(convert.restart_to_msg(spec.restart))
     assert convert.restart_from_msg(message) == spec.restart
 
@@ -109,7 +109,7 @@ def test_restart_policy_survives(spec) -> None:
     ("name", "value"), [("when", "sometimes"), ("factor", 0.5), ("delay", -1.0)]
 )
 def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
-    """Nothing of it is used."""
+    """The policy is refused as a whole."""
     message = convert.restart_to_msg(values.RestartPolicy())
     setattr(message, name, value)
     with pytest.raises(Refused, match="a restart policy: "):
@@ -133,7 +133,7 @@ def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
 )
 @settings(max_examples=60, deadline=None)
 def test_status_survives(status) -> None:
-    """What a slave says of an instance is what the master hears."""
+    """A status is received by the master as the slave sent it."""
     assert convert.status_from_msg(over_the_wire(convert.status_to_msg(status))) == status
 
 
@@ -159,14 +159,14 @@ HOSTS = st.builds(
 @given(HOSTS)
 @settings(max_examples=60, deadline=None)
 def test_host_survives(host) -> None:
-    """A host is what it says of itself; the place of a resource is its slot."""
+    """A host description is received unchanged; a resource's position is its slot."""
     assert convert.host_from_msg(over_the_wire(convert.host_to_msg(host))) == host
 
 
 @given(HOSTS, st.data())
 @settings(max_examples=30, deadline=None)
 def test_host_row_survives(host, data) -> None:
-    """A row of `rosrm hosts` arrives whole, without the digits that float32 adds."""
+    """A row of `rosrm hosts` is received whole, without digits added by float32."""
     fraction = st.integers(0, 2_000_000).map(lambda number: number / 1e6)
     row = HostRow(
         host, 7, "up", True, False, True, 0.25,
@@ -181,7 +181,7 @@ def test_host_row_survives(host, data) -> None:
 
 
 def test_rows_survive() -> None:
-    """Rows of `ps`, `plugins` and `events` arrive whole."""
+    """Rows of `ps`, `plugins` and `events` are received whole."""
     process = ProcessRow(
         "a", "job", "failed", "h", 2**40, 12, 3, 1, -9, -5, 0, 1.5, 0.9, 2**40, "why", True
     )
@@ -228,7 +228,7 @@ NONSENSE_IN_SPECS = {
 
 @pytest.mark.parametrize("what", NONSENSE_IN_SPECS)
 def test_spec_that_makes_no_process_is_refused(what) -> None:
-    """Somebody else's client may send anything: it is refused with a reason, and nothing raises."""
+    """Any client may send an invalid spec: the refusal has a reason, and nothing else is raised."""
     message = good_spec()
     convert.spec_from_msg(message)
 
@@ -255,7 +255,7 @@ NONSENSE_IN_HOSTS = {
 
 @pytest.mark.parametrize("what", NONSENSE_IN_HOSTS)
 def test_host_that_makes_no_sense_is_refused(what) -> None:
-    """A slave that describes itself badly is not taken in."""
+    """A slave with an invalid description cannot register."""
     resources = tuple(values.ResourceDescription(name, "B", 1.0) for name in ("memory", "disk"))
     message = convert.host_to_msg(values.HostDescription("h", 1, resources=resources))
     convert.host_from_msg(message)
@@ -267,14 +267,14 @@ def test_host_that_makes_no_sense_is_refused(what) -> None:
 
 
 def test_unknown_state_is_refused() -> None:
-    """A status of a state that this version does not know is not guessed at."""
+    """A status of a state unknown to this version is refused."""
     with pytest.raises(Refused, match="flying"):
         convert.status_from_msg(msg.ProcessStatus(state="flying"))
 
 
 @pytest.mark.parametrize("text", ["[1]", "1", "nothing", "{", '"a"', "null"])
 def test_only_a_json_object_is_one(text) -> None:
-    """Free-form values are JSON objects; anything else is refused with what it was."""
+    """The refusal of any other value names its type."""
     with pytest.raises(Refused, match="the options"):
         convert.json_object(text, "the options")
     assert convert.json_object("", "the options") == {}

@@ -1,4 +1,4 @@
-"""The settings of Fast DDS that a node makes itself with."""
+"""Fast DDS settings of the nodes of rosrm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm.ros.fast_dds import announcements, announcing
 
 
 def test_fast_dds_is_given_a_profile_while_the_node_is_made():
-    """And what the process starts later is not."""
+    """Processes that start later do not inherit the profile."""
     environment = {"HOME": "/home/robot"}
     with announcing(environment, "steady", udp=False):
         (profile,) = set(environment) - {"HOME"}
@@ -46,7 +46,7 @@ def test_no_transport_is_chosen_for_nodes_or_over_the_users_choice(pace, udp, ch
 
 @pytest.mark.parametrize("pace", ["eager", "steady"])
 def test_the_profile_for_udp_differs_by_its_locators_alone(pace):
-    """Two files for one pace must not drift apart."""
+    """The two files for one pace must not drift apart."""
     plain, udp = (
         Path(announcements({}, pace, udp=udp)["FASTRTPS_DEFAULT_PROFILES_FILE"])
         .read_text()
@@ -61,7 +61,7 @@ def test_the_profile_for_udp_differs_by_its_locators_alone(pace):
     "variable", ["FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"]
 )
 def test_what_the_user_has_set_stands(variable):
-    """Also afterwards."""
+    """The variable has its value afterwards, too."""
     environment = {variable: "/etc/robot.xml"}
     with announcing(environment, "steady", udp=True):
         assert environment == {variable: "/etc/robot.xml"}

@@ -1,4 +1,4 @@
-"""The gate: the receiver alone judges whether a request is still meant, and none counts twice."""
+"""Gate for requests: the receiver refuses stale and repeated ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ S = 10**9
 
 
 class Requested:
-    """Stands for a request that waits for its answer."""
+    """Fake request that waits for its answer."""
 
     def __init__(self) -> None:
         self.answers = []
@@ -32,13 +32,13 @@ def gate(now: float = 100.0, max_age: float = 5.0) -> Gate:
 
 
 def test_a_fresh_request_passes() -> None:
-    """Up to the greatest age, by the receiver's own clock."""
+    """The age is at most the limit, by the receiver's own clock."""
     for age in (0, 1, 5):
         assert gate().refusal(envelope((100 - age) * S)) is None
 
 
 def test_a_late_request_is_refused() -> None:
-    """DDS delivers requests seconds late after a cut: they are not carried out any more."""
+    """DDS delivers requests seconds late after a cut; they are no longer carried out."""
     answer = gate().refusal(envelope(94 * S))
     assert (answer.accepted, answer.code) == (False, "stale")
     assert "6.0 s" in answer.message
@@ -46,20 +46,20 @@ def test_a_late_request_is_refused() -> None:
 
 
 def test_a_request_for_another_run_is_refused() -> None:
-    """No beat, or one that this receiver's clock has not reached: it was meant for another run."""
+    """A missing beat, or one that this receiver's clock has not reached, belongs to another run."""
     for beat in (0, 101 * S, 2**63):
         assert gate().refusal(envelope(beat)).code == "stale"
 
 
 def test_an_older_epoch_is_refused() -> None:
-    """A master that was replaced gives no orders; a sender that knows a newer epoch may ask."""
+    """A replaced master gives no orders; a sender that knows a newer epoch may send requests."""
     assert gate().refusal(envelope(100 * S, epoch=2), epoch=3).code == "stale"
     assert gate().refusal(envelope(100 * S, epoch=3), epoch=3) is None
     assert gate().refusal(envelope(100 * S, epoch=4), epoch=3) is None
 
 
 def test_another_version_is_refused_first() -> None:
-    """Of a stranger's envelope no other field is believed."""
+    """The other fields of such an envelope are not used."""
     answer = gate().refusal(envelope(0, protocol_version=99))
     assert answer.code == "version"
     assert "99" in answer.message
@@ -67,12 +67,12 @@ def test_another_version_is_refused_first() -> None:
 
 
 def test_a_request_without_an_id_is_refused() -> None:
-    """Nobody could tell it from another one."""
+    """Without an id a repetition could not be recognised."""
     assert gate().refusal(envelope(100 * S, request_id="")).code == "invalid"
 
 
 def test_a_repeated_request_gets_the_same_answer() -> None:
-    """It is not carried out again."""
+    """A repeated request is not carried out again."""
     judge, first, again = gate(), Requested(), Requested()
     assert not judge.repeated(envelope(1), first)
     judge.remember(envelope(1), "done")
@@ -81,18 +81,21 @@ def test_a_repeated_request_gets_the_same_answer() -> None:
 
 
 def test_a_request_repeated_while_it_is_carried_out_gets_the_answer_too() -> None:
-    """The answer in the making goes to everybody who asks for it."""
+    """The pending answer goes to every sender of the request."""
     judge, first, again = gate(), Requested(), Requested()
     assert not judge.repeated(envelope(1), first)
     assert judge.repeated(envelope(1), again)
     assert again.answers == []
     judge.remember(envelope(1), "done")
     assert again.answers == ["done"]
-    assert first.answers == []  # it is answered by whoever carries it out
+    assert first.answers == []  # the code that carries out the first request answers it
 
 
 def test_the_gate_forgets_only_the_oldest() -> None:
-    """Its memory is bounded, and holds far more than can come within the greatest age."""
+    """The gate's memory is bounded.
+
+    It holds far more requests than can arrive within the greatest age.
+    """
     judge = gate()
     for number in range(10_001):
         assert not judge.repeated(envelope(1, request_id=str(number)), Requested())
@@ -102,7 +105,7 @@ def test_the_gate_forgets_only_the_oldest() -> None:
 
 
 def test_check_answer_raises_what_was_said() -> None:
-    """A client raises the master's own words, or that it is of another version."""
+    """A client raises the master's message, or names the master's version."""
     import pytest
 
     from rosrm.errors import Refused

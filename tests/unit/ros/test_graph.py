@@ -1,4 +1,4 @@
-"""An instance is known in the graph by its own GID, whoever else has its pid."""
+"""Graph lookup by GID: instances on different hosts may share a pid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ HERE, ELSEWHERE = b"\x11\x11", b"\x22\x22"
 
 
 def gid(host: bytes, pid: int) -> bytes:
-    """As Fast DDS makes them: vendor, host, process, chance."""
+    """Return a GID as Fast DDS builds it: vendor, host, process, random part."""
     return b"\x01\x0f" + host + (pid & 0xFFFF).to_bytes(2, "little") + bytes(18)
 
 
@@ -23,7 +23,7 @@ class Info:
 
 
 class FakeNode:
-    """The graph as our own node sees it."""
+    """Fake ROS graph of the slave's own node."""
 
     def __init__(self, *infos: Info) -> None:
         self.infos = infos
@@ -36,7 +36,7 @@ class FakeNode:
 
 
 def test_the_slave_of_another_host_may_have_the_same_pid():
-    """As on virtual hosts or in containers, which number their processes from 1 on."""
+    """Virtual hosts and containers number their processes from 1 on."""
     own, other = gid(HERE, os.getpid()), gid(ELSEWHERE, os.getpid())
     node = FakeNode(
         Info("rosrm_slave_a", own), Info("rosrm_slave_b", other), Info("talker", gid(HERE, 44))
@@ -45,7 +45,7 @@ def test_the_slave_of_another_host_may_have_the_same_pid():
 
 
 def test_the_same_pid_on_another_host_is_another_process():
-    """A namesake that a host has left behind is not the instance that was started here."""
+    """A node of the same name left on another host is not the instance started here."""
     node = FakeNode(
         Info("rosrm_slave_a", gid(HERE, os.getpid())), Info("talker", gid(ELSEWHERE, 44))
     )

@@ -1,4 +1,4 @@
-"""Orders to a slave carry a beat that it has said lately."""
+"""Orders to a slave: each carries a recent beat of that slave."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DESCRIPTION = HostDescription("shelf", RUN)
 
 
 class FakeClient:
-    """Takes the requests in place of DDS."""
+    """Fake client that stores the requests instead of sending them."""
 
     def __init__(self) -> None:
         self.beats: list[int] = []
@@ -44,7 +44,7 @@ def heard(links: HostLinks, beat: int, sequence: int) -> None:
 
 
 class Control:
-    """Stands for the client of the slave's service."""
+    """Fake client of the slave's service."""
 
     ready = True
 
@@ -71,7 +71,7 @@ def links(monkeypatch, control) -> HostLinks:
 
 
 def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control):
-    """Sent before, it would be lost, and given again only after `control.order_retry`."""
+    """An earlier order would be lost, and repeated only after `control.order_retry`."""
     control.ready = False
     links.renew(HOST, DESCRIPTION)
     heard(links, beat=100, sequence=1)
@@ -84,7 +84,7 @@ def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control)
 
 
 def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
-    """A host that was cut off has only old readings, and an order with those would be stale."""
+    """A host that was cut off has only old readings; an order with their beat would be stale."""
     client = links._client
     links.renew(HOST, DESCRIPTION)
     heard(links, beat=100, sequence=1)
@@ -97,7 +97,7 @@ def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
 
 @pytest.mark.parametrize("text", ["null", "[1]", "3", "{"])
 def test_a_result_that_is_no_object_fails_the_order(text):
-    """The step fails with that sentence; nothing is raised in the callback of the answer."""
+    """The step fails with that message; the callback of the answer raises nothing."""
     response = srv.ControlHost.Response(answer=accepted(), result=text)
     event = _order_answered(7, response)
     assert (event.order, event.accepted, event.code) == (7, False, BAD_RESULT)

@@ -1,4 +1,4 @@
-"""The books of the readings: cycles that came, cycles that were missed, and the oldest reading."""
+"""Ledger of readings: received cycles, missed cycles, and the oldest reading."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RUN = 500
 
 
 def runs(*rows: tuple[int, int, int], incarnation: int = RUN, beat: int = 9) -> Runs:
-    """Of (host id, sequence, cycles)."""
+    """Return runs from rows of (host id, sequence, cycles)."""
     hosts, sequences, cycles = (np.array(column, np.int64) for column in zip(*rows, strict=True))
     return Runs(
         hosts, np.full(len(rows), incarnation, np.uint64), sequences - cycles + 1, sequences,
@@ -37,7 +37,7 @@ def test_what_came_is_accounted_for(ledger: Ledger) -> None:
 
 
 def test_a_gap_in_the_sequence_is_missed(ledger: Ledger) -> None:
-    """By as many cycles as no message stands for."""
+    """Each cycle without a message counts."""
     ledger.take(runs((1, 1, 1)), 0.0)
     ledger.take(runs((1, 9, 2)), 0.1)
 
@@ -58,7 +58,7 @@ def test_what_comes_late_is_missed_no_more(ledger: Ledger) -> None:
 
 @pytest.mark.parametrize("host", [0, 3, 10_000_000])
 def test_who_is_not_registered_is_not_entered(ledger: Ledger, host: int) -> None:
-    """Nor a former run of who is."""
+    """A former run of a registered host is ignored, too."""
     assert ledger.take(runs((host, 5, 5)), 0.0).tolist() == []
     assert ledger.take(runs((1, 5, 5), incarnation=RUN + 1), 0.0).tolist() == []
     assert (ledger.cycles, ledger.missed) == (0, 0)
@@ -66,7 +66,7 @@ def test_who_is_not_registered_is_not_entered(ledger: Ledger, host: int) -> None
 
 
 def test_a_new_run_begins_anew(ledger: Ledger) -> None:
-    """Its sequence starts over, its beat is by another clock; what was counted stays."""
+    """Its sequence starts again and its beat uses another clock; the old counts stay."""
     ledger.take(runs((1, 100, 1), beat=10**15), 0.0)
     ledger.begin(1, RUN + 1)
     assert not ledger.beat[1]
@@ -88,7 +88,7 @@ def test_the_oldest_reading_is_that_of_the_most_silent_host(ledger: Ledger) -> N
 
 
 def test_the_books_grow(ledger: Ledger) -> None:
-    """And keep what is in them."""
+    """Existing counts stay."""
     ledger.take(runs((1, 7, 1), beat=3), 1.0)
     ledger.begin(5000, RUN)
     ledger.take(runs((5000, 1, 1), (1, 8, 1), beat=4), 1.5)

@@ -1,4 +1,4 @@
-"""What a process that has left ROS still holds, and what of it is closed."""
+"""Sockets that a process still holds after leaving ROS: which are closed, which are reported."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rosrm.ros.graph_remains import close_leaked, open_sockets, what_is_left
 
 @pytest.fixture
 def make():
-    """Makes sockets, and closes what is left of them."""
+    """Create sockets, and close the remaining ones afterwards."""
     made = []
 
     def make(kind: int) -> socket.socket:
@@ -30,7 +30,7 @@ def make():
 
 
 def test_an_open_socket_is_named(make) -> None:
-    """By its number, with what to do."""
+    """The error has its number and the remedy."""
     one = make(socket.SOCK_DGRAM)
     assert one.fileno() in open_sockets()
     assert f"{one.fileno()}" in what_is_left()
@@ -38,14 +38,14 @@ def test_an_open_socket_is_named(make) -> None:
 
 
 def test_what_nobody_uses_is_closed(make) -> None:
-    """A UDP socket that is neither bound nor connected, as Fast DDS leaves them."""
+    """Fast DDS leaves UDP sockets that are neither bound nor connected."""
     number = make(socket.SOCK_DGRAM).fileno()
     close_leaked(open_sockets())
     assert number not in open_sockets()
 
 
 def test_what_somebody_uses_stays(make) -> None:
-    """Bound, connected, or of another kind: it is the author's."""
+    """Bound and connected sockets, and other kinds, belong to the author of the node."""
     bound, connected, stream = (
         make(kind) for kind in (socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM)
     )
@@ -57,14 +57,14 @@ def test_what_somebody_uses_stays(make) -> None:
 
 
 def test_a_number_that_is_another_socket_by_now_stays(make) -> None:
-    """What was noted is gone, and its number was given again."""
+    """The recorded socket is gone, and its number was reused."""
     number = make(socket.SOCK_DGRAM).fileno()
     close_leaked({number: "socket:[1]"})
     assert number in open_sockets()
 
 
 def test_a_fast_dds_that_cannot_look_again_is_said(monkeypatch) -> None:
-    """Before the node leaves, and not by silence after its move."""
+    """The error comes before the node leaves, not as a silent node after its move."""
     libc = ctypes.CDLL(None)
     monkeypatch.setattr(fast_dds_relocation, "_library", lambda: libc)
     for function in (fast_dds_relocation.check, fast_dds_relocation.look_again):
@@ -73,7 +73,7 @@ def test_a_fast_dds_that_cannot_look_again_is_said(monkeypatch) -> None:
 
 
 def test_interfaces_that_cannot_be_read_are_said(monkeypatch) -> None:
-    """The node would be heard by nobody."""
+    """Otherwise no other participant would receive the node's messages."""
     monkeypatch.setattr(fast_dds_relocation, "_library", lambda: ctypes.CDLL(None))
     monkeypatch.setattr(fast_dds_relocation, "_interfaces_of", lambda _: lambda: False)
     with pytest.raises(PortableError, match="cannot read the network interfaces"):
@@ -81,14 +81,14 @@ def test_interfaces_that_cannot_be_read_are_said(monkeypatch) -> None:
 
 
 def test_guids_that_cannot_be_renewed_are_told_of(monkeypatch) -> None:
-    """Less is lost by that: an image can be restored only once."""
+    """The loss is smaller: an image can then be restored only once."""
     monkeypatch.setattr(fast_dds_relocation, "_library", lambda: ctypes.CDLL(None))
     monkeypatch.setattr(fast_dds_relocation, "_interfaces_of", lambda _: lambda: True)
     assert fast_dds_relocation.look_again() is False
 
 
 def test_without_fast_dds_there_is_nothing_to_renew(monkeypatch) -> None:
-    """Another vendor's library looks by itself."""
+    """The library of another vendor detects the interfaces without help."""
     monkeypatch.setattr(fast_dds_relocation, "_library", lambda: None)
     fast_dds_relocation.check()
     assert fast_dds_relocation.look_again() is True

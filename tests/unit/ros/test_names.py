@@ -1,4 +1,4 @@
-"""Names of topics and services: valid for ROS, and different for different hosts."""
+"""Names of topics and services: valid in ROS, and different for different hosts."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ AWKWARD = [
 
 @pytest.mark.parametrize("host", AWKWARD)
 def test_names_are_valid(host) -> None:
-    """Whatever a host is called, ROS takes the names of its services and of its node."""
+    """This holds for every host name, for its services and for its node."""
     assert validate_full_topic_name(Names("/rosrm").of_host(host, "control"))
     validate_node_name(f"rosrm_slave_{token(host)}")
 
 
 def test_a_plain_name_stays() -> None:
-    """What needs no change is easily recognised in `ros2 service list`."""
+    """A valid name is easy to recognise in `ros2 service list`."""
     assert Names("/rosrm").of_host("robot_1", "control") == "/rosrm/host/robot_1/control"
 
 
@@ -43,7 +43,7 @@ def test_a_plain_name_stays() -> None:
     st.lists(st.sampled_from(AWKWARD) | st.text(min_size=1, max_size=8), min_size=2, unique=True)
 )
 def test_different_hosts_have_different_names(hosts) -> None:
-    """All servers of a name execute a request: robot-1 must not hear what robot_1 is told."""
+    """All servers of a name execute a request, so robot-1 must not receive requests for robot_1."""
     assert len({token(host) for host in hosts}) == len(hosts)
     for host in hosts:
         validate_full_topic_name(Names("/rosrm").of_host(host, "control"))

@@ -1,4 +1,4 @@
-"""The loop of a part of rosrm: what is ready is done as one group, but not without an end."""
+"""Loop of a rosrm participant: ready callbacks run as one bounded group."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rosrm_msgs import srv
 
 
 class Executor:
-    """Stands for rclpy's: each turn calls one callback, as long as there are any.
+    """Fake rclpy executor; each turn calls one ready callback.
 
     Args:
-        ready: callbacks that are ready; None: there is no end of them.
+        ready: number of ready callbacks; None: unlimited.
     """
 
     def __init__(self, ready: int | None) -> None:
@@ -40,14 +40,14 @@ def participant(ready: int | None) -> tuple[Participant, Executor]:
 
 
 def test_all_that_is_ready_is_one_group() -> None:
-    """It waits for the first only, and stops when nothing is left."""
+    """The loop waits for the first callback only, and stops when none is ready."""
     made, executor = participant(ready=3)
     made.spin(7.0)
     assert executor.turns == [7.0, 0.0, 0.0, 0.0]
 
 
 def test_a_flood_does_not_keep_a_part_from_its_other_work() -> None:
-    """A master that is asked without an end still says its beats."""
+    """A master under continuous requests still sends its beats."""
     made, executor = participant(ready=None)
     began = time.monotonic()
     made.spin(7.0)
@@ -56,7 +56,7 @@ def test_a_flood_does_not_keep_a_part_from_its_other_work() -> None:
 
 
 class Node:
-    """Stands for rclpy's: keeps the service that was made."""
+    """Fake rclpy node that stores the created service."""
 
     def create_service(self, _kind, _name, _callback, *, qos_profile):
         self.service = SimpleNamespace(send_response=lambda *sent: self.sent.append(sent))
@@ -65,7 +65,7 @@ class Node:
 
 
 def asked(kind, handle):
-    """The responses to one request that a handler takes."""
+    """Return the responses of a handler to one request."""
     made, _ = participant(ready=0)
     made.node = node = Node()
     made.serve(kind, "/service", handle)
@@ -89,7 +89,7 @@ def test_a_request_whose_handler_raises_is_answered_as_failed() -> None:
 
 
 def test_a_request_that_was_answered_is_not_answered_again() -> None:
-    """An error after the answer is logged and no more."""
+    """An error after the answer is only logged."""
 
     def handle(_request, open_request):
         open_request.answer(srv.Submit.Response())
@@ -101,7 +101,7 @@ def test_a_request_that_was_answered_is_not_answered_again() -> None:
 
 
 def test_ctrl_c_in_a_callback_ends_the_loop() -> None:
-    """The interrupt is raised where Python can take it, not through the executor."""
+    """The interrupt is raised in Python code, not through the executor."""
     made, executor = participant(ready=1)
 
     def interrupted() -> None:

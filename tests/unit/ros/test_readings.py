@@ -1,4 +1,4 @@
-"""`resource_info` as bytes: field by field what rclpy's own serialisation says."""
+"""Binary encoding of `resource_info`: equal to rclpy's own serialisation."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def row(**changes) -> np.ndarray:
 
 
 def beats(decoded) -> dict:
-    """(host id, incarnation) to the newest beat of that run."""
+    """Return the newest beat of each run: (host id, incarnation) to beat."""
     runs = decoded.runs
     hosts = zip(runs.host_id.tolist(), runs.incarnation.tolist(), strict=True)
     return dict(zip(hosts, runs.beat.tolist(), strict=True))
 
 
 def test_encoding_is_what_rclpy_writes() -> None:
-    """A reader of any language gets the message that rclpy would have sent."""
+    """A reader in any language receives the message that rclpy would have sent."""
     assert encode(row()) == serialize_message(info())
 
 
 def test_every_byte_is_a_field() -> None:
-    """Each field of the layout stands where rclpy reads the field of that name."""
+    """Each field of the layout is where rclpy reads the field of that name."""
     for name in LAYOUT.names[1:]:
         record = row()
         record[name] = 0
@@ -62,7 +62,7 @@ def test_zeros_at_the_end_are_kept() -> None:
 
 
 def test_decoding_what_rclpy_writes() -> None:
-    """A reading that a slave in another language sends is read right."""
+    """A reading from a slave in another language is decoded correctly."""
     decoded = decode([serialize_message(info(host_id=5, incarnation=9, sequence=4))])
 
     readings = decoded.readings
@@ -80,7 +80,7 @@ def test_decoding_what_rclpy_writes() -> None:
 
 
 def test_newest_of_each_host_counts() -> None:
-    """Of several readings of one run of a host the last one counts."""
+    """The last of several readings of one run of a host counts."""
     batch = [
         serialize_message(info(host_id=host, sequence=sequence, beat=sequence))
         for sequence, host in enumerate([1, 2, 1, 3, 2, 1])
@@ -96,7 +96,7 @@ def test_newest_of_each_host_counts() -> None:
 
 
 def test_quiet_cycles_are_told_by_the_next_message() -> None:
-    """A message stands for its own cycle and the quiet ones before it, the most that fit too."""
+    """A message counts its own cycle and the idle ones before it, up to the greatest number."""
     batch = [
         serialize_message(info(host_id=host, sequence=sequence, flags=flags(**said)))
         for host, sequence, said in (
@@ -115,7 +115,7 @@ def test_quiet_cycles_are_told_by_the_next_message() -> None:
 
 
 def test_a_former_run_hides_no_reading() -> None:
-    """What a former run of a slave still sends replaces neither reading nor beat of the new one."""
+    """Late messages of a former run replace neither reading nor beat of the new run."""
     now = serialize_message(info(host_id=1, incarnation=20, sequence=1, beat=100))
     late = serialize_message(info(host_id=1, incarnation=10, sequence=900, beat=5))
 
@@ -137,7 +137,7 @@ def test_a_former_run_hides_no_reading() -> None:
     ids=["version", "short", "long", "big-endian", "empty"],
 )
 def test_strangers_are_refused(raw, said) -> None:
-    """Another version, size or byte order is refused and said, and never read as numbers."""
+    """Another version, size or byte order is refused with a message, and not decoded."""
     alone = decode([raw])
     assert alone.readings is None
     assert len(alone.strangers) == 1
@@ -150,5 +150,5 @@ def test_strangers_are_refused(raw, said) -> None:
 
 
 def test_nothing_is_nothing() -> None:
-    """No message, no event."""
+    """No message gives no event."""
     assert decode([]).readings is None

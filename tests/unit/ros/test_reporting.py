@@ -1,4 +1,4 @@
-"""Which cycles of a slave are told at once, and that none is lost from the count."""
+"""Reporting of readings: which cycles are sent at once; no cycle is lost from the count."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FACTS = (True, 2, 0b11, 0, 5)  # accepting, processes, present, stale, newest st
 
 
 class Slave:
-    """One slave's reporter, and what it sent."""
+    """Reporter of one slave, with the messages that it sent."""
 
     def __init__(self, beat_period: float = 1.0) -> None:
         self.sent: list[bytes] = []
@@ -31,14 +31,14 @@ class Slave:
         self.limit[:2] = 0.8
 
     def cycle(self, facts=FACTS) -> int:
-        """One cycle; how many messages went out in it."""
+        """Run one cycle and return the number of messages sent in it."""
         before = len(self.sent)
         self.reporter.cycle(self.usage, self.limit, facts)
         return len(self.sent) - before
 
 
 def test_the_first_reading_goes_out_whatever_it_says() -> None:
-    """A master that has just taken a host in must not wait for it, also a second time."""
+    """A master that has just accepted a host must not wait for it, on a rejoin either."""
     slave = Slave()
     assert [slave.cycle() for _ in range(3)] == [1, 0, 0]
 
@@ -48,7 +48,7 @@ def test_the_first_reading_goes_out_whatever_it_says() -> None:
 
 @pytest.mark.parametrize(("beat_period", "every"), [(1.0, 10), (0.3, 3), (0.2, 2), (0.05, 1)])
 def test_quiet_cycles_are_told_once_in_a_beat_period(beat_period: float, every: int) -> None:
-    """However little happens, the master hears of a slave that often, and of each cycle."""
+    """However little changes, the master receives a message that often, and counts each cycle."""
     slave = Slave(beat_period)
     slave.cycle()
     sent = [slave.cycle() for _ in range(3 * every)]
@@ -70,7 +70,7 @@ def test_quiet_cycles_are_told_once_in_a_beat_period(beat_period: float, every: 
     ids=["accepting", "processes", "present", "stale", "statuses"],
 )
 def test_what_decides_goes_out_in_its_own_cycle(facts) -> None:
-    """Whether work is taken, how much is held, what is late, what was reported: at once, once."""
+    """Changes of acceptance, load, late probes and statuses are sent at once, and once."""
     slave = Slave()
     slave.cycle()
     slave.cycle()
@@ -80,7 +80,7 @@ def test_what_decides_goes_out_in_its_own_cycle(facts) -> None:
 
 
 def test_a_limit_that_is_reached_or_left_goes_out_at_once() -> None:
-    """However small the step was that crossed it."""
+    """The size of the step across the limit makes no difference."""
     slave = Slave()
     slave.usage[0] = 0.799
     slave.cycle()
@@ -92,7 +92,7 @@ def test_a_limit_that_is_reached_or_left_goes_out_at_once() -> None:
 
 
 def test_another_limit_goes_out_at_once() -> None:
-    """Placement compares with it."""
+    """Placement compares with the limit."""
     slave = Slave()
     slave.cycle()
     slave.limit[1] = 0.9
@@ -100,7 +100,7 @@ def test_another_limit_goes_out_at_once() -> None:
 
 
 def test_a_slow_drift_is_told_when_it_adds_up() -> None:
-    """The master's view is never further off than the resolution, however small the steps are."""
+    """The master's value is never further off than the resolution, however small the steps are."""
     slave = Slave(beat_period=10.0)
     slave.cycle()
     for _ in range(60):
@@ -111,7 +111,7 @@ def test_a_slow_drift_is_told_when_it_adds_up() -> None:
 
 
 def test_the_newest_reading_can_be_told_before_its_time() -> None:
-    """What relies on it (a need that is met) goes out behind it; nothing is said twice."""
+    """Messages that rely on the reading (such as a satisfied need) follow it; it is sent once."""
     slave = Slave()
     slave.cycle()
     slave.usage[0] += 0.5 * RESOLUTION
@@ -132,7 +132,7 @@ def test_the_newest_reading_can_be_told_before_its_time() -> None:
     batch=st.integers(1, 7),
 )
 def test_each_cycle_is_either_accounted_for_or_missed(steps, lost, batch) -> None:
-    """Whatever is quiet and whatever is lost: both sides count the same cycles."""
+    """Both sides count the same cycles, whatever is idle and whatever is lost."""
     slave, ledger = Slave(beat_period=0.4), Ledger()
     ledger.begin(HOST, RUN)
     for step in steps:

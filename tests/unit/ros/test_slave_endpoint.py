@@ -1,4 +1,4 @@
-"""How a slave tells which master it has: without DDS, by a clock that the test sets."""
+"""Connection of a slave to its master: without DDS, with a simulated clock."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PERIOD = 0.2
 
 
 class Clock:
-    """Seconds; stands in for the module `time`."""
+    """Clock in seconds; stands in for the module `time`."""
 
     now = 100.0
 
@@ -29,7 +29,7 @@ class Clock:
 
 
 class Call:
-    """A request on its way, and what becomes of it."""
+    """Request on its way, with its result."""
 
     def __init__(self, request) -> None:
         self.request = request
@@ -47,7 +47,7 @@ class Call:
 
 
 class Peer:
-    """Stands for a service client and a publisher: it keeps what is sent."""
+    """Fake service client and publisher that store what is sent."""
 
     def __init__(self) -> None:
         self.sent: list[Call] = []
@@ -67,7 +67,7 @@ class Peer:
 
 
 class Wire:
-    """Stands for the participant and for its node."""
+    """Fake participant, and its node."""
 
     settings = type("Settings", (), {"namespace": "/rosrm"})
 
@@ -94,7 +94,7 @@ class Wire:
 
 
 class Host:
-    """Stands for the slave's runtime."""
+    """Fake runtime of the slave."""
 
     def __init__(self) -> None:
         self.events = []
@@ -118,7 +118,7 @@ class Host:
 
 
 class Master:
-    """One run of a master, as a slave meets it."""
+    """Run of a master, as a slave sees it."""
 
     def __init__(self, slave: Slave, incarnation: int, epoch: int = 1, pid: int = 7) -> None:
         self._slave = slave
@@ -153,7 +153,7 @@ class Master:
 
 
 class Slave:
-    """The endpoint, and all that is around it."""
+    """Endpoint of a slave with its fake surroundings."""
 
     def __init__(self, clock: Clock, seen: JournalSeen | None = None) -> None:
         self.clock, self.wire, self.host = clock, Wire(), Host()
@@ -171,7 +171,7 @@ class Slave:
         return self.sent(kind)[-1]
 
     def pass_time(self, seconds: float, *masters: Master) -> None:
-        """Cycle by cycle; these masters beat."""
+        """Let time pass, cycle by cycle, with beats of these masters."""
         for _ in range(round(seconds / PERIOD)):
             self.clock.now += PERIOD
             for master in masters:
@@ -180,7 +180,7 @@ class Slave:
             self.endpoint.ask(self.clock.now)
 
     def join(self, master: Master) -> None:
-        """Greeted, heard, taken in."""
+        """Greet the slave, send beats and accept its registration."""
         self.pass_time(PERIOD)
         master.beat()
         master.greet()
@@ -197,7 +197,7 @@ def slave(monkeypatch) -> Slave:
 
 @pytest.mark.parametrize("epoch", [1, 2, 3])
 def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> None:
-    """A master whose journal was lost begins at epoch 1 again: the slave registers anew."""
+    """A master with a lost journal begins at epoch 1 again: the slave registers with it, too."""
     old, new = Master(slave, 11, epoch=2), Master(slave, 12, epoch=epoch, pid=8)
     slave.join(old)
     slave.pass_time(2.0, old)
@@ -218,14 +218,14 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
 
 
 def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
-    """The first is killed as soon as it has greeted the slave: the greeting tells no run."""
+    """The first run is killed right after its greeting, which does not identify the run."""
     old, new = Master(slave, 11), Master(slave, 12, pid=8)
     slave.pass_time(PERIOD)
     old.greet()
     assert slave.link is Link.LISTENING
     slave.pass_time(1.0, new)
     assert slave.sent(srv.RegisterHost) == []
-    slave.pass_time(3.0, new)  # the greeting has become old
+    slave.pass_time(3.0, new)  # the greeting has expired
     new.greet()
     new.take_in()
     assert slave.link is Link.REGISTERED
@@ -243,7 +243,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     slave.pass_time(5.0, new)
     assert slave.link is Link.REGISTERED
     assert len(slave.sent(srv.RegisterHost)) == 2
-    slave.pass_time(3.0)  # it is silent for a while
+    slave.pass_time(3.0)  # the new run is silent for a while
     slave.pass_time(PERIOD, new)
     new.greet()
     new.take_in()
@@ -251,7 +251,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
 
 
 def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
-    """Of two at once the younger gives way; only a newer epoch is believed at once."""
+    """The younger of two masters stops; the slave switches at once only to a newer epoch."""
     ours = Master(slave, 11, epoch=2)
     slave.join(ours)
     for epoch in (1, 2):
@@ -262,11 +262,11 @@ def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
 
 
 def test_beats_say_that_the_master_hears_this_host(slave) -> None:
-    """Those of the master that took it in, unless they name it among the hosts not heard."""
+    """Beats of the accepting master count, unless they list this host as silent."""
     ours, another = Master(slave, 11, epoch=2), Master(slave, 12, epoch=1, pid=8)
     slave.pass_time(PERIOD, ours)
     ours.greet()
-    assert slave.host.heard == []  # nobody has taken it in yet
+    assert slave.host.heard == []  # no master has accepted the host yet
     ours.take_in()
     slave.host.heard.clear()
     slave.clock.now += 1.0
@@ -278,7 +278,7 @@ def test_beats_say_that_the_master_hears_this_host(slave) -> None:
 
 
 def test_old_beats_say_who_was_heard_then(slave) -> None:
-    """A slave that was stopped finds them in its sockets."""
+    """A slave that was stopped finds old beats in its sockets."""
     ours = Master(slave, 11)
     slave.join(ours)
     slave.pass_time(1.0, ours)
@@ -291,7 +291,7 @@ def test_old_beats_say_who_was_heard_then(slave) -> None:
 
 
 def test_an_answer_that_was_taken_in_late_greets_nobody(slave) -> None:
-    """It is no round trip that would tell how old the master's words are."""
+    """Its round trip is too long to tell the age of the master's messages."""
     ours = Master(slave, 11)
     slave.pass_time(PERIOD)
     slave.clock.now += 10.0
@@ -309,7 +309,7 @@ def test_a_silent_master_is_lost(slave) -> None:
 
 
 def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave) -> None:
-    """It is told with the silence of the master, and does not claim that processes keep running."""
+    """The slave leaves once the master is silent; its log claims no running processes."""
     slave.join(Master(slave, 11))
     slave.pass_time(1.6)
     told = []
@@ -321,7 +321,7 @@ def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave) 
 
 
 def test_a_master_that_comes_back_is_told_that_the_slave_leaves(slave) -> None:
-    """The stop may take long: meanwhile its host is not taken for one that stays."""
+    """The stop may take long; until its end the master must not count the host as staying."""
     slave.join(Master(slave, 11))
     slave.endpoint.leave(lambda: None)
     slave.pass_time(3.0)
@@ -330,7 +330,7 @@ def test_a_master_that_comes_back_is_told_that_the_slave_leaves(slave) -> None:
 
 
 def test_a_request_for_work_that_was_lost_is_soon_repeated(slave) -> None:
-    """The first after a registration may be; one that is open for long is repeated seldom."""
+    """The first request after a registration may get lost; a long open one is repeated rarely."""
     master = Master(slave, 11)
     slave.join(master)
     start, at = slave.clock.now, []
@@ -357,14 +357,14 @@ def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
     first.answer(srv.RequestProcess.Response(answer=answer))
     assert core.AssignmentsReceived((), None) in slave.host.events
     slave.pass_time(PERIOD, master)
-    assert len(slave.sent(srv.RequestProcess)) == 3  # of which the master keeps the newest open
+    assert len(slave.sent(srv.RequestProcess)) == 3  # the master keeps the newest of them open
     slave.pass_time(5.0, master)
-    second.answer(srv.RequestProcess.Response(answer=answer))  # given up by then
+    second.answer(srv.RequestProcess.Response(answer=answer))  # the slave has given it up by then
     assert slave.host.events.count(core.AssignmentsReceived((), None)) == 1
 
 
 def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
-    """The slave asks again for a moment, and tells the user so once."""
+    """The slave retries for a moment, and logs the conflict once."""
     ours = Master(slave, 11)
     answer = msg.Answer(protocol_version=PROTOCOL_VERSION, code="name_taken", message="a live one")
     for _ in range(3):
@@ -377,11 +377,11 @@ def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
     assert slave.endpoint.failure == ""
 
 
-# --- what is remembered of the master's journal ------------------------------------------------
+# --- remembered journal numbers ----------------------------------------------------------------
 
 
 def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_path) -> None:
-    """Also by a later run of the slave; to the run that said it, there is nothing to tell."""
+    """A later run of the slave reports it, too; the same run of the master needs no report."""
     clock = Clock()
     monkeypatch.setattr(endpoint, "time", clock)
     path = tmp_path / "journal_seen"
@@ -406,7 +406,7 @@ def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_pa
 
 
 def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -> None:
-    """The disk of the slave is full, or what is on it makes no sense."""
+    """The slave's disk is full, or its file is invalid."""
     path = tmp_path / "journal_seen"
     path.write_bytes(b"\xff nonsense")
     seen = JournalSeen(path)
@@ -418,7 +418,7 @@ def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -
 
 
 def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
-    """It takes nobody in for now: that is no reason to give up, and is said once."""
+    """A master with a journal stall accepts no host for now: the slave retries and logs it once."""
     ours = Master(slave, 11)
     slave.pass_time(PERIOD)
     ours.beat()
@@ -437,7 +437,7 @@ def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
 
 
 def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) -> None:
-    """The slave does not wait for ever in the middle of a registration: it asks again."""
+    """The slave repeats its request, instead of waiting forever during a registration."""
     master = Master(slave, 11)
     slave.pass_time(PERIOD)
     master.beat()

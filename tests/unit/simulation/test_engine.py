@@ -1,4 +1,4 @@
-"""The simulated cluster: what the model of a host promises, and that nothing is lost or doubled."""
+"""Simulated cluster: the host model, and no lost or doubled process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_job_takes_its_duration_where_it_has_all_the_cpu_it_wants():
 
 
 def test_on_a_crowded_host_jobs_take_longer_in_proportion():
-    """Two that want 2 cores each on 2 cores get one each, and the second half of one is alone."""
+    """Two that want 2 cores each on 2 cores get one each; the longer one then runs alone."""
     plans = [plan("long", cpu=2.0, duration=10.0, needs={"memory": MIB, "cpu": 0.0}),
              plan("short", cpu=2.0, duration=4.0, needs={"memory": MIB, "cpu": 0.0})]  # fmt: skip
     outcome = run([host("a", cpu=2.0)], plans)
@@ -47,7 +47,7 @@ def test_a_job_that_wants_no_cpu_is_not_slowed():
 
 
 def test_what_the_master_reads_is_what_the_processes_hold():
-    """50 MiB and 150 MiB on 1000 MiB, and 10 % of others."""
+    """Usage is 50 MiB and 150 MiB on 1000 MiB, and 10 % by others."""
     outcome = run(
         [host("a", 1000.0, busy={"memory": 0.1})], [plan("p"), plan("q", 150.0)], until=5.0
     )
@@ -73,11 +73,11 @@ def test_a_curve_goes_through_its_points_and_never_beyond(pieces):
     assert min(tried) >= 0.0 and max(tried) <= curve.most * (1 + 1e-9)  # noqa: PT018
 
 
-# --- what the cores make of it ----------------------------------------------------------------
+# --- decisions of the cores -------------------------------------------------------------------
 
 
 def test_equal_processes_are_spread_evenly_and_none_goes_over_the_limit():
-    """100 MiB each, 8 fit below 80 % of 1000 MiB: of 30 the hosts take 24."""
+    """With 100 MiB each, 8 fit below 80 % of 1000 MiB: of 30 the hosts take 24."""
     hosts = [host(name, 1000.0) for name in "abc"]
     outcome = run(hosts, [plan(f"p{n:02}", 100.0, at=0.5 * n) for n in range(30)])
     assert len(outcome.placements) == 24
@@ -99,7 +99,7 @@ def test_on_more_hosts_more_is_placed_and_the_makespan_is_shorter():
 
 
 def test_a_host_over_its_limit_gives_a_process_away():
-    """Fig. 10: what grows brings its host over the limit, and something moves."""
+    """Fig. 10: growth brings a host over its limit, and a process moves."""
     plans = [
         plan("grows", 100.0, growth=40.0, most=700.0),
         plan("quiet", 200.0, strategy="relaunch"),
@@ -116,7 +116,7 @@ def test_a_host_over_its_limit_gives_a_process_away():
     ("strategy", "ros", "total"), [("relaunch", False, 18), ("handoff", True, 10)]
 )
 def test_a_relaunched_job_begins_anew_and_one_that_hands_over_goes_on(strategy, ros, total):
-    """Moved after 8 of its 10 seconds."""
+    """The job moves after 8 of its 10 seconds."""
     moved = (8.0 + START, happened.MigrationRequested(0, "p"))
     plans = [plan("p", duration=10.0, strategy=strategy, ros=ros)]
     outcome = run([host("a"), host("b")], plans, requests=[moved])
@@ -133,7 +133,7 @@ def test_what_a_leaving_slave_ends_goes_elsewhere():
 
 
 def test_of_a_lost_host_the_processes_are_not_forgotten():
-    """Nothing replaces them: they are there, and unreachable."""
+    """They have no successors, stay in memory and are unreachable."""
     made = simulation([host("a", leaves=5.0, lost=True), host("b", joins=1.0)], [plan("p")])
     outcome = made.run()
     assert made.state.processes["p"].phase is ProcessPhase.UNREACHABLE
@@ -153,7 +153,7 @@ def test_a_cancelled_process_is_neither_finished_nor_waiting():
 
 
 def test_a_long_quiet_time_costs_nothing():
-    """A day of one job: readings that say nothing new are left out."""
+    """A day of one job is fast, because readings without a change are left out."""
     outcome = run([host("a")], [plan("p", duration=86_400.0)])
     assert outcome.makespan == pytest.approx(86_400.0, abs=1.0)
     assert outcome.events < 5_000
@@ -168,7 +168,7 @@ def test_the_gap_is_measured_over_time():
     assert outcome.imbalance["memory"] == pytest.approx(0.2, abs=0.005)
 
 
-# --- whatever is simulated --------------------------------------------------------------------
+# --- invariants of any simulation -------------------------------------------------------------
 
 PLANS = st.lists(
     st.builds(
@@ -197,16 +197,17 @@ def built(hosts, plans):
 
 
 def _fit(fields):
-    """Only ROS nodes hand over."""
+    """Make a process with `handoff` a ROS node, because only ROS nodes hand over."""
     return {**fields, "ros": fields["ros"] or fields["strategy"] == "handoff"}
 
 
 @settings(max_examples=25)
 @given(hosts=HOSTS, plans=PLANS)
 def test_every_process_is_somewhere_exactly_once(hosts, plans):
-    """Finished, ended otherwise, running or waiting, in the master's eyes.
+    """In the master's state a process is finished, ended otherwise, running or waiting.
 
-    In truth no process has two owners and none that has ended runs; who never got a host is named.
+    In truth no process has two owners, and no ended one runs. Processes that never got a host are
+    named.
     """
     made = simulation(*built(hosts, plans), until=80.0)
     ended: list[str] = []

@@ -1,4 +1,4 @@
-"""The record of a run: what is written comes back, and nothing else is taken for a record."""
+"""Record of a run: written data reads back, and anything else is refused."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_every_kind_of_event_is_tried_below():
 
 
 def same(one, other) -> bool:
-    """Bit by bit: NaN equals NaN, and 0.0 is not -0.0."""
+    """Return True if both are equal bit by bit: NaN equals NaN, and 0.0 is not -0.0."""
     if isinstance(one, np.ndarray):
         return one.dtype == other.dtype and one.shape == other.shape and (
             one.tobytes() == other.tobytes()
@@ -168,7 +168,7 @@ def test_a_record_is_read_as_it_was_written(content):
 
 
 def test_cut_anywhere_it_is_refused_and_says_where(content):
-    """At every byte of the first and of the last frames, and at some between."""
+    """The cut is at every byte of the first and the last frames, and at some between."""
     cuts = {*range(1, 200), *range(len(content) - 200, len(content)), *range(0, len(content), 97)}
     for end in sorted(cuts - {0}):
         with pytest.raises(RecordError) as raised:
@@ -200,7 +200,7 @@ def test_a_flipped_bit_is_noticed_also_where_a_cut_would_be_borne(content, at):
 
 
 def test_zeros_behind_the_last_whole_frame_are_a_cut(content):
-    """A power loss leaves them, at any byte: within a frame, within its length, between two."""
+    """A power loss leaves them at any byte: within a frame, within its length, between two."""
     whole = read(content)
     for end in {*range(1800, 2600), len(content) - 17, len(content) - 16, len(content) - 3}:
         torn = content[:end].rstrip(b"\0") + bytes(5000)

@@ -1,4 +1,4 @@
-"""The recorder of a master: bounded, beside the loop, and never the master's end."""
+"""Recorder of a master: bounded, beside the loop, and without effect on the master."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ def test_a_full_record_ends_there_and_says_so(start, caplog):
     made.close("the master stopped: SIGINT")
 
     record = read(made.path.read_bytes())
-    assert made.path.stat().st_size <= 65536 + 200  # its end still has to go in
+    assert made.path.stat().st_size <= 65536 + 200  # the end record is still to be written
     assert 100 < len(record.events) < 5000
     assert record.end == "full: it has reached `record.max_size`, 65536 bytes"
     assert "ends here" in caplog.text
 
 
 class Hung:
-    """A file whose writes wait until they are let go."""
+    """File whose writes wait for a release."""
 
     def __init__(self, inner):
         self.inner = inner
@@ -92,7 +92,7 @@ def batch(hosts: int) -> happened.ReadingsReceived:
 
 @pytest.mark.parametrize("hosts", [1, 1000])
 def test_a_disk_that_hangs_ends_the_record_not_the_memory(start, monkeypatch, caplog, hosts):
-    """What waits is bounded in bytes, however many hosts one event is about."""
+    """The backlog is bounded in bytes, however many hosts one event concerns."""
     bound = 2**20
     monkeypatch.setattr(recorder, "_BACKLOG", bound)
     made = start(max_size=10**9)
@@ -112,7 +112,7 @@ def test_a_disk_that_hangs_ends_the_record_not_the_memory(start, monkeypatch, ca
 
 
 def test_a_disk_that_keeps_up_is_never_too_slow(start, monkeypatch):
-    """What is written no longer waits: a record may be many times as large as what may wait."""
+    """Written data leaves the backlog, so a record may be many times as large as the bound."""
     made = start(max_size=10**9)
     monkeypatch.setattr(recorder, "_BACKLOG", 64 * 2**10)
     for number in range(50):
@@ -126,7 +126,7 @@ def test_a_disk_that_keeps_up_is_never_too_slow(start, monkeypatch):
 
 @pytest.mark.parametrize("fault", [KeyError("slot"), MemoryError()])
 def test_what_cannot_be_encoded_ends_the_record_with_its_reason(start, monkeypatch, caplog, fault):
-    """It is said once, nothing waits in vain after it, and what was written stays whole."""
+    """The reason is logged once, no later event is queued, and written data stays whole."""
     encode = recorder.encode
 
     def broken(event, now, wall):
@@ -152,7 +152,7 @@ def test_a_write_that_fails_ends_the_record_and_is_said_once(start, caplog):
     made = start()
 
     class Full:
-        """A file on a full disk."""
+        """File on a full disk."""
 
         def __init__(self, inner):
             self.inner = inner

@@ -1,4 +1,4 @@
-"""A record told again to a core: the same settings decide the same, others do not."""
+"""Replay of a record by a core: equal settings give equal decisions, others do not."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BY_CPU = ("weighted", Weighted(WeightedOptions({"cpu": 1.0})))
 
 
 def busy(until: float = 60.0, **options) -> Simulation:
-    """Arrivals, a full host, growth, moves, a request, a host that comes and one that goes."""
+    """Return a simulation: arrivals, a full host, growth, moves, requests, a join and a loss."""
     hosts = [host("a", 400), host("b", 400), host("c", 400, joins=6.0), host("d", leaves=20.0)]
     plans = [plan(f"p{n}", 60.0, at=0.7 * n, duration=15.0, cpu=0.5) for n in range(12)]
     plans += [plan("grows", 40.0, at=1.0, growth=20.0, most=300.0, strategy="relaunch")]
@@ -83,7 +83,7 @@ def test_any_run_is_replayed_to_the_same_decisions(loads, growth, backfill):
 
 
 def test_where_the_journal_had_lost_its_end_the_replay_gives_no_work_either(record):
-    """It knows where the journal ended, and which host had seen more of it."""
+    """The replay knows the end of the journal and the host that had seen more of it."""
     told = [
         replace(one, event=replace(one.event, journal_seen=9))
         if isinstance(one.event, happened.HostRegistered)
@@ -105,7 +105,7 @@ def test_other_weights_decide_otherwise_and_the_first_difference_is_told(record)
 
 
 def test_a_core_that_decides_by_chance_would_be_found(record):
-    """The recorded decisions are what is compared, not those of a second replay."""
+    """The comparison uses the recorded decisions, not those of a second replay."""
     events = list(record.events)
     at = next(n for n, one in enumerate(events) if one.decided)
     one = events[at]
@@ -125,7 +125,7 @@ def test_the_outcome_of_a_replay_is_that_of_the_run(record):
 
 
 def test_measured_up_to_a_time_a_replay_is_the_run_up_to_there(record):
-    """Nothing that came later is in its numbers; the decisions are compared to the end."""
+    """Later events do not change its numbers; the decisions are compared to the end."""
     run = busy(until=6.5).run()
     again = replay(record, CoreSettings(), EQ1, STRATEGIES, until=6.5)
     whole = replay(record, CoreSettings(), EQ1, STRATEGIES)
@@ -139,7 +139,7 @@ def test_measured_up_to_a_time_a_replay_is_the_run_up_to_there(record):
 
 
 def test_what_runs_when_the_record_begins_is_where_it_is():
-    """A master that took over: its processes arrived at its start, and have their hosts."""
+    """After a restart of the master its processes arrived at its start, on their hosts."""
     plans = [plan("p0", 100.0), plan("p1", 100.0), plan("large", 5000.0)]
     made = simulation([host("a"), host("b")], plans, until=5.0)
     tables: dict[str, dict[str, dict]] = {}
@@ -161,7 +161,7 @@ def test_what_runs_when_the_record_begins_is_where_it_is():
 
 
 def test_a_process_of_a_record_that_ended_without_a_host_is_named_with_its_reason():
-    """Among those that were never placed, as one that still waits is."""
+    """The process is listed among those never placed, like one that still waits."""
     plans = [plan("p0", 100.0), plan("large", 900.0)]
     requests = [(3.0, happened.CancelRequested(0, ("large",)))]
     made = simulation([host("a")], plans, until=5.0, requests=requests)
@@ -170,7 +170,7 @@ def test_a_process_of_a_record_that_ended_without_a_host_is_named_with_its_reaso
 
 
 def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
-    """Simulated, recorded, extracted and simulated again."""
+    """The workload is simulated, recorded, extracted and simulated again."""
     extraction = Extraction(record)
     first = replay(record, CoreSettings(), EQ1, STRATEGIES, extraction.watch).outcome
     workload = extraction.workload()
@@ -190,7 +190,7 @@ def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
 
 
 def test_what_hands_over_keeps_its_age_in_the_workload_made_of_it():
-    """It grows for 20 s and moves after 10: its curve is that of one process, not of two."""
+    """A process that grows for 20 s and moves after 10 s has the curve of a single process."""
     move = (10.0, happened.MigrationRequested(0, "node"))
     grows = plan("node", 50.0, growth=10.0, most=250.0, ros=True, strategy="handoff")
     made = simulation([host("a"), host("b")], [grows], requests=[move], until=30.0)

@@ -1,4 +1,4 @@
-"""Workloads and variants in files: what is wrong is refused at its place, all of it at once."""
+"""Workload and variant files: all errors are reported at once, each at its place."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BOTH = HOST + PROCESS
 
 
 def of_process(keys: str) -> str:
-    """A workload of one process with these keys."""
+    """Return a workload of one process with these keys."""
     return f"{HOST}processes: [{{name: p, {keys}}}]"
 
 
@@ -151,7 +151,7 @@ def test_every_example_loads(path, registry):
 
 
 def test_the_workload_in_the_how_to_shows_differences(load, registry):
-    """Each row of its table differs from the others in what it compares."""
+    """Each row of its table differs from the others in the compared values."""
     text = (ROOT / "docs" / "how-to" / "simulate.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"<!-- workload -->\n```yaml[^\n]*\n(.*?)```", text, re.DOTALL)
     made = load(block)
@@ -184,7 +184,7 @@ def test_every_key_is_documented_and_nothing_else(heading, names):
 
 
 def test_variants_are_judged_beside_a_wrong_workload(load):
-    """All that is wrong at once: the file, and each variant."""
+    """The message lists all errors at once: those of the file and of each variant."""
     with pytest.raises(ConfigError) as raised:
         load(
             BOTH + "seed: x",

@@ -1,4 +1,4 @@
-"""Small workloads, and how to run and record them."""
+"""Small workloads, with functions that run and record them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STRATEGIES = {"relaunch": Relaunch(RelaunchOptions()), "handoff": Handoff(Handof
 
 
 def host(name: str, memory: float = 1024.0, cpu: float = 4.0, **fields) -> HostPlan:
-    """A host with `memory` MiB."""
+    """Return a host with `memory` MiB."""
     fields.setdefault("limits", {"memory": 0.8})
     resources = (
         ResourceDescription("memory", "B", memory * MIB),
@@ -38,7 +38,7 @@ def plan(
     name: str, memory: float = 50.0, *, at: float = 0.0, cpu: float = 0.0, duration: float = inf,
     growth: float = 0.0, most: float = inf, strategy: str | None = None, **spec,
 ) -> ProcessPlan:  # fmt: skip
-    """A process that holds and declares `memory` MiB."""
+    """Return a process that uses and declares `memory` MiB."""
     kind = Kind.SERVICE if duration == inf else Kind.JOB
     spec.setdefault("needs", {"memory": memory * MIB, "cpu": cpu})
     made = ProcessSpec(
@@ -54,12 +54,12 @@ def simulation(hosts, plans, *, until: float = inf, requests=(), **settings) -> 
 
 
 def run(hosts, plans, **more):
-    """The outcome of a workload."""
+    """Return the outcome of a workload."""
     return simulation(hosts, plans, **more).run()
 
 
 def recorded(simulated: Simulation, config: ClusterConfig | None = None) -> bytes:
-    """The record that the simulated master would have written."""
+    """Return the record that the simulated master would have written."""
     header = Header("1", "test", to_plain(config or ClusterConfig()), 1, 0.0, {})
     written = [opening(), frame(FrameKind.HEADER, header.encoded())]
     take = simulated.meter.take

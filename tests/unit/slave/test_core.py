@@ -1,4 +1,4 @@
-"""The slave's reducer: what it does with orders and with what the supervisor tells."""
+"""Reducer of the slave: orders, supervisor reports, readiness and restart policies."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def told(state, name="p", number=1, **more) -> reducer.SupervisorReported:
 
 
 class Slave:
-    """A state and its clock."""
+    """State of a slave's reducer, with its clock."""
 
     def __init__(self) -> None:
         self.state = reducer.SlaveState(registered=True)
@@ -59,16 +59,17 @@ def one() -> Slave:
 
 
 def test_what_went_with_the_supervisor_cannot_be_refused_any_more(one):
-    """It was being started when its supervisor was killed: nobody holds it."""
+    """The instance was starting when its supervisor was killed: no supervisor holds it."""
     one.step(assigned())
     one.step(reducer.SupervisorReplaced((), {}, frozenset()))
     assert one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package")) == []
 
 
 def test_what_is_taken_back_at_once_is_not_launched(one):
-    """An assignment and the next supervisor in one go: that one does not know it, so nobody has it.
+    """An assignment and the next supervisor in one batch start nothing.
 
-    The master gives it again, and hears that it is refused.
+    The next supervisor does not know the instance. The master repeats the assignment and receives
+    the refusal.
     """
     events = [assigned(), reducer.SupervisorReplaced((), {}, frozenset())]
     commands = reducer.step_all(one.state, events, one.now)
@@ -78,17 +79,17 @@ def test_what_is_taken_back_at_once_is_not_launched(one):
 
 
 def awaited_names(one: Slave) -> list[str]:
-    """Who is looked for in the graph."""
+    """Return the names of the nodes that the slave awaits in the graph."""
     return [h.awaited.node_name for h in one.state.awaited_in_graph().values()]
 
 
 def states(commands) -> list[InstanceState]:
-    """What is reported."""
+    """Return the reported states."""
     return [s.state for c in commands if isinstance(c, reducer.Report) for s in c.statuses]
 
 
 def test_an_assignment_is_launched_once(one) -> None:
-    """The same order twice starts nothing twice."""
+    """A repeated order starts nothing."""
     assert [type(c) for c in one.step(assigned())] == [reducer.Launch]
     assert one.step(assigned()) == []
     one.step(told(STATE.RUNNING, pid=5))
@@ -97,7 +98,7 @@ def test_an_assignment_is_launched_once(one) -> None:
 
 
 def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None:
-    """It stood otherwise in the request, and no batch was published without a link."""
+    """The registration request had the older status, and no batch was published without a link."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
     one.step(reducer.MasterLost())
@@ -107,7 +108,7 @@ def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None
 
 
 def test_a_registration_without_news_is_not_followed_by_a_report(one) -> None:
-    """All of it stood in the request."""
+    """The request had all statuses."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
     one.step(reducer.MasterLost())
@@ -115,21 +116,21 @@ def test_a_registration_without_news_is_not_followed_by_a_report(one) -> None:
 
 
 def test_an_older_epoch_starts_nothing(one) -> None:
-    """A master that was replaced gives no orders; the refusal says which epochs."""
+    """Orders of a replaced master have no effect; the refusal names both epochs."""
     one.step(reducer.Registered(3))
     assert states(one.step(assigned(epoch=2))) == [STATE.REFUSED]
     assert "epoch 2" in one.of().status.message
 
 
 def test_a_registration_sets_the_epoch(one) -> None:
-    """A master whose journal was lost begins at epoch 1 again, and this host works for it."""
+    """A master with a lost journal begins at epoch 1 again, and this host works for it."""
     one.step(reducer.Registered(7))
     one.step(reducer.Registered(1))
     assert [type(c) for c in one.step(assigned(epoch=1))] == [reducer.Launch]
 
 
 def test_stopped_before_it_was_started(one) -> None:
-    """A stop that overtakes its start wins: what comes late is refused for good."""
+    """A stop that overtakes its start wins: a later start is refused for good."""
     assert states(one.step(reducer.StopOrdered(InstanceId("p", 1)))) == [STATE.REFUSED]
     assert one.step(assigned()) == []
     one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
@@ -138,7 +139,7 @@ def test_stopped_before_it_was_started(one) -> None:
 
 @pytest.mark.parametrize("end", ["refused", "exited"])
 def test_a_dead_number_stays_dead(one, end) -> None:
-    """Also after its end was forgotten, a late order of the same instance starts nothing."""
+    """A late order of the same instance starts nothing, even after its end was forgotten."""
     one.step(assigned())
     if end == "refused":
         one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package"))
@@ -151,7 +152,7 @@ def test_a_dead_number_stays_dead(one, end) -> None:
 
 
 def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one) -> None:
-    """It knows nothing of them; another registration with the same one changes nothing."""
+    """A master with a lost journal may reuse them; a repeated registration changes nothing."""
     one.step(reducer.StopOrdered(InstanceId("p", 1)))
     one.step(reducer.Registered(1))
     one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
@@ -162,7 +163,7 @@ def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one)
 
 
 def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
-    """However long the master is away, it is told of a job that finished meanwhile."""
+    """The slave keeps the end of a job until a master has learned it, however long that takes."""
     one.step(assigned())
     one.step(reducer.MasterLost())
     one.step(told(STATE.EXITED))
@@ -173,7 +174,7 @@ def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
 
 
 def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
-    """Only the order was too old: a newer master may still give the instance its own number."""
+    """Only the order was too old: a newer master may still use the instance's number."""
     one.step(reducer.Registered(3))
     one.step(assigned(epoch=2, number=8))
     assert states(one.step(assigned(epoch=3, number=9))) == []
@@ -189,14 +190,14 @@ def test_a_launch_that_is_refused_is_said(one) -> None:
 
 
 def test_a_process_is_ready_as_soon_as_it_runs(one) -> None:
-    """Unless it is a ROS node."""
+    """Only ROS nodes need more than a running process."""
     one.step(assigned())
     assert states(one.step(told(STATE.RUNNING, pid=5))) == [STATE.READY]
     assert one.step(told(STATE.RUNNING, pid=5)) == []
 
 
 def test_a_node_is_ready_when_it_is_seen(one) -> None:
-    """It is awaited under its qualified name, and ready once."""
+    """The slave awaits the node under its qualified name, and reports it ready once."""
     one.step(assigned(NODE))
     assert one.state.awaited_in_graph() == {}
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.RUNNING]
@@ -207,7 +208,7 @@ def test_a_node_is_ready_when_it_is_seen(one) -> None:
 
 
 def test_a_shadow_is_awaited_under_its_alias(one) -> None:
-    """The source has the node's own name; the shadow's is in the graph as soon as it is ready."""
+    """The source has the node's own name; the shadow's alias shows in the graph when ready."""
     shadow = Assignment(InstanceId("n", 2), NODE, 1, "n_1700000000", shadow=True)
     one.step(reducer.AssignmentsReceived((shadow,)))
     one.step(told(STATE.RUNNING, "n", 2, pid=5))
@@ -216,7 +217,7 @@ def test_a_shadow_is_awaited_under_its_alias(one) -> None:
 
 
 def test_readiness_kinds(one) -> None:
-    """`running` makes a node ready at once, `graph` lets any process be awaited."""
+    """`running` makes a node ready at once; with `graph` the slave awaits any process."""
     running = replace(NODE, readiness=Readiness("running"))
     graph = replace(PLAIN, readiness=Readiness("graph"))
     assert not reducer.awaits_graph(running)
@@ -226,7 +227,7 @@ def test_readiness_kinds(one) -> None:
 
 
 def test_never_ready_is_stopped_and_has_failed(one) -> None:
-    """The reason is the time-out, whatever the process exits with."""
+    """The time-out is the reason, whatever the exit code."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
     assert one.step(reducer.TimePassed(), after=9.9) == []
@@ -240,7 +241,7 @@ def test_never_ready_is_stopped_and_has_failed(one) -> None:
 
 
 def test_each_run_has_its_own_time_to_become_ready(one) -> None:
-    """A node that crashed and was restarted must be seen anew."""
+    """After a crash and restart the node must appear in the graph again."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
     one.step(reducer.SeenInGraph(InstanceId("n", 1)))
@@ -253,7 +254,7 @@ def test_each_run_has_its_own_time_to_become_ready(one) -> None:
 
 
 def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
-    """Its spec is not known any more, but it runs: nothing is stopped for that."""
+    """Its spec is lost, but the process runs and keeps running."""
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.READY]
     assert one.step(reducer.TimePassed(), after=1000.0) == []
     assert one.step(assigned(NODE)) == []
@@ -265,13 +266,13 @@ NODE_1 = InstanceId("n", 1)
 
 
 def memo_of(commands) -> reducer.Memo:
-    """What the supervisor is to remember, as a later run reads it."""
+    """Return the memo for the supervisor as a later run reads it."""
     (memo,) = [c.memo for c in commands if isinstance(c, reducer.Remember)]
     return from_memo(to_memo(memo))
 
 
 def taken_over(one: Slave, status: InstanceStatus, memo: reducer.Memo) -> Slave:
-    """Another run of the slave, which found this with the supervisor."""
+    """Return a later run of the slave that re-adopts this instance from the supervisor."""
     later = Slave()
     later.now = one.now
     later.step(reducer.SupervisorReplaced((status,), {status.instance: memo}))
@@ -279,7 +280,7 @@ def taken_over(one: Slave, status: InstanceStatus, memo: reducer.Memo) -> Slave:
 
 
 def test_a_node_that_was_still_awaited_is_awaited_by_the_next_slave(one) -> None:
-    """It is not ready because the slave that waited for it was killed."""
+    """The next slave waits for the node, whose first slave was killed before the node was ready."""
     one.step(assigned(NODE))
     awaited = from_memo(to_memo(one.of("n").memo))
     later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
@@ -290,7 +291,7 @@ def test_a_node_that_was_still_awaited_is_awaited_by_the_next_slave(one) -> None
 
 
 def test_a_node_that_was_seen_is_ready_for_the_next_slave(one) -> None:
-    """The run that was seen, that is: its next one must be seen anew."""
+    """Readiness holds for the run that was seen; the next run must appear in the graph again."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
     awaited = memo_of(one.step(reducer.SeenInGraph(NODE_1)))
@@ -309,7 +310,7 @@ MEMO = '{"awaited": ["/n", "soon", 0], "watch": null}'
 
 @pytest.mark.parametrize("memo", ["", "{}", "[1]", "nothing", '["/n", 1.0, 0]', MEMO])
 def test_a_memo_of_another_version_is_none(memo) -> None:
-    """What it says is not guessed at."""
+    """A memo of an unknown version is ignored."""
     assert from_memo(memo) is None
 
 
@@ -321,7 +322,7 @@ ON_FAILURE = RestartPolicy("on-failure")
 
 
 def running() -> Slave:
-    """A slave with one instance that runs."""
+    """Return a slave with one running instance."""
     one = Slave()
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
@@ -329,7 +330,7 @@ def running() -> Slave:
 
 
 def test_a_restart_policy_is_settled_when_it_is_recorded() -> None:
-    """Each time it is ordered; its status is told as well."""
+    """Each repeated order is acknowledged, with the instance's status."""
     one = running()
     for _ in range(2):
         assert one.step(reducer.RestartPolicySet(ONE, NEVER)) == [reducer.Amend(ONE, NEVER)]
@@ -339,14 +340,14 @@ def test_a_restart_policy_is_settled_when_it_is_recorded() -> None:
 
 
 def test_a_restart_policy_of_what_the_slave_found_running() -> None:
-    """Its spec is not known any more: the supervisor has all that is needed."""
+    """The slave lost its spec, but the supervisor has all that is needed."""
     one = Slave()
     one.step(reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
     assert one.step(reducer.RestartPolicySet(ONE, NEVER)) == [reducer.Amend(ONE, NEVER)]
 
 
 def test_a_restart_policy_is_ordered_again_from_another_supervisor() -> None:
-    """The one that was killed may have had it or not; the next one's word counts."""
+    """The killed supervisor may have recorded it or not; the next one's answer counts."""
     one = running()
     one.step(reducer.RestartPolicySet(ONE, NEVER))
     replaced = reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
@@ -356,7 +357,7 @@ def test_a_restart_policy_is_ordered_again_from_another_supervisor() -> None:
 
 
 def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one() -> None:
-    """Both were under way: each is answered for itself."""
+    """Both were in progress: each order has its own answer."""
     one = running()
     one.step(reducer.RestartPolicySet(ONE, NEVER))
     one.step(reducer.RestartPolicySet(ONE, ON_FAILURE))
@@ -366,7 +367,7 @@ def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one() -> None:
 
 
 def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
-    """The master can go on; so it can where the end came in between."""
+    """The master receives the end, so its plan continues; the same holds for an end in between."""
     one = running()
     one.step(reducer.RestartPolicySet(ONE, NEVER))
     one.step(told(STATE.FAILED))
@@ -378,7 +379,7 @@ def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
 
 
 def test_a_restart_policy_of_a_stranger_is_refused() -> None:
-    """Also where nobody but a supervisor that was killed could have known it."""
+    """The order is refused also if only a killed supervisor could have known the instance."""
     one = Slave()
     (settled,) = one.step(reducer.RestartPolicySet(ONE, NEVER))
     assert "p#1 is not known here" in settled.refusal
@@ -390,7 +391,7 @@ def test_a_restart_policy_of_a_stranger_is_refused() -> None:
 
 
 def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
-    """It is started with it, and as no shadow."""
+    """The waiting instance starts with the new policy, and not as a shadow."""
     one = running()
     one.state.max_processes = 1
     shadow = Assignment(InstanceId("p", 2), PLAIN, 1, "p_1700000000", shadow=True)
@@ -416,7 +417,7 @@ def launched(commands) -> list[str]:
 
 
 def test_so_many_are_started_at_a_time(one) -> None:
-    """The others are held, and say so; the next one starts when one is ready."""
+    """The others are held and reported; the next one starts once one is ready."""
     one.state.max_starting = 2
     commands = one.step(nodes(4))
     assert launched(commands) == ["n0", "n1"]
@@ -427,7 +428,7 @@ def test_so_many_are_started_at_a_time(one) -> None:
 
 
 def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
-    """Also one that is stopped because it is not ready in time."""
+    """An instance that is stopped because it is not ready in time makes room, too."""
     one.state.max_starting = 1
     one.step(nodes(3))
     assert launched(one.step(told(STATE.FAILED, "n0", exit_code=1))) == ["n1"]
@@ -437,7 +438,7 @@ def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
 
 
 def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
-    """So a bound on starts hardly holds up plain programs."""
+    """A bound on starts hardly delays plain programs."""
     one.state.max_starting = 1
     one.step(assigned(number=1))
     one.step(assigned(replace(PLAIN, name="q")))
@@ -445,7 +446,7 @@ def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
 
 
 def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
-    """The supervisor never says that it has it: the master is answered all the same."""
+    """The supervisor never records it, but the master still receives an answer."""
     one = running()
     one.step(reducer.Registered(1))
     one.step(reducer.RestartPolicySet(ONE, NEVER))
@@ -455,7 +456,7 @@ def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
 
 
 def test_stop_and_restart_go_to_the_supervisor(one) -> None:
-    """Of what has ended the end is told again; of what is unknown a restart says nothing."""
+    """An ended instance is reported again; a restart of an unknown one has no effect."""
     instance = InstanceId("p", 1)
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
@@ -468,7 +469,7 @@ def test_stop_and_restart_go_to_the_supervisor(one) -> None:
 
 
 def test_a_complete_report_names_everything(one) -> None:
-    """Ended instances that are still remembered included."""
+    """The report includes ended instances that are still remembered."""
     one.step(assigned())
     one.step(assigned(number=2))
     one.step(told(STATE.EXITED))
@@ -483,14 +484,14 @@ def test_a_complete_report_names_everything(one) -> None:
     ("usage", "present", "stale", "under"),
     [
         ([0.1, 0.2], 0b11, 0, True),
-        ([0.1, 0.9], 0b11, 0, False),  # over
+        ([0.1, 0.9], 0b11, 0, False),  # over the limit
         ([0.1, 0.5], 0b11, 0, False),  # at the limit
         ([0.1, np.nan], 0b11, 0, False),  # unknown
         ([0.1, 0.2], 0b11, 0b10, False),  # stale, and limited
         ([0.1, 0.2], 0b11, 0b01, True),  # stale, but without a limit
         ([1.0, 0.2], 0b11, 0b01, True),  # never read, but without a limit
         ([1.5, 0.2], 0b11, 0, True),  # used up, but without a limit
-        ([0.1, 0.9], 0b01, 0, True),  # not in use
+        ([0.1, 0.9], 0b01, 0, True),  # unused
         ([], 0, 0, True),  # no probe at all
     ],
 )
@@ -514,7 +515,7 @@ FENCES = st.none() | st.builds(Fence, st.sampled_from([1.0, 5.0]), st.just(1.0))
 
 
 class AnySlave(RuleBasedStateMachine):
-    """The supervisor here is one that obeys: it tells of each launch and stop, sooner or later."""
+    """State machine with a supervisor that carries out and reports each order after a delay."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -596,7 +597,7 @@ class AnySlave(RuleBasedStateMachine):
 
     @rule(hears=st.booleans())
     def replace_supervisor(self, hears) -> None:
-        """It was killed: orders that it did not read are lost, what it had recorded is not."""
+        """Replace the supervisor: unread orders are lost, its record is kept."""
         if not hears:
             self.amending.clear()
         found = (InstanceStatus(one, state, 7) for one, state in self.alive.items())
@@ -609,7 +610,7 @@ class AnySlave(RuleBasedStateMachine):
 
     @rule(number=NUMBERS, pid=st.sampled_from([7, 7, 7, 8]), runs=st.booleans())
     def look(self, number, pid, runs) -> None:
-        """At one that is stopped, or at another run of it, for longer than is allowed."""
+        """Report unhealthy looks at the present or another run for longer than is allowed."""
         instance = InstanceId(WATCHED.name, number)
         if runs and instance in self.alive:
             self.alive[instance] = STATE.RUNNING
@@ -652,7 +653,7 @@ class AnySlave(RuleBasedStateMachine):
 
     @invariant()
     def the_master_knows(self) -> None:
-        """What was told of an instance is how it stands; a launch is told when it starts."""
+        """Check that the last report of each instance, if it started, has its state."""
         for instance, held in self.state.held.items():
             known = self.reported.get(instance, STATE.STARTING)
             assert known is held.status.state

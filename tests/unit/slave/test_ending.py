@@ -1,4 +1,4 @@
-"""What a slave says at its end is true: the last line names each process that may still run."""
+"""Last log line of a slave: each process that may still run is named."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STOP = StopPolicy(interrupt_grace=1.0, terminate_grace=1.0)
 
 
 class Slave:
-    """The end of a slave with two processes, and a supervisor that does what a test says."""
+    """End of a slave with two processes and a supervisor controlled by the test."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -59,14 +59,14 @@ def slave(monkeypatch) -> Slave:
 
 
 def test_an_order_to_stop_that_was_not_taken_is_no_stop(slave, caplog) -> None:
-    """The supervisor hangs: what it has not begun to stop is named, with the way to stop it."""
+    """If the supervisor hangs, the line names the running processes and the way to stop them."""
     slave.when_stopped = lambda: slave.report("q", InstanceState.STOPPING)
     assert slave.end() == 1
     assert "(pid 7) still stops q#1 and has not begun to stop p#1. Stop them by" in caplog.text
 
 
 def test_what_is_still_being_stopped_is_named(slave, caplog) -> None:
-    """Processes that need longer than their `stop` allows."""
+    """The line names processes that need longer than their `stop` allows."""
     slave.when_stopped = lambda: [slave.report(name, InstanceState.STOPPING) for name in "pq"]
     assert slave.end() == 1
     assert f"not ended within {STOP.timeout:g} s: the supervisor (pid 7) still stops" in caplog.text
@@ -74,7 +74,7 @@ def test_what_is_still_being_stopped_is_named(slave, caplog) -> None:
 
 
 def test_a_supervisor_that_is_gone_has_stopped_nothing(slave, caplog) -> None:
-    """No "2 processes were stopped" where the supervisor was killed and none takes its place."""
+    """After a kill of the supervisor the slave does not claim "2 processes were stopped"."""
     slave.when_stopped = lambda: slave.ending.note_supervisor_left("the supervisor is gone")
     assert slave.end() == 1
     assert "p#1 and q#1 may still run: the supervisor is gone" in caplog.text
@@ -83,7 +83,7 @@ def test_a_supervisor_that_is_gone_has_stopped_nothing(slave, caplog) -> None:
 
 
 def test_a_slave_whose_supervisor_was_gone_before_says_so(slave, caplog) -> None:
-    """No "no process is left running" where nothing stopped them."""
+    """The slave does not claim "no process is left running" if nothing stopped them."""
     slave.ending.note_supervisor_left("the supervisor is gone")
     assert slave.end() == 1
     assert "p#1 and q#1 may still run" in caplog.text
@@ -113,7 +113,7 @@ def test_a_second_signal_is_answered_with_what_is_left_and_until_when(slave) -> 
 
 
 def test_a_time_that_is_not_known_is_not_claimed(slave) -> None:
-    """A re-adopted process: this run of the slave does not know its `stop`."""
+    """This run of the slave does not know the `stop` of a re-adopted process."""
     slave.state.held[InstanceId("q", 1)].spec = None
     slave.when_stopped = lambda: slave.ending.note_supervisor_left("")
     assert slave.end() == 0

@@ -1,4 +1,4 @@
-"""Executors: whatever a plugin's function does is an answer to the order, never the slave's end."""
+"""Executors: every outcome of a plugin's function answers the order, and none ends the slave."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HERE = Here("alpha", Path("/state"), {})
 
 
 class Rig:
-    """The executor `wait` of the strategy `acme`, run as the slave's loop runs it."""
+    """The executor `wait` of the strategy `acme`, run as in the slave's loop."""
 
     def __init__(self, function) -> None:
         self.posted, self.said, self.clock = Queue(), [], FakeClock()
@@ -33,7 +33,7 @@ class Rig:
         )  # fmt: skip
 
     def run(self, timeout=60.0) -> list[tuple[str, str, str]]:
-        """Run the executor until the loop is called back; returns what it has settled."""
+        """Run the executor until it calls the loop back; return the settled results."""
         outcomes = []
         self.executors.execute(
             "wait", {}, timeout, here=HERE, done=lambda *outcome: outcomes.append(outcome)
@@ -43,7 +43,7 @@ class Rig:
 
 
 def outcome(function) -> tuple[str, str, str]:
-    """Code, message and result of an executor."""
+    """Return code, message and result of an executor."""
     return Rig(function).run()[0]
 
 
@@ -51,7 +51,7 @@ def outcome(function) -> tuple[str, str, str]:
     ("answer", "said"), [(None, "None"), ([1], "a list"), (3, "a int"), ("{}", "a str")]
 )
 def test_an_answer_that_is_no_object_is_a_failure_of_its_own(answer, said) -> None:
-    """Forgetting `return {}` is the beginner's mistake: the sentence says what is required."""
+    """A missing `return {}` is a common mistake, so the message says what is required."""
     code, message, result = outcome(lambda _: answer)
     assert (code, result) == (BAD_RESULT, "")
     assert message == f"wait answered {said}; a JSON object is required"
@@ -59,7 +59,7 @@ def test_an_answer_that_is_no_object_is_a_failure_of_its_own(answer, said) -> No
 
 @pytest.mark.parametrize("answer", [{}, {"a": 1}, ChainMap({"a": 1})])
 def test_any_mapping_is_an_answer(answer) -> None:
-    """The answer travels as JSON."""
+    """The answer is sent as JSON."""
     code, message, result = outcome(lambda _: answer)
     assert (code, message, json.loads(result)) == ("", "", dict(answer))
 
@@ -69,14 +69,14 @@ def exits(_arguments) -> None:
 
 
 def test_an_executor_that_exits_fails_with_its_place() -> None:
-    """The order is answered at once; it need not wait for its time-out."""
+    """The order is answered at once, without waiting for its time-out."""
     code, message, _ = outcome(exits)
     line = exits.__code__.co_firstlineno + 1
     assert (code, message) == ("failed", f"wait raised SystemExit: 3 ({__file__}:{line})")
 
 
 def test_an_error_of_rosrm_is_the_whole_message() -> None:
-    """The shipped executors say what a user can do."""
+    """The errors of the shipped executors say what a user can do."""
 
     def fails(_arguments) -> None:
         raise CriuError("no CRIU here: install it")
@@ -93,7 +93,7 @@ def test_an_error_of_rosrm_is_the_whole_message() -> None:
     ],
 )
 def test_an_answer_that_json_cannot_hold_is_named_by_its_key_and_type(answer, said) -> None:
-    """Asked again the executor would answer so for ever, as where it answers no object."""
+    """A retry would return the same answer, as for an answer that is no object."""
     expected = f"wait answered something that is no JSON: {said}"
     assert outcome(lambda _: answer) == (BAD_RESULT, expected, "")
 
@@ -117,7 +117,7 @@ def hangs(_arguments) -> None:
     ],
 )
 def test_an_executor_that_fails_makes_its_strategy_failing(function, said) -> None:
-    """With the executor, the error and the place; said once as long as the error stays."""
+    """The report has executor, error and place, once as long as the error stays."""
     rig = Rig(function)
     for _ in range(2):
         rig.run(0.05 if function is hangs else 60.0)
@@ -130,7 +130,7 @@ def test_an_executor_that_fails_makes_its_strategy_failing(function, said) -> No
 
 @pytest.mark.parametrize("answer", [ValueError("arm is in use"), CriuError("no CRIU here")])
 def test_a_refusal_by_an_executor_is_an_answer_and_no_failure(answer) -> None:
-    """A `ValueError`, as in `propose`, or an error of rosrm."""
+    """A `ValueError`, as in `propose`, and an error of rosrm are refusals."""
 
     def refuses(_arguments) -> None:
         raise answer
@@ -142,7 +142,7 @@ def test_a_refusal_by_an_executor_is_an_answer_and_no_failure(answer) -> None:
 
 
 def test_a_strategy_works_again_with_a_good_answer_after_a_while() -> None:
-    """Not with the first one: an executor that fails every second time would fill the record."""
+    """One success is too few: an executor that fails every second time would fill the record."""
     rig = Rig(lambda arguments: {} if good else None)
     good = False
     rig.run()
@@ -156,6 +156,6 @@ def test_a_strategy_works_again_with_a_good_answer_after_a_while() -> None:
 
 
 def test_an_unknown_executor_is_refused_with_those_that_there_are() -> None:
-    """Before anything runs."""
+    """The refusal comes before any executor runs."""
     with pytest.raises(Refused, match=r"no executor 'wit' on alpha; there are: wait"):
         Rig(exits).executors.execute("wit", {}, 1.0, here=HERE, done=lambda *_: None)

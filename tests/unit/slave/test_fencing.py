@@ -1,4 +1,4 @@
-"""Fences at the slave: what it passes on, and what it starts no more."""
+"""Fences at the slave: renewals for the supervisor, and assignments that are too old to start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FENCE = Fence(after=2.0, grace=1.0)
 
 
 class Slave:
-    """A state and its clock; registered at 100 s, when the master had heard it."""
+    """State and clock of a slave that registered at 100 s, its last contact with the master."""
 
     def __init__(self, **bounds) -> None:
         self.state = reducer.SlaveState(**bounds)
@@ -55,7 +55,7 @@ def refusals(commands) -> list[str]:
 
 
 def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
-    """And at most every 0.1 s; for instances without one nothing is said."""
+    """Renewals come at most every 0.1 s, and none without a fenced instance."""
     one = Slave()
     one.assign(fence=None)
     assert one.hears(1.0) == []
@@ -68,7 +68,7 @@ def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
 
 
 def test_an_older_word_puts_nothing_off() -> None:
-    """A beat that waited to be taken in says who was heard when it was said."""
+    """A delayed beat renews the fence from the time at which it was sent."""
     one = Slave()
     one.assign()
     one.hears(1.0)
@@ -79,7 +79,7 @@ def test_an_older_word_puts_nothing_off() -> None:
 
 
 def test_a_fence_is_known_again_from_the_supervisor() -> None:
-    """By the next run of the slave; and a supervisor is told the newest at once."""
+    """The next run of the slave restores fences. A new supervisor gets the last contact at once."""
     status = InstanceStatus(ONE, InstanceState.RUNNING, pid=5)
     replaced = reducer.SupervisorReplaced((status,), fenced=frozenset({ONE}))
     one = Slave()
@@ -98,7 +98,7 @@ def test_what_is_given_out_too_late_is_not_started() -> None:
 
 
 def test_an_answer_that_was_long_on_its_way_starts_nothing() -> None:
-    """DDS delivers it when a cut is over, and beats have come meanwhile."""
+    """DDS delivers the answer after a cut, when newer beats have arrived already."""
     one = Slave(max_age=5.0)
     spec = ProcessSpec("p", command=("true",))
     for number, (fence, age, taken) in enumerate(
@@ -117,7 +117,7 @@ def test_an_answer_that_was_long_on_its_way_starts_nothing() -> None:
 
 
 def test_what_waits_for_its_start_is_fenced_too() -> None:
-    """A slot that becomes free during a long cut starts nothing that may run elsewhere."""
+    """A slot that becomes free during a long cut starts no instance that may run elsewhere."""
     one = Slave(max_processes=1)
     one.assign(fence=None)
     one.assign(number=2)
@@ -133,7 +133,7 @@ def test_what_waits_for_its_start_is_fenced_too() -> None:
 
 
 def test_a_slave_at_work_says_so_while_it_hears_nothing() -> None:
-    """What is fenced only where its slave is not at work is started and kept in a cut."""
+    """Fences with `alive` are renewed by the running slave, so their instances survive a cut."""
     one = Slave()
     alive = Fence(after=2.0, grace=0.0, alive=True)
     (launch,) = one.assign(fence=alive, after=30.0)
@@ -142,7 +142,7 @@ def test_a_slave_at_work_says_so_while_it_hears_nothing() -> None:
 
 
 def test_the_order_to_fence_is_passed_on() -> None:
-    """For what runs; one never heard of will not be started, as after an order to stop."""
+    """A running instance is killed; an unknown one is never started, as after a stop order."""
     one = Slave()
     one.assign()
     assert one.step(reducer.FenceOrdered(ONE)) == [reducer.Fence(ONE)]
@@ -152,11 +152,11 @@ def test_the_order_to_fence_is_passed_on() -> None:
     assert not any(isinstance(c, reducer.Launch) for c in one.assign(number=2))
 
 
-# --- when a beat was said ---------------------------------------------------------------------
+# --- age of beats -----------------------------------------------------------------------------
 
 
 def test_beats_that_were_waiting_are_as_old_as_they_are() -> None:
-    """Stopped for 30 s: the beats of the first second are no newer than that."""
+    """After a stop of 30 s the beats of the first second count as 30 s old."""
     clock = reducer.BeatClock()
     for tenth in range(10):
         assert clock.said_at(tenth / 10, 500.0 + tenth / 10) == pytest.approx(500.0 + tenth / 10)
@@ -169,12 +169,12 @@ def test_beats_that_were_waiting_are_as_old_as_they_are() -> None:
     st.lists(st.tuples(st.floats(0.05, 100.0), st.floats(0.0, 60.0)), min_size=1, max_size=40),
 )  # fmt: skip
 def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift, beats) -> None:
-    """Whatever the clocks' difference, drift and delays: too new by the least delay at most."""
+    """With any clock offset, drift and delay, the error is at most the least delay."""
     clock = reducer.BeatClock()
     said, arrived, quickest = 1000.0, 0.0, 1e9
     for wait, delay in beats:
         said += wait
-        arrived = max(arrived, said + delay)  # they come in order
+        arrived = max(arrived, said + delay)  # beats arrive in order
         quickest = min(quickest, arrived - said)
         beat = (said + ahead) * (1 + drift)
         taken = clock.said_at(beat, arrived)
@@ -183,7 +183,7 @@ def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift
 
 
 def test_another_pace_of_the_clock_makes_no_beat_old() -> None:
-    """An hour of beats by a clock that is 100 ppm slow: the newest is as new as the first."""
+    """After an hour of beats from a clock that is 100 ppm slow, the newest counts as new."""
     clock = reducer.BeatClock()
     for second in range(0, 3600, 5):
         age = second - clock.said_at(second * (1 - 1e-4), float(second))
@@ -191,7 +191,7 @@ def test_another_pace_of_the_clock_makes_no_beat_old() -> None:
 
 
 def test_a_new_greeting_takes_another_clock() -> None:
-    """The master's host was asleep: its beats would count as an hour old for ever."""
+    """After a sleep of the master's host its beats would otherwise count as an hour old forever."""
     clock = reducer.BeatClock()
     clock.said_at(10.0, 100.0)
     clock.restart()

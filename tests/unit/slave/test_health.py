@@ -1,4 +1,4 @@
-"""Who is unhealthy: what was amiss in every look for longer than its time, and nobody else."""
+"""Health checks: an instance is unhealthy only if every look fails for longer than its time."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def watched(health: Health = SCAN, **more) -> reducer.Watch:
 
 
 class Node:
-    """A node as its looks show it, and the judgement of them.
+    """Node with simulated looks, and its health verdict.
 
     Args:
-        health: what is wanted of it.
+        health: health settings of the node.
     """
 
     def __init__(self, health: Health = SCAN) -> None:
@@ -44,7 +44,7 @@ class Node:
         self.now = 0.0
 
     def goes_on(self, seconds: float, rate: float | None = None, period: float = 0.2, **look):
-        """For so long; the first verdict that is not "healthy", and when."""
+        """Repeat a look for this long; return the first verdict of bad health, with its time."""
         begun, told = self.now, 0
         while self.now - begun < seconds:
             self.now += period
@@ -62,7 +62,7 @@ class Node:
 
 
 def test_a_topic_that_falls_silent_is_noticed_within_its_time_and_a_quarter() -> None:
-    """Not before `timeout`; the verdict says what was found, for how long, and what is wanted."""
+    """The verdict comes after `timeout`, and has the finding, its duration and the requirement."""
     node = Node()
     assert node.goes_on(60.0, rate=20.0) == ""
     silent = node.now
@@ -71,7 +71,7 @@ def test_a_topic_that_falls_silent_is_noticed_within_its_time_and_a_quarter() ->
 
 
 def test_a_slow_topic_is_not_enough() -> None:
-    """Four tenths of a hertz where five are wanted; however steady."""
+    """A steady rate of 0.4 Hz fails where 5 Hz are required."""
     node = Node()
     verdict = node.goes_on(20.0, rate=0.4)
     assert verdict.endswith("at least 5 Hz are required")
@@ -79,7 +79,7 @@ def test_a_slow_topic_is_not_enough() -> None:
 
 
 def test_a_node_has_its_time_once_more_until_it_must_publish() -> None:
-    """From when it is ready: what it loads first is its own affair."""
+    """The time starts again once the node is ready, because it may load data first."""
     node = Node()
     assert node.goes_on(7.5, trouble="not published as /robot/lidar/scan") == ""
     verdict = node.goes_on(2.0, trouble="not published as /robot/lidar/scan")
@@ -87,7 +87,7 @@ def test_a_node_has_its_time_once_more_until_it_must_publish() -> None:
 
 
 def test_a_pause_shorter_than_its_time_is_forgiven() -> None:
-    """Again and again: what is amiss must last."""
+    """Repeated short pauses do not add up."""
     node = Node()
     for _ in range(10):
         assert node.goes_on(8.0, rate=5.0) == ""
@@ -96,28 +96,28 @@ def test_a_pause_shorter_than_its_time_is_forgiven() -> None:
 
 @given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0), st.floats(1.0, 10.0))
 def test_a_topic_as_fast_as_is_wanted_is_never_amiss(least, timeout, faster) -> None:
-    """Whatever the rate, the time and where the windows begin."""
+    """This holds for every rate, time and start of the windows."""
     node = Node(Health("scan", least, "", timeout))
     assert node.goes_on(max(10 * timeout, 10 / least), least * faster, timeout / 10) == ""
 
 
 @given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0))
 def test_a_topic_at_half_its_rate_or_less_is_always_noticed(least, timeout) -> None:
-    """Within twice its time and two windows."""
+    """The verdict comes within twice its time and two windows."""
     node = Node(Health("scan", least, "", timeout))
     window = max(timeout / 4, 3 / least)
     assert node.goes_on(3 * timeout + 2 * window, least / 3.1, min(0.2, timeout / 10)) != ""
 
 
 def test_a_subscription_is_counted_from_its_matching_on() -> None:
-    """What was not listened to was not silent: no verdict before its first whole window."""
+    """Silence counts only from the first whole window after the match."""
     node = Node(Health("scan", 5.0, "", 1.0))
     assert node.goes_on(1.9, trouble="not found by discovery yet") == ""
     assert node.goes_on(30.0, rate=5.0) == ""
 
 
 def test_a_slave_that_did_not_look_blames_nobody() -> None:
-    """It was stopped itself for a minute, and what came meanwhile was lost."""
+    """Looks that failed because the slave itself was stopped for a minute do not count."""
     node = Node()
     assert node.goes_on(20.0, rate=5.0) == ""
     node.now += 60.0
@@ -130,7 +130,7 @@ PLAIN = Health(timeout=4.0)
 
 
 def test_what_is_stopped_for_too_long_is_unhealthy() -> None:
-    """SIGSTOP; one that goes on in time is not."""
+    """SIGSTOP counts; a process that resumes in time is healthy."""
     node = Node(PLAIN)
     assert node.goes_on(3.7, stopped=True) == ""
     assert node.goes_on(1.0) == ""
@@ -146,7 +146,7 @@ def test_what_is_stopped_for_too_long_is_unhealthy() -> None:
     ],
 )
 def test_another_lifecycle_state_or_no_answer(state, said) -> None:
-    """Both are amiss; a state that is not known yet is not."""
+    """Both fail the check; a state that is not known yet does not."""
     node = Node(Health(lifecycle="active", timeout=4.0))
     assert node.goes_on(10.0, state=None) == ""
     assert node.goes_on(10.0, state="active") == ""
@@ -158,7 +158,7 @@ def test_another_lifecycle_state_or_no_answer(state, said) -> None:
 
 
 def test_all_that_is_amiss_is_said() -> None:
-    """In one line."""
+    """The message has all findings in one line."""
     node = Node(Health("~/scan", 5.0, "active", 4.0))
     while "~/scan" not in (verdict := node.goes_on(20.0, rate=0.0, state="")):
         assert node.now < 60.0, verdict
@@ -187,13 +187,13 @@ RULES = {
     ],
 )
 def test_a_name_is_found_as_the_node_finds_it(name, absolute) -> None:
-    """In its namespace, below its name, by the first rule that fits."""
+    """The first matching remapping rule applies, in the namespace or below the node's name."""
     assert resolve(name, "/robot", "lidar", RULES, "rostopic://") == absolute
     assert resolve("scan", "", "lidar", {}, "rostopic://") == "/scan"
 
 
 def test_under_an_alias_names_are_those_that_others_see() -> None:
-    """And the alias's own, for a node that does not know rosrm."""
+    """A node that does not know rosrm uses the alias, so names below the alias resolve, too."""
     spec = replace(SPEC, health=Health("~/scan", 5.0, "active", 4.0))
     watch = watch_of(Assignment(InstanceId("lidar", 2), spec, 1, "lidar_17", shadow=True))
     assert watch == reducer.Watch(
@@ -206,15 +206,15 @@ def test_under_an_alias_names_are_those_that_others_see() -> None:
 
 
 def test_nothing_is_watched_without_a_time() -> None:
-    """The default."""
+    """No health check is the default."""
     assert watch_of(Assignment(LIDAR, replace(SPEC, health=Health()), 1, "lidar")) is None
 
 
-# --- the slave's core -------------------------------------------------------------------------
+# --- reducer of the slave ---------------------------------------------------------------------
 
 
 class Slave:
-    """A slave that holds one plain process whose health is watched."""
+    """Slave that holds one plain process with a health check."""
 
     def __init__(self, shadow: bool = False) -> None:
         self.state = reducer.SlaveState(registered=True)
@@ -231,7 +231,7 @@ class Slave:
         self.step(reducer.SupervisorReported((status,)))
 
     def looks(self, seconds: float, pid: int, **look) -> list[reducer.Command]:
-        """What is ordered within so long."""
+        """Return the first orders within this time."""
         ordered, until = [], self.now + seconds
         while self.now < until and not ordered:
             self.now += reducer.LOOK_PERIOD
@@ -240,7 +240,7 @@ class Slave:
 
 
 def test_an_unhealthy_run_is_ended_as_failed() -> None:
-    """By an order for this very run, to kill it if it is stopped; if it is lost, it comes again."""
+    """The fail order names this run, and kills it if it is stopped; a lost order is repeated."""
     one = Slave()
     one.runs(5)
     for _ in range(2):
@@ -250,7 +250,7 @@ def test_an_unhealthy_run_is_ended_as_failed() -> None:
 
 
 def test_a_restart_begins_anew() -> None:
-    """Looks at the run before count no more, nor do those at what is not ready."""
+    """Looks at the former run, or at a run that is not ready, do not count."""
     one = Slave()
     one.runs(5)
     assert one.looks(3.0, 5, stopped=True) == []
@@ -264,7 +264,7 @@ def test_a_restart_begins_anew() -> None:
 
 
 def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
-    """A later run of the slave knows it too."""
+    """A later run of the slave resumes the checks, too."""
     one = Slave(shadow=True)
     one.runs(5)
     assert one.state.watched() == {}
@@ -279,7 +279,7 @@ def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
 
 
 def test_what_is_being_moved_may_be_silent() -> None:
-    """Its restart policy is suspended for the move, and its health with it; then anew."""
+    """A move suspends restart policy and health checks; afterwards the time starts again."""
     one = Slave()
     one.runs(5)
     one.looks(3.0, 5, stopped=True)
@@ -291,7 +291,7 @@ def test_what_is_being_moved_may_be_silent() -> None:
 
 
 def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
-    """It was told before it was started."""
+    """The restart policy arrived before its start."""
     state = reducer.SlaveState(registered=True, max_processes=1)
     spec = ProcessSpec("lidar", command=("true",), health=PLAIN)
     other = Assignment(InstanceId("other", 2), replace(spec, name="other"), 1, "other")
@@ -317,7 +317,7 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
     )
 )  # fmt: skip
 def test_a_memo_survives_the_way(memo) -> None:
-    """What a later run of the slave reads is what this one wrote; nothing is written of nothing."""
+    """A later run of the slave reads the same memo; an empty memo is not written."""
     text = to_memo(memo)
     assert (from_memo(text) or reducer.Memo()) == memo
     assert bool(text) == (memo != reducer.Memo())

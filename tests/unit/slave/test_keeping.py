@@ -1,4 +1,4 @@
-"""What a slave does with kept states: ships, takes, fetches, deletes; real files, no ROS."""
+"""Snapshot replication at the slave: ship, receive, fetch, delete; with files, without ROS."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PATIENCE = 20.0
 
 
 class Wire:
-    """In place of ROS: what one slave says to another arrives at once, unless it is cut off."""
+    """Transport without ROS: messages between slaves arrive at once, unless a host is cut off."""
 
     def __init__(self, net: Net, name: str) -> None:
         self.net, self.name = net, name
@@ -60,13 +60,13 @@ class Wire:
 
 
 class Net:
-    """Slaves of several hosts, with one loop for all.
+    """Slaves of several hosts with one loop.
 
     Attributes:
-        hidden: hosts that are not found.
+        hidden: hosts that discovery does not find.
         silent: hosts that do not answer.
-        said: what users were told, by host.
-        told: what the master was told, by host.
+        said: messages to the user, by host.
+        told: reports to the master, by host.
     """
 
     def __init__(self, tmp_path) -> None:
@@ -96,7 +96,7 @@ class Net:
         return self.slaves[name]
 
     def write(self, host: str, sequence: int, size: int = 10, number: int = 7) -> None:
-        """The node of `p` keeps its state."""
+        """Publish a snapshot of the node of `p`."""
         data = bytes([sequence % 256]) * size
         writer = SlotWriter(self.directory(host), "p", number)
         writer.write(sequence, [Block(data, zlib.crc32(data))])
@@ -110,7 +110,7 @@ class Net:
         return None if head is None else head.age
 
     def until(self, condition: Callable[[], object], what: str, step: float = 0.1) -> None:
-        """Time passes, as fast as it can, until something holds."""
+        """Let time pass, without real delays, until a condition holds."""
         deadline = time.monotonic() + PATIENCE
         while not condition():
             assert time.monotonic() < deadline, f"not in time: {what}"
@@ -123,7 +123,7 @@ class Net:
         self.settle()
 
     def settle(self) -> None:
-        """All that the threads have done reaches the loop."""
+        """Deliver all results of the threads to the loop."""
         for slave in self.slaves.values():
             done = threading.Event()
             slave._jobs.put(done.set)
@@ -148,7 +148,7 @@ def assignment(*kept_on: str, kept_from: int = 1, number: int = 9, **fields) -> 
 
 
 def test_a_state_is_shipped_when_it_has_changed(net):
-    """Byte by byte, and not again before there is a newer one."""
+    """The replica is identical, and is not sent again before there is a newer snapshot."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
     net.write("a", 1, 600_000)
@@ -166,7 +166,7 @@ def test_a_state_is_shipped_when_it_has_changed(net):
 
 
 def test_not_more_often_than_the_policy_says(net):
-    """However fast the state changes."""
+    """The bound holds however fast the snapshot changes."""
     net.add("a").keep(P7, ["b"], 2.0)
     net.add("b")
     for sequence in range(1, 101):
@@ -177,7 +177,7 @@ def test_not_more_often_than_the_policy_says(net):
 
 
 def test_to_several_hosts(net):
-    """To each of them, one after the other."""
+    """Each host receives the replica, one after the other."""
     net.add("a").keep(P7, ["b", "c", "a"], 1.0)
     net.add("b")
     net.add("c")
@@ -186,7 +186,7 @@ def test_to_several_hosts(net):
 
 
 def test_the_rate_is_bounded(net):
-    """Of all that is sent; a second's worth may go out at once."""
+    """The bound holds for all transfers together; one second's amount may be sent at once."""
     net.add("a", max_rate=1_000_000).keep(P7, ["b"], 1.0)
     net.add("b")
     net.write("a", 1, 5_000_000)
@@ -196,7 +196,7 @@ def test_the_rate_is_bounded(net):
 
 
 def test_who_does_not_answer_is_tried_again_and_named_once(net):
-    """And others get theirs all the while."""
+    """Other hosts still receive their replicas."""
     net.add("a").keep(P7, ["b", "c"], 1.0)
     net.add("b")
     net.add("c")
@@ -211,7 +211,7 @@ def test_who_does_not_answer_is_tried_again_and_named_once(net):
 
 
 def test_a_newer_state_there_is_left_alone(net):
-    """An old instance that still runs somewhere does no harm."""
+    """An old instance that still runs somewhere does not replace newer state."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
     net.write("b", 1, number=8)
@@ -223,7 +223,7 @@ def test_a_newer_state_there_is_left_alone(net):
 
 
 def test_the_state_of_a_successor_is_not_sent_back(net):
-    """The process has moved to b, whose slave ships its state to here."""
+    """The process has moved to b, whose slave sends its replicas to this host."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
     net.write("a", 1)
@@ -238,7 +238,7 @@ def test_the_state_of_a_successor_is_not_sent_back(net):
 
 
 def test_room_is_bounded(net):
-    """By the copies of all processes together; what is there already stays."""
+    """The bound holds for the replicas of all processes together; existing ones stay."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b", max_bytes=10_000)
     net.write("a", 1, 9_000)
@@ -250,7 +250,7 @@ def test_room_is_bounded(net):
 
 
 def test_a_state_that_is_damaged_on_its_way_is_refused(net):
-    """Nothing of it is kept, and nothing of it is left."""
+    """No part of the damaged replica is stored or left behind."""
     taker = net.add("b")
     net.write("b", 1, number=6)
     good = snapshots.newest_content(net.directory("b"))[1]
@@ -264,7 +264,7 @@ def test_a_state_that_is_damaged_on_its_way_is_refused(net):
 
 
 def test_parts_out_of_order_begin_anew(net):
-    """One was lost, or two senders speak at once."""
+    """A part was lost, or two senders send at the same time."""
     taker = net.add("b")
     answers = []
     taker.take_part(Part("p", 7, 5, 100, 200, 0, b"x" * 50), lambda *a: answers.append(a))
@@ -273,7 +273,7 @@ def test_parts_out_of_order_begin_anew(net):
 
 
 def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
-    """The loop only asks the thread."""
+    """Files are written by a thread, not by the loop."""
     slave = net.add("a")
     net.write("a", 1)
     blocked, free = threading.Event(), threading.Event()
@@ -294,11 +294,11 @@ def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
     net.settle()
 
 
-# --- what the master is told ------------------------------------------------------------------
+# --- reports to the master --------------------------------------------------------------------
 
 
 def test_the_master_is_told_what_is_kept_when_it_changes(net):
-    """And a master that has just come, at once."""
+    """A new master receives the report at once."""
     slave = net.add("a")
     for _ in range(30):
         net.pass_time(0.1)
@@ -313,7 +313,7 @@ def test_the_master_is_told_what_is_kept_when_it_changes(net):
 
 
 def test_a_copy_that_has_come_is_told_at_once(net):
-    """Not with the next look: its process may be lost in the next moment."""
+    """The report must not wait for the next look, because the process may be lost before."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
     net.pass_time(0.05)  # the look that follows its start is over
@@ -325,7 +325,7 @@ def test_a_copy_that_has_come_is_told_at_once(net):
 
 
 def test_what_lives_here_is_not_deleted(net):
-    """An order that comes late does not take the state of a running process."""
+    """A late order does not delete the snapshot of a running process."""
     slave = net.add("a")
     net.write("a", 3)
     slave.drop(P7, lives=True)
@@ -343,7 +343,7 @@ def test_what_lives_here_is_not_deleted(net):
 
 
 def prepare(net: Net, host: str, wanted: Assignment) -> list[Assignment]:
-    """The start that follows, when time has passed; at once, or later."""
+    """Return the assignments that start, at once or after some time."""
     started: list[Assignment] = []
     if net.slaves[host].prepare(wanted, started.append):
         return [wanted]
@@ -352,7 +352,7 @@ def prepare(net: Net, host: str, wanted: Assignment) -> list[Assignment]:
 
 
 def test_a_start_fetches_the_newest_state(net):
-    """Part by part; then it is there as if it had been kept here."""
+    """The parts of the snapshot are stored as if the node had published it here."""
     net.add("a")
     net.add("b")
     net.write("b", 42, 10_000)
@@ -374,7 +374,7 @@ def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
 
 
 def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
-    """And its slave says why."""
+    """The slave logs the reason."""
     monkeypatch.setattr(fetch, "PATIENCE", 0.05)
     net.add("a")
     net.add("b")
@@ -398,7 +398,7 @@ def test_what_is_here_and_as_new_is_not_fetched(net):
 
 
 def test_all_that_is_kept_is_the_owners_alone(net):
-    """Whatever the umask, and whoever makes the directory first: a node that starts, or a copy."""
+    """The mode is 0o700 under any umask, whether a node or a replica creates the directory."""
     before = os.umask(0)
     try:
         net.add("a").keep(P7, ["b"], 1.0)
@@ -417,7 +417,7 @@ def test_all_that_is_kept_is_the_owners_alone(net):
     "wanted", [assignment("a", "b"), assignment(), assignment("b", shadow=True)], ids=str
 )
 def test_what_needs_no_state_of_another_host_asks_none(net, wanted):
-    """The newest is here, or there is none, or it follows a source."""
+    """The newest snapshot is here, or none exists, or the instance follows a source."""
     net.add("a")
     net.add("b")
     net.write("b", 42)
@@ -426,13 +426,13 @@ def test_what_needs_no_state_of_another_host_asks_none(net, wanted):
 
 
 def test_a_process_without_a_state_starts_at_once(net):
-    """Nothing is looked for."""
+    """No host is asked for a snapshot."""
     stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", kept_on=("b",))
     assert net.add("a").prepare(stateless, pytest.fail)
 
 
 def test_states_of_a_former_life_are_deleted_before_a_start(net):
-    """Wherever they came from."""
+    """The origin of these snapshots makes no difference."""
     net.add("a")
     net.write("a", 42)
     prepare(net, "a", assignment(kept_from=8))
@@ -440,7 +440,7 @@ def test_states_of_a_former_life_are_deleted_before_a_start(net):
 
 
 def test_a_start_goes_on_though_looking_for_its_state_failed(net, monkeypatch):
-    """Its slave says what went wrong."""
+    """The slave logs the error."""
     slave = net.add("a")
     monkeypatch.setattr(slave, "_look_for", lambda _: 1 / 0)
     prepare(net, "a", assignment())
@@ -448,7 +448,7 @@ def test_a_start_goes_on_though_looking_for_its_state_failed(net, monkeypatch):
 
 
 def test_a_start_that_is_called_off_does_not_happen(net):
-    """The state may come, the instance does not."""
+    """The snapshot may arrive, but the instance does not start."""
     slave = net.add("a")
     net.add("b")
     net.write("b", 42, 10_000)

@@ -1,4 +1,4 @@
-"""Parts of a log: what was asked for, across rotations, and a reason where there is none."""
+"""Parts of a log: requested range, rotations, and the reason where no log exists."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def read(tmp_path, offset=0, most=0, *, ended=False, **more):
 
 
 def everything(tmp_path, **more):
-    """All content, with the offsets at which bytes are missing and how many."""
+    """Return all content, with the offsets and sizes of gaps."""
     part = read(tmp_path, 0, **more)
     content, gaps = part.content, [(0, part.offset)] if part.offset and not more else []
     while part.content:
@@ -58,13 +58,13 @@ def everything(tmp_path, **more):
     ],
 )
 def test_parts(tmp_path, log, offset, most, content, after) -> None:
-    """From an offset; the next offset continues without gap or repetition."""
+    """The next offset continues without gap or repetition."""
     part = read(tmp_path, offset, most)
     assert (part.content, part.next_offset) == (content, after)
 
 
 def test_ended_only_with_everything_read(tmp_path, log) -> None:
-    """Whoever follows reads on until the last byte, and is then told that nothing more comes."""
+    """A follower reads until the last byte, and only then receives the end mark."""
     assert not read(tmp_path, 0, 4, ended=True).ended
     assert read(tmp_path, 4, ended=True).ended
     assert not read(tmp_path, 4, ended=False).ended
@@ -72,7 +72,7 @@ def test_ended_only_with_everything_read(tmp_path, log) -> None:
 
 @pytest.mark.parametrize("keep", [0, 1, 2])
 def test_a_rotation_changes_no_offset(tmp_path, log, keep) -> None:
-    """A reader continues at its offset; bytes that were not kept are a gap of known size."""
+    """A reader continues at its offset; dropped bytes are a gap of known size."""
     rotate(str(log), 10, LogLimits(max_bytes=6, keep=keep))
     log.write_bytes(b"new")
     part = read(tmp_path, 2)
@@ -83,7 +83,7 @@ def test_a_rotation_changes_no_offset(tmp_path, log, keep) -> None:
 
 
 def test_what_is_written_while_a_log_is_cut_is_counted(tmp_path, log, monkeypatch) -> None:
-    """These bytes cannot be kept; the reader sees how many they were."""
+    """These bytes cannot be kept; the reader learns their number."""
     copy = log_index.copy_from
 
     def copy_late(*arguments):
@@ -100,7 +100,7 @@ def test_what_is_written_while_a_log_is_cut_is_counted(tmp_path, log, monkeypatc
 @pytest.mark.parametrize("tail", [1, 2, 3, 250, 999, 1000, 2000])
 @pytest.mark.parametrize("end", [b"", b"unfinished"])
 def test_tail(tmp_path, log, monkeypatch, tail, end) -> None:
-    """So many lines, over files and blocks; one that is not finished counts."""
+    """The tail has this many lines, over files and blocks; an unfinished line counts."""
     monkeypatch.setattr(logs, "_BLOCK", 50)
     log.write_bytes(LINES[:5000])
     rotate(str(log), 5000, LogLimits())
@@ -110,14 +110,14 @@ def test_tail(tmp_path, log, monkeypatch, tail, end) -> None:
 
 
 def test_tail_of_a_log_that_was_just_rotated(tmp_path, log) -> None:
-    """The current file is empty: the lines are those of the one before."""
+    """The current file is empty: the lines are those of the file before."""
     log.write_bytes(LINES)
     rotate(str(log), len(LINES), LogLimits())
     assert everything(tmp_path, tail=2)[0] == b"line 998\nline 999\n"
 
 
 def test_since(tmp_path, log) -> None:
-    """From the first byte that may have been written at that time on."""
+    """The part begins with the first byte that may have been written at that time."""
     log.write_bytes(b"abcdef")
     log_index.begin(str(log), Mark(10.0, 0, 7))
     for when, offset in ((11.0, 2), (13.0, 6)):
@@ -147,7 +147,7 @@ def test_marks_cover_a_part(tmp_path, log) -> None:
 
 
 def test_an_answer_with_many_marks_ends_sooner(tmp_path, log, monkeypatch) -> None:
-    """The next one continues there."""
+    """The next answer continues there."""
     monkeypatch.setattr(logs, "_MOST_MARKS", 5)
     log_index.begin(str(log), Mark(10.0, 0, 1))
     for offset in range(1, 11):
@@ -189,14 +189,14 @@ def test_what_a_program_wrote_first_after_dropped_bytes_stays(tmp_path, log) -> 
 
 
 def test_one_answer_is_bounded(tmp_path, log) -> None:
-    """Whatever is asked for, a flood does not come in one message."""
+    """A large request gets its answer in several messages."""
     log.write_bytes(b"x" * (3 << 20))
     assert len(read(tmp_path, most=0).content) == len(read(tmp_path, most=2**32 - 1).content)
     assert len(read(tmp_path).content) <= 1 << 20
 
 
 def test_no_log_is_said(tmp_path) -> None:
-    """With the file that was looked for."""
+    """The refusal names the file."""
     with pytest.raises(Refused, match="no log of robot/p#3"):
         read(tmp_path)
     with pytest.raises(Refused, match="no log of nobody"):
@@ -204,7 +204,7 @@ def test_no_log_is_said(tmp_path) -> None:
 
 
 def test_newest_instance(tmp_path, log) -> None:
-    """By number, not by name: 10 is newer than 9; rotated and other files do not count."""
+    """Numbers are compared as numbers: 10 is newer than 9; rotated and other files do not count."""
     for number in (9, 10):
         log_path(tmp_path, InstanceId("robot/p", number)).write_bytes(b"")
     for process in ("robot", "robot/p.11", "p", "robot/p/12"):
@@ -216,7 +216,7 @@ def test_newest_instance(tmp_path, log) -> None:
     assert read(tmp_path).numbers == (3, 9, 10)
 
 
-# --- what the supervisor writes ---------------------------------------------------------------
+# --- logs written by the supervisor -----------------------------------------------------------
 
 
 @pytest.fixture
@@ -234,7 +234,7 @@ def start(keeper, pid, content=b""):
 
 
 def test_starts_and_growth_are_noted(tmp_path, keeper) -> None:
-    """A restart writes into the same file; the supervisor knows where it begins."""
+    """A restart writes into the same file; the supervisor records where it begins."""
     start(keeper, 7, b"oh no\n")
     keeper.look(1e9)
     start(keeper, 8, b"oh no\n")
@@ -245,7 +245,7 @@ def test_starts_and_growth_are_noted(tmp_path, keeper) -> None:
 
 @pytest.mark.parametrize("died", [False, True])
 def test_offsets_continue_in_another_supervisor(tmp_path, keeper, died) -> None:
-    """Rotations before and after it count alike."""
+    """Rotations before and after the restart count alike."""
     start(keeper, 7, b"x" * 150)
     keeper.look(1e9)
     if died:
@@ -260,7 +260,7 @@ def test_offsets_continue_in_another_supervisor(tmp_path, keeper, died) -> None:
 
 
 def test_a_log_that_was_cut_without_a_note_is_read_on(tmp_path, keeper) -> None:
-    """By hand, or by a supervisor that was killed in the middle of a rotation."""
+    """A user, or a supervisor killed during a rotation, may have cut it."""
     start(keeper, 7, b"first\n")
     keeper.look(1e9)
     log_path(tmp_path, P).write_bytes(b"2\n")
@@ -300,7 +300,7 @@ def test_an_index_is_bounded_like_its_log(tmp_path, keeper) -> None:
 
 
 def test_a_loop_of_crashes_without_output_does_not_let_an_index_grow(tmp_path, keeper) -> None:
-    """Of the starts without a byte between them the newest is known."""
+    """The index keeps only the newest of several starts without output in between."""
     for pid in range(7, 30):
         start(keeper, pid)
         keeper.release((P.process, P.number))

@@ -1,4 +1,4 @@
-"""What each instance uses: whose session is followed, and when it is said."""
+"""Usage of each instance: sessions that are followed, and time of the report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ P = InstanceId("p", 7)
 
 
 class Table:
-    """Stands for the table of sessions: who is in it, and what it was told of ends."""
+    """Fake table of sessions: its members, and the ends that it received."""
 
     def __init__(self) -> None:
         self.leaders: list[int] = []
@@ -44,7 +44,7 @@ def told(state: InstanceState, pid: int = 0, cpu_time: float = 0.0) -> InstanceS
 
 
 def test_usage_is_said_three_readings_after_it_was_seen(table) -> None:
-    """And only once; what was not said yet is not looked at anew."""
+    """Each usage is reported once, and is not measured again before its report."""
     watch = UsageWatch(table)
     watch.follow(told(InstanceState.RUNNING, 40))
     watch.look(1.0)
@@ -55,14 +55,14 @@ def test_usage_is_said_three_readings_after_it_was_seen(table) -> None:
 
 
 def test_nothing_is_looked_at_while_nothing_runs(table) -> None:
-    """An idle host pays nothing."""
+    """An idle host has no overhead."""
     watch = UsageWatch(table)
     watch.look(1.0)
     assert (table.looks, watch.after_reading()) == (0, {})
 
 
 def test_a_session_is_followed_from_its_start_to_its_end(table) -> None:
-    """A restart is another one; what ended hands its CPU time over."""
+    """A restart is a new session; an ended session hands over its CPU time."""
     watch = UsageWatch(table)
     watch.follow(told(InstanceState.RUNNING, 40))
     watch.follow(told(InstanceState.BACKOFF, cpu_time=2.0))
@@ -74,7 +74,7 @@ def test_a_session_is_followed_from_its_start_to_its_end(table) -> None:
 
 
 def test_one_that_was_never_seen_running_counts_too(table) -> None:
-    """It ended before anybody looked."""
+    """The process ended before the first look."""
     watch = UsageWatch(table)
     watch.follow(told(InstanceState.STARTING))
     watch.follow(told(InstanceState.FAILED, 40, cpu_time=0.1))
@@ -82,6 +82,6 @@ def test_one_that_was_never_seen_running_counts_too(table) -> None:
 
 
 def test_one_that_ended_before_this_slave_started_does_not_count(table) -> None:
-    """Its hours of CPU time are no load of the moment in which its end is found on record."""
+    """The hours of CPU time of a recorded end are no present load."""
     UsageWatch(table).follow(told(InstanceState.EXITED, cpu_time=3600.0))
     assert table.removed == []

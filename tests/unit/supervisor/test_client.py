@@ -1,4 +1,4 @@
-"""The slave's side of its supervisor, without one: a socket pair."""
+"""The slave's side of the supervisor connection, tested with a socket pair."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 
 
 def test_a_supervisor_that_ended_beside_an_order_has_ended(tmp_path: Path) -> None:
-    """An order that it did not read any more breaks the connection: that is no crash."""
+    """An unread order breaks the connection; that counts as an end, not as a crash."""
     ours, its = socket.socketpair()
     with SupervisorClient(ours, tmp_path) as client:
         client.heard(1.0, 1.0)

@@ -1,6 +1,6 @@
-"""Fences of the supervisor's state machine: when an instance ends by itself, how, and what is said.
+"""Fences of the supervisor's state machine: time, stop steps and status of a fenced instance.
 
-What holds in every order of events is tested in `test_supervision`.
+`test_supervision` tests the guarantees for every order of events.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ ALWAYS = sv.RestartRule("always", delay=1.0)
 
 
 def ordered(fence=FENCE, restart=ALWAYS, stop=GRACES, heard=None):
-    """A state machine that was told to start an instance, at time 0."""
+    """Return a state machine with a start order at time 0, and its instance."""
     core = sv.Supervision()
     core.handle(sv.StartOrdered(ONE, restart, stop, fence, heard), 0.0)
     return core, core.instances[ONE]
 
 
 def running(**options):
-    """The same, and it runs."""
+    """Return a state machine and its instance, which runs."""
     core, instance = ordered(**options)
     core.handle(sv.Spawned(ONE, 100), 0.0)
     return core, instance
 
 
 def signals(core, until):
-    """Which signals it gets when nothing else happens, and when."""
+    """Return the signals sent until this time without other events, with their times."""
     sent = []
     while (due := core.deadline()) is not None and due <= until:
         commands = core.handle(sv.TimePassed(), due)
@@ -45,7 +45,7 @@ def signals(core, until):
 
 
 def test_it_is_stopped_when_nobody_says_that_it_is_heard():
-    """By the steps of its stop, as much shorter as its fence wants; it is fenced, and says why."""
+    """The stop steps of its spec apply, shortened to the fence's grace; its status says why."""
     core, instance = running()
     assert signals(core, 13.5) == [(10.0, "SIGINT"), (11.0, "SIGTERM"), (13.0, "SIGKILL")]
     why = "fenced: no confirmed contact with the master for 10 s; "
@@ -57,7 +57,7 @@ def test_it_is_stopped_when_nobody_says_that_it_is_heard():
 
 
 def test_its_own_graces_stay_where_they_are_short_enough():
-    """What would end by itself in good order is not hurried."""
+    """Graces that are short enough allow the instance to end without haste."""
     core, _ = running(stop=sv.StopRule(0.5, 0.5))
     assert signals(core, 11.5) == [(10.0, "SIGINT"), (10.5, "SIGTERM"), (11.0, "SIGKILL")]
 
@@ -68,25 +68,25 @@ def test_without_a_grace_it_is_killed():
 
 
 def test_a_late_look_at_the_clock_kills():
-    """The supervisor itself was stopped: what should be dead by now gets no grace."""
+    """The supervisor itself was stopped: an instance past its deadline gets no grace."""
     core, _ = running()
     commands = core.handle(sv.TimePassed(), 20.0)
     assert [c.number for c in commands if isinstance(c, sv.Signal)] == [signal.SIGKILL]
 
 
 def test_every_word_puts_it_off_from_when_it_was_true():
-    """Not from when it came; and an older one changes nothing."""
+    """The deadline counts from the contact, not from the message; older ones have no effect."""
     core, _ = running()
     core.handle(sv.Heard(8.0), 9.5)
     assert core.deadline() == 18.0
     core.handle(sv.Heard(7.0), 9.6)
     assert core.deadline() == 18.0
-    core.handle(sv.Heard(99.0), 10.0)  # nobody knows that yet
+    core.handle(sv.Heard(99.0), 10.0)  # no master contact is possible at this future time
     assert core.deadline() == 20.0
 
 
 def test_the_clock_begins_with_what_the_start_knows():
-    """The master heard the host 4 s before; a start that says nothing of it counts itself."""
+    """The master had contact 4 s before; a start without this time counts from itself."""
     core, _ = running(heard=-4.0)
     assert core.deadline() == 6.0
     core, _ = running()
@@ -94,7 +94,7 @@ def test_the_clock_begins_with_what_the_start_knows():
 
 
 def test_a_word_that_comes_after_it_has_begun_is_too_late():
-    """Its successor may count on its end."""
+    """Its successor may rely on its end."""
     core, instance = running()
     core.handle(sv.TimePassed(), 10.0)
     core.handle(sv.Heard(10.5), 10.5)
@@ -103,13 +103,13 @@ def test_a_word_that_comes_after_it_has_begun_is_too_late():
 
 
 def test_one_without_a_fence_is_left_alone():
-    """A robot's driver goes on."""
+    """A robot's driver, for example, keeps running."""
     core, _ = running(fence=None)
     assert core.deadline() is None
 
 
 def test_a_restart_by_policy_does_not_put_it_off():
-    """The clock is the host's, not the run's."""
+    """The fence's deadline belongs to the host, not to the run."""
     core, instance = running()
     core.handle(sv.Exited(ONE, 1), 5.0)
     core.handle(sv.TimePassed(), 6.0)
@@ -124,7 +124,7 @@ def test_a_restart_by_policy_does_not_put_it_off():
 
 
 def test_a_start_that_waits_its_turn_is_given_up():
-    """And one in hand is stopped as soon as it runs."""
+    """A start in progress is stopped as soon as it runs."""
     core, instance = ordered()
     assert sv.Unspawn(ONE) in core.handle(sv.TimePassed(), 10.0)
     core.handle(sv.SpawnFailed(ONE, ""), 10.0)
@@ -138,7 +138,7 @@ def test_a_start_that_waits_its_turn_is_given_up():
 
 
 def test_a_stop_under_way_becomes_as_short():
-    """It ends as was meant: the user wanted its end before its fence did."""
+    """The user ordered the stop before the fence, so the status stays "stopped"."""
     core, instance = running(stop=sv.StopRule(30.0, 30.0))
     core.handle(sv.StopOrdered(ONE), 9.0)
     assert signals(core, 13.0) == [(11.5, "SIGTERM"), (13.0, "SIGKILL")]
@@ -160,7 +160,7 @@ def test_a_restart_under_way_becomes_an_end():
     [(0, "on-failure", sv.EXITED), (1, "never", sv.FAILED), (1, "always", sv.FENCED)],
 )
 def test_what_had_ended_by_itself_keeps_its_end(code, when, phase):
-    """Its leader is gone, others are being stopped: a job that is done is done; no restart."""
+    """A job that completed before the fence has completed; it is not restarted."""
     core, instance = running(restart=sv.RestartRule(when))
     core.handle(sv.Exited(ONE, code, leftovers=True), 9.5)
     core.handle(sv.TimePassed(), 10.0)
@@ -168,11 +168,11 @@ def test_what_had_ended_by_itself_keeps_its_end(code, when, phase):
     assert instance.phase == phase
 
 
-# --- the order ------------------------------------------------------------------------------------
+# --- fence order ----------------------------------------------------------------------------------
 
 
 def test_the_order_to_fence_kills_what_runs():
-    """Whether it has a fence of its own or not; and it is not restarted."""
+    """The order holds with and without an own fence, and prevents a restart."""
     core, instance = running(fence=None)
     assert core.handle(sv.FenceOrdered(ONE), 1.0)[-1] == sv.Signal(ONE, signal.SIGKILL)
     core.handle(sv.Exited(ONE, signal=9), 1.1)
@@ -181,7 +181,7 @@ def test_the_order_to_fence_kills_what_runs():
 
 
 def test_the_order_to_fence_kills_what_is_being_stopped():
-    """Once: after SIGKILL there is nothing harder."""
+    """One SIGKILL is enough."""
     core, instance = running()
     core.handle(sv.StopOrdered(ONE), 1.0)
     assert core.handle(sv.FenceOrdered(ONE), 1.5)[-1] == sv.Signal(ONE, signal.SIGKILL)
@@ -201,7 +201,7 @@ def test_the_order_to_fence_ends_what_waits():
 
 
 def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
-    """A start that comes late is refused."""
+    """A late start is refused."""
     core = sv.Supervision()
     core.handle(sv.FenceOrdered(ONE), 0.0)
     core.handle(sv.StartOrdered(ONE, ALWAYS, GRACES), 1.0)
@@ -209,7 +209,7 @@ def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
 
 
 def test_what_is_fenced_on_its_way_out_is_not_restarted_on_order():
-    """It had failed, and its policy was to decide: there is a successor now."""
+    """The instance had failed, and its policy was to decide; now it has a successor."""
     core, instance = running(restart=sv.RestartRule("always"))
     core.handle(sv.FailOrdered(ONE, instance.pid, "hung", False), 1.0)
     core.handle(sv.FenceOrdered(ONE), 1.5)

@@ -1,4 +1,4 @@
-"""When the master last heard the host, as it is kept for the next supervisor."""
+"""Last contact of the master with the host, stored for the next supervisor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rosrm.supervisor import lease_file
 
 
 def test_the_newest_is_read_back(tmp_path):
-    """However the times came in."""
+    """The order in which the times arrived makes no difference."""
     kept = lease_file.LastHeard(str(tmp_path))
     for at, alive in ((5.0, 1.0), (123456789.25, 3.0), (7.0, 2.0)):
         kept.keep(Heard(at, alive))
@@ -18,7 +18,7 @@ def test_the_newest_is_read_back(tmp_path):
 
 
 def test_what_another_boot_heard_does_not_count(tmp_path, monkeypatch):
-    """Its clock was another."""
+    """The clock of another boot does not compare."""
     lease_file.LastHeard(str(tmp_path)).keep(Heard(5.0))
     monkeypatch.setattr(lease_file.procfs, "boot_id", lambda: "another")
     assert lease_file.read(str(tmp_path)) == Heard(0.0)
@@ -26,14 +26,14 @@ def test_what_another_boot_heard_does_not_count(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("content", [None, b"", b"torn", b"\xff\xff \xff", b"boot not-a-number\n"])
 def test_what_cannot_be_read_does_not_count(tmp_path, content):
-    """Then each instance's own start does, and it ends the sooner."""
+    """Each instance's own start counts then, which fences it earlier."""
     if content is not None:
         (tmp_path / "heard").write_bytes(content)
     assert lease_file.read(str(tmp_path)) == Heard(0.0)
 
 
 def test_what_cannot_be_written_is_said_once(tmp_path, capsys):
-    """And fences go on by what this supervisor knows."""
+    """Fences then rely on the contacts known to this supervisor."""
     (tmp_path / "heard").mkdir()
     kept = lease_file.LastHeard(str(tmp_path))
     kept.keep(Heard(5.0))

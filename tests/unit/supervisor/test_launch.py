@@ -1,4 +1,4 @@
-"""From an assignment to a launch order, and what the process's environment holds."""
+"""Launch orders from assignments, and environments of processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def assignment(**fields) -> Assignment:
 
 
 def shadow() -> Assignment:
-    """A destination of a handoff: under an alias, though the node is known by its own name."""
+    """Return a handoff's destination, whose alias differs from its node's own name."""
     spec = ProcessSpec(
         name="talker", namespace="robot", command=("node",), ros=True, parameters={"rate": 10},
         restart=RestartPolicy("always"),
@@ -57,7 +57,7 @@ def order(tmp_path, environment=None, **fields):
 
 @pytest.fixture
 def prefix(tmp_path):
-    """An ament prefix with one package that has two executables and a file that is none."""
+    """Create an ament prefix with a package that has two executables and another file."""
     prefix = tmp_path / "install"
     index = prefix / "share" / "ament_index" / "resource_index" / "packages"
     index.mkdir(parents=True)
@@ -74,7 +74,7 @@ def prefix(tmp_path):
 
 
 def test_a_plain_command_gets_nothing_added(tmp_path):
-    """What is no ROS node is run as it was written."""
+    """A command that is not a ROS node runs as written."""
     assert order(tmp_path, command=("sleep", "3"), arguments=("x",)).argv == ("sleep", "3", "x")
 
 
@@ -97,7 +97,7 @@ def test_a_module_is_run_by_the_given_python(tmp_path):
 
 
 def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
-    """The user's arguments go first, the ROS arguments behind them."""
+    """The user's arguments come first, then the ROS arguments."""
     argv = order(
         tmp_path,
         command=("node",),
@@ -113,7 +113,7 @@ def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
 
 
 def test_an_alias_names_the_node(tmp_path):
-    """In a handoff the node's name is the assignment's, not the spec's."""
+    """In a handoff the assignment has the node's name, not the spec."""
     made = launch_order(
         shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
     )
@@ -123,7 +123,7 @@ def test_an_alias_names_the_node(tmp_path):
 
 
 def test_a_shadow_is_not_restarted(tmp_path):
-    """Its end is final, whatever its spec says; what is no shadow follows its spec."""
+    """A shadow's end is final, whatever its spec says; other instances follow their specs."""
     made = launch_order(
         shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
     )
@@ -145,12 +145,12 @@ def test_a_shadow_is_not_restarted(tmp_path):
     ],
 )
 def test_ros_arguments_of_the_user_are_closed_first(arguments, joined):
-    """What the user left open does not swallow ours."""
+    """Unclosed ROS arguments of the user do not swallow those of rosrm."""
     assert join_arguments(arguments, ["--ros-args", "x"]) == joined
 
 
 def test_policies_and_directory_are_carried_over(tmp_path):
-    """The order holds what the spec says about restarts, stops and the directory."""
+    """The order has the spec's restart and stop policies and its directory."""
     made = order(
         tmp_path,
         command=("x",),
@@ -167,7 +167,7 @@ def test_policies_and_directory_are_carried_over(tmp_path):
 
 
 def test_an_executable_is_found_through_the_ament_index(tmp_path, prefix):
-    """PREFIX/lib/PACKAGE/EXECUTABLE, given its ROS arguments."""
+    """The result is PREFIX/lib/PACKAGE/EXECUTABLE with its ROS arguments."""
     environment = {"AMENT_PREFIX_PATH": f"/opt/none:{prefix}"}
     made = order(tmp_path, environment, package="demo_nodes", executable="talker")
     assert made.argv[:2] == (str(prefix / "lib" / "demo_nodes" / "talker"), "--ros-args")
@@ -197,7 +197,7 @@ def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
     ],
 )
 def test_what_is_missing_is_named(tmp_path, prefix, package, executable, said):
-    """What was looked for, where, and what is there with a similar name."""
+    """The error has the missing name, the places searched, and similar names found there."""
     environment = {"AMENT_PREFIX_PATH": str(prefix)}
     with pytest.raises(LaunchError) as caught:
         order(tmp_path, environment, package=package, executable=executable)
@@ -206,7 +206,7 @@ def test_what_is_missing_is_named(tmp_path, prefix, package, executable, said):
 
 
 def test_a_few_packages_are_listed_and_many_counted(prefix):
-    """The first ones by alphabet help nobody; their number says that the path is not empty."""
+    """The first names of many would not help; their number shows that the path is not empty."""
     with pytest.raises(LaunchError, match="'quux' was not found; there: demo_nodes"):
         find_executable("quux", "x", [prefix])
     index = prefix / "share" / "ament_index" / "resource_index" / "packages"
@@ -220,7 +220,7 @@ def test_a_few_packages_are_listed_and_many_counted(prefix):
 
 
 def test_parameters_go_to_a_file_beside_the_log(tmp_path):
-    """Whatever the node's name is, the file is for it."""
+    """The file applies to any node name."""
     made = order(tmp_path, command=("node",), ros=True, parameters={"rate": 10})
     path = tmp_path / "logs" / "talker.7.parameters.yaml"
     assert made.argv[-2:] == ("--params-file", str(path))
@@ -251,7 +251,7 @@ PARAMETERS = st.recursive(
 
 
 def typed(value):
-    """With types made visible: 1 == 1.0 == True."""
+    """Make types visible, because 1 == 1.0 == True."""
     if isinstance(value, dict):
         return {key: typed(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -267,7 +267,7 @@ def test_parameters_survive_with_their_types(parameters):
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2's numbers, as ROS 2 reads them: 1e-05 and 1e+22 are fractions."""
+    """Loader with YAML 1.2's numbers, as ROS 2 reads them: 1e-05 and 1e+22 are fractions."""
 
 
 _Loader.add_implicit_resolver(
@@ -287,7 +287,7 @@ def test_whole_numbers_among_fractions_become_fractions():
 
 
 def test_what_is_no_number_is_written_as_yaml_does():
-    """NaN and the infinities."""
+    """NaN and the infinities are written so."""
     text = parameters_text({"a": math.nan, "b": -math.inf})
     assert ".nan" in text
     assert "-.inf" in text
@@ -295,7 +295,7 @@ def test_what_is_no_number_is_written_as_yaml_does():
 
 @pytest.mark.parametrize("value", [None, [], [1, "a"], [[1]], 2**63, [True, 1]])
 def test_what_no_parameter_can_hold_is_refused(value):
-    """By name, where it is nested too."""
+    """The refusal names the parameter, nested ones too."""
     with pytest.raises(LaunchError, match=r"'outer\.inner'"):
         parameters_text({"outer": {"inner": value}})
 
@@ -314,7 +314,7 @@ def test_the_bootstrappers_variables_are_removed():
 
 
 def test_nothing_is_left_of_an_empty_library_path():
-    """Where nothing was there before, the variable goes altogether."""
+    """A variable without other content is removed altogether."""
     polluted = {
         "LD_LIBRARY_PATH": f"{sys.prefix}/lib:{SITE}/ros_rcl.libs",
         "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
@@ -329,7 +329,7 @@ def test_without_the_bootstrapper_nothing_is_touched():
 
 
 def test_the_spec_has_the_last_word():
-    """A process can find out what it is, and its own variables win."""
+    """A process has variables with its identity, and the spec's own variables take precedence."""
     made = process_environment(
         assignment(command=("x",), environment={"ROS_DOMAIN_ID": "9", "PYTHONUNBUFFERED": ""}),
         {"ROS_DOMAIN_ID": "5", "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"},
@@ -349,7 +349,7 @@ def test_the_spec_has_the_last_word():
 
 
 def test_a_node_is_told_by_which_name_it_is_known():
-    """Its alias is not in it; and it is told that it starts as a shadow."""
+    """The variables have the node's own name instead of the alias, and mark a shadow."""
     made = process_environment(shadow(), {}, HERE)
     assert made["ROSRM_NODE"] == "/robot/talker"
     assert made["ROSRM_SHADOW"] == "1"
@@ -359,7 +359,7 @@ def test_a_node_is_told_by_which_name_it_is_known():
 
 
 def test_who_the_slave_is_itself_is_not_handed_on():
-    """A slave may be started by rosrm, even as a shadow: its processes are none for that."""
+    """A slave may itself run under rosrm, even as a shadow; its processes do not inherit that."""
     slave = process_environment(shadow(), {}, HERE)
     made = process_environment(assignment(command=("x",)), slave, HERE)
     assert "ROSRM_SHADOW" not in made

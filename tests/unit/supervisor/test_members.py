@@ -1,4 +1,4 @@
-"""Environments of real processes in /proc, also in the middle of an execve."""
+"""Environments of real processes in /proc, including those in the middle of an execve."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ STARTS = 20
 
 @pytest.fixture
 def one_processor():
-    """On one processor the parent runs again before the child's execve has ended."""
+    """Pin this process to one processor.
+
+    The parent then runs again before the child's execve has ended.
+    """
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     yield

@@ -1,4 +1,4 @@
-"""What travels to the supervisor and back: it survives the way, and nothing else is accepted."""
+"""Supervisor protocol: round trip of orders, and refusal of anything else."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rosrm.supervisor.logs import LogLimits
 
 SECONDS = st.floats(0, 1e6)
 KEYS = st.tuples(st.text(), st.integers(0, 2**53))
-# What Linux gives as a word: any bytes, those that are no UTF-8 as surrogates.
+# Arguments as Linux passes them: any bytes; invalid UTF-8 becomes surrogates.
 WORDS = st.binary().map(lambda data: data.decode("utf-8", "surrogateescape"))
 RULES = st.builds(
     RestartRule,
@@ -67,7 +67,7 @@ ORDERS = st.one_of(
 
 @given(ORDERS)
 def test_orders_survive_the_way(order):
-    """Any order reads back as what it was, of the same type, from one line."""
+    """Each order reads back from one line as an equal object of the same type."""
     line = messages.encode_order(order)
     assert line.count(b"\n") == 1
     read = messages.decode_order(line)
@@ -77,7 +77,7 @@ def test_orders_survive_the_way(order):
 
 @given(st.lists(st.binary().map(lambda data: data.replace(b"\n", b"")), max_size=5), st.data())
 def test_lines_are_cut_wherever_the_stream_is(lines, data):
-    """However the bytes come in, the lines are the same."""
+    """The lines do not depend on the sizes of the received parts."""
     stream = b"".join(line + b"\n" for line in lines)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
     cutter, found = ls.Lines(), []
@@ -103,7 +103,7 @@ def test_lines_are_cut_wherever_the_stream_is(lines, data):
     ],
 )
 def test_what_is_not_understood_is_refused(line, said):
-    """Never guessed at: the answer says what was wrong."""
+    """The refusal names the error; nothing is guessed."""
     with pytest.raises(ls.ProtocolError, match=said):
         messages.decode_order(line)
 

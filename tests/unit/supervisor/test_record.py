@@ -1,4 +1,4 @@
-"""The durable record: what it keeps, and what it does while the disk is full."""
+"""Durable record of the supervisor: content, compaction, and a full disk."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def record(tmp_path, core):
 
 
 def test_an_instance_comes_back_as_it_was(tmp_path, core, record):
-    """Every field of its state, its launch, its environment and its leader's birth."""
+    """State, launch, environment and start time of its leader are restored in every field."""
     recorded = rc.read(str(tmp_path))
     back, instance = recorded.instances[TALKER], core.instances[TALKER]
     assert {name: getattr(back, name) for name in sv.Instance.__slots__} == {
@@ -46,7 +46,7 @@ def test_an_instance_comes_back_as_it_was(tmp_path, core, record):
 
 
 def test_an_amendment_counts_from_then_on(tmp_path, core, record):
-    """A shadow that was confirmed: its policy and its environment are others, also compacted."""
+    """A confirmed shadow has another policy and environment, also after compaction."""
     amend = Amend(sv.AmendOrdered(TALKER, sv.RestartRule("on-failure")), {"ROSRM_SHADOW": None})
     amended = LAUNCH.amended(amend)
     core.handle(amend.order, 1.0)
@@ -63,7 +63,7 @@ def test_an_amendment_counts_from_then_on(tmp_path, core, record):
 
 
 def test_an_environment_that_is_known_is_kept(tmp_path, core, record):
-    """A client sends it once: launches that come after the record was compacted refer to it."""
+    """A client sends it once; launches after a compaction refer to it."""
     record.rewrite(core, {}, {"base": {"A": "1"}}, lambda key: 55)
     record.launch(LAUNCH)
     record.flush()
@@ -71,7 +71,7 @@ def test_an_environment_that_is_known_is_kept(tmp_path, core, record):
 
 
 def test_a_launch_without_its_environment_is_compacted(tmp_path, core, record):
-    """The line that held it was damaged."""
+    """The line that held the environment was damaged."""
     record.rewrite(core, {TALKER: LAUNCH}, {}, lambda key: 55)
     recorded = rc.read(str(tmp_path))
     assert recorded.launches == {TALKER: LAUNCH}
@@ -112,7 +112,7 @@ def test_the_last_line_counts(tmp_path, core, record):
 
 
 def test_the_forgotten_are_gone_but_stay_dead(tmp_path, record):
-    """A forgotten instance leaves its number behind, through a compaction too."""
+    """Only the number of a forgotten instance is kept, through a compaction, too."""
     record.dead(TALKER, 7)
     record.flush()
     recorded = rc.read(str(tmp_path))
@@ -125,13 +125,13 @@ def test_the_forgotten_are_gone_but_stay_dead(tmp_path, record):
 
 
 def test_another_boot_is_noticed(tmp_path, record, monkeypatch):
-    """After a restart of the machine none of the pids means anything."""
+    """After a reboot of the machine the recorded pids are meaningless."""
     monkeypatch.setattr(rc.procfs, "boot_id", lambda: "another")
     assert not rc.read(str(tmp_path)).same_boot
 
 
 def test_no_record_is_an_empty_one(tmp_path):
-    """The first start of a host."""
+    """A host has no record before its first start."""
     recorded = rc.read(str(tmp_path))
     assert not recorded.instances
     assert not recorded.notes
@@ -142,7 +142,7 @@ def full(*_):
 
 
 def test_a_full_disk_delays_and_says_so(tmp_path, core, record, monkeypatch):
-    """What cannot be written waits, and is written when there is room again."""
+    """Unwritten lines wait, and are written once there is room again."""
     core.handle(sv.Exited(TALKER, 3), 2.0)
     with monkeypatch.context() as patched:
         patched.setattr(os, "write", full)
@@ -169,7 +169,7 @@ def test_a_write_in_part_is_finished_later(tmp_path, core, record, monkeypatch):
 
 
 def test_a_compaction_without_room_keeps_the_old_record(tmp_path, core, record, monkeypatch):
-    """The old file stays, and what was waiting still gets into it."""
+    """The old file stays, and pending lines are still appended to it."""
     core.handle(sv.Exited(TALKER, 3), 2.0)
     record.state(core.instances[TALKER], 0)
     with monkeypatch.context() as patched:
@@ -181,7 +181,7 @@ def test_a_compaction_without_room_keeps_the_old_record(tmp_path, core, record, 
 
 
 def test_it_is_compacted_when_it_has_grown(tmp_path, core, record):
-    """Thousands of changes of one instance leave one line of it."""
+    """Thousands of changes of one instance leave one line."""
     while not record.is_large():
         record.state(core.instances[TALKER], 55)
         record.flush()

@@ -1,4 +1,4 @@
-"""The supervisor's state machine: its table row by row, and what holds in every order of events."""
+"""State machine of the supervisor: each row of its table, and invariants under random events."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ TALKER = ("talker", 7)
 
 
 def kinds(commands):
-    """The commands by their type alone: named tuples of different types may be equal."""
+    """Return the types of the commands, because named tuples of different types may be equal."""
     return [type(command).__name__ for command in commands]
 
 
 def started(**policies):
-    """A state machine with one running instance, started at time 0."""
+    """Return a state machine with one running instance, started at time 0."""
     core = sv.Supervision()
     core.handle(
         sv.StartOrdered(
@@ -50,7 +50,7 @@ def test_policies_are_those_of_the_model():
 
 
 def test_status_is_that_of_the_model():
-    """What is told has the fields of the model's status, and its words for the states."""
+    """Statuses have the fields and the state names of the model."""
     assert messages.Status._fields == tuple(
         field.name for field in dataclasses.fields(values.InstanceStatus)
     )
@@ -64,7 +64,7 @@ def test_status_is_that_of_the_model():
 def test_rules_stand_in_the_table_of_the_module():
     """Each row of the docstring is a transition that runs, and the reverse; no event is left out.
 
-    The phase "-" has the orders that may concern an instance that is not known.
+    The phase "-" has the orders that may concern an unknown instance.
     """
     table = re.findall(r"^    (\w+|-|)  +(\w+)  +\S", sv.__doc__, re.MULTILINE)
     documented, phase = [], ""
@@ -79,14 +79,14 @@ def test_rules_stand_in_the_table_of_the_module():
 
 
 def test_start_is_recorded_before_it_is_tried():
-    """A start is told (so recorded) first and spawned second."""
+    """The start is reported, and so recorded, before the spawn."""
     core = sv.Supervision()
     commands = core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 0.0)
     assert kinds(commands) == ["Tell", "Spawn"]
 
 
 def test_repeated_start_only_tells_again():
-    """DDS repeats: a start of a known instance spawns nothing."""
+    """DDS repeats messages: a start of a known instance spawns nothing."""
     core, _ = started()
     commands = core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 1.0)
     assert kinds(commands) == ["Tell"]
@@ -102,7 +102,7 @@ def test_late_start_of_a_stopped_stranger_is_refused():
 
 @pytest.mark.parametrize(("number", "starts"), [(6, False), (7, False), (8, True)])
 def test_forgotten_numbers_never_start(number, starts):
-    """Once an instance is forgotten, it and the older ones of its process are refused."""
+    """A forgotten instance and the older ones of its process are refused."""
     core, _ = started()
     core.handle(sv.Exited(TALKER), 1.0)
     core.handle(sv.Forgotten(TALKER), 2.0)
@@ -130,14 +130,14 @@ def test_what_runs_is_not_forgotten():
     ],
 )
 def test_restart_policy(when, code, phase):
-    """What follows an exit is the policy's."""
+    """The restart policy decides the phase after an exit."""
     core, instance = started(restart=sv.RestartRule(when=when))
     core.handle(sv.Exited(TALKER, code), 1.0)
     assert instance.phase == phase
 
 
 def test_backoff_grows_to_its_bound_and_restarts_run_out():
-    """1, 2, 4 s and so on up to the bound; after the last attempt it has failed, and says why."""
+    """Waits are 1, 2, 4 s and so on up to the bound; the status of the failure has its reason."""
     policy = sv.RestartRule("on-failure", 1.0, 5.0, 2.0, attempts=5, window=300.0)
     core, instance = started(restart=policy)
     now, waits = 0.0, []
@@ -155,7 +155,7 @@ def test_backoff_grows_to_its_bound_and_restarts_run_out():
 
 
 def test_a_long_run_starts_the_backoff_afresh():
-    """Restarts that lie further back than the window do not count."""
+    """Restarts older than the window do not count."""
     core, instance = started(restart=sv.RestartRule("always", 1.0, 30.0, 2.0, 1, window=10.0))
     core.handle(sv.Exited(TALKER, 1), 0.0)
     core.handle(sv.TimePassed(), 1.0)
@@ -172,7 +172,7 @@ def test_backoff_is_bounded(done, delay, most, factor):
 
 
 def crashed(count, rule):
-    """So many instances that ended at once."""
+    """Return this many instances that ended at once."""
     core = sv.Supervision()
     keys = [(f"p{number}", number) for number in range(count)]
     for key in keys:
@@ -193,7 +193,7 @@ def test_what_crashed_together_does_not_start_together():
 
 
 def test_at_most_eight_restarts_begin_within_a_second():
-    """All of them begin, eight after eight."""
+    """All restarts begin, eight per second."""
     core = crashed(30, sv.RestartRule("on-failure", delay=0.0))
     begun = []
     while core.deadline() is not None:
@@ -205,7 +205,7 @@ def test_at_most_eight_restarts_begin_within_a_second():
 
 
 def test_stop_escalates_and_says_each_step():
-    """SIGINT at once, SIGTERM and SIGKILL after their graces; the last message holds all three."""
+    """SIGTERM and SIGKILL follow SIGINT after their graces; the last message has all three."""
     core, instance = started(stop=sv.StopRule(2.0, 3.0))
     sent = []
     commands = core.handle(sv.StopOrdered(TALKER), 10.0)
@@ -219,7 +219,7 @@ def test_stop_escalates_and_says_each_step():
 
 
 def test_stopped_process_is_not_restarted():
-    """The user's stop is stronger than `always`."""
+    """The user's stop overrides `always`."""
     core, instance = started(restart=sv.RestartRule("always"))
     core.handle(sv.StopOrdered(TALKER), 1.0)
     core.handle(sv.Exited(TALKER, signal=signal.SIGINT), 2.0)
@@ -235,7 +235,7 @@ def test_forced_restart_stops_then_starts():
 
 
 def test_stop_during_a_forced_restart_wins():
-    """Who was to be started again ends, if a stop comes before that."""
+    """The instance ends instead of starting again."""
     core, instance = started()
     core.handle(sv.RestartOrdered(TALKER), 1.0)
     core.handle(sv.StopOrdered(TALKER), 1.5)
@@ -244,7 +244,7 @@ def test_stop_during_a_forced_restart_wins():
 
 
 def test_a_restart_while_its_own_end_is_in_hand_is_carried_out():
-    """Its leader has ended by itself, what it left is being stopped: then it starts again."""
+    """The leader has ended, and leftovers are being stopped: then the instance restarts."""
     core, instance = started()
     core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
     assert kinds(core.handle(sv.RestartOrdered(TALKER), 1.1)) == ["Tell"]
@@ -261,7 +261,7 @@ ON_FAILURE = sv.RestartRule("on-failure")
     ("when", "phase"), [("never", sv.FAILED), ("on-failure", sv.BACKOFF), ("always", sv.BACKOFF)]
 )
 def test_an_unhealthy_run_has_failed_however_it_ends(when, phase):
-    """It is asked to end and exits with 0: its policy goes by the reason, and says it."""
+    """The instance exits with 0 on the stop signal, but its policy uses the health failure."""
     core, instance = started(restart=sv.RestartRule(when))
     commands = core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
     assert commands[-1] == sv.Signal(TALKER, signal.SIGINT)
@@ -272,7 +272,7 @@ def test_an_unhealthy_run_has_failed_however_it_ends(when, phase):
 
 
 def test_an_unhealthy_run_that_does_not_end_is_killed():
-    """The steps of the stop rule, as for every other stop."""
+    """The steps of the stop rule apply, as for every other stop."""
     core, _ = started()
     core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
     sent = []
@@ -282,7 +282,7 @@ def test_an_unhealthy_run_that_does_not_end_is_killed():
 
 
 def test_what_is_stopped_is_killed_at_once():
-    """It would hear no SIGINT; behind the SIGKILL nothing milder follows."""
+    """A stopped process does not handle SIGINT; after SIGKILL no milder signal follows."""
     core, instance = started()
     commands = core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: stopped", kill=True), 1.0)
     assert commands[-1] == sv.Signal(TALKER, signal.SIGKILL)
@@ -292,7 +292,7 @@ def test_what_is_stopped_is_killed_at_once():
 
 
 def test_a_run_is_not_failed_for_the_one_before():
-    """The order names a pid; what runs now is another run. Its own end is by its own exit."""
+    """The order names a pid of a former run, so it does not affect the present one."""
     core, instance = started(restart=ON_FAILURE)
     assert kinds(core.handle(sv.FailOrdered(TALKER, 99, "late"), 1.0)) == ["Tell"]
     assert instance.phase == sv.RUNNING
@@ -305,7 +305,7 @@ def test_a_run_is_not_failed_for_the_one_before():
 
 
 def test_a_stop_of_what_is_failing_wins():
-    """The user's stop is stronger than its restart policy."""
+    """The user's stop overrides the restart policy."""
     core, instance = started(restart=sv.RestartRule("always"))
     core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
     core.handle(sv.StopOrdered(TALKER), 1.5)
@@ -314,7 +314,7 @@ def test_a_stop_of_what_is_failing_wins():
 
 
 def test_another_policy_counts_at_the_next_end():
-    """A source whose policy is suspended ends for good; a shadow that is none any more does not."""
+    """A source with a suspended policy ends for good; a former shadow restarts."""
     core, instance = started(restart=ON_FAILURE)
     assert kinds(core.handle(sv.AmendOrdered(TALKER, NEVER), 1.0)) == ["Tell"]
     core.handle(sv.Exited(TALKER, signal=9), 2.0)
@@ -326,7 +326,7 @@ def test_another_policy_counts_at_the_next_end():
 
 
 def test_a_repeated_policy_only_tells_again():
-    """DDS repeats; so does a master that was restarted."""
+    """DDS repeats messages, and so does a restarted master."""
     core, instance = started()
     core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 1.0)
     assert kinds(core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
@@ -342,7 +342,7 @@ def test_a_repeated_policy_only_tells_again():
     ],
 )
 def test_a_policy_that_allows_no_restart_ends_the_wait_for_one(restart, phase):
-    """One restart was made and another one is due: it is given up, or stays due when it was."""
+    """One restart was made and another one is due: the new policy may cancel it."""
     core, instance = started(restart=ON_FAILURE)
     core.handle(sv.Exited(TALKER, 1), 0.0)
     core.handle(sv.TimePassed(), 1.0)
@@ -358,7 +358,7 @@ def test_a_policy_that_allows_no_restart_ends_the_wait_for_one(restart, phase):
 
 
 def test_a_policy_for_what_is_being_stopped_counts_afterwards():
-    """Its leader ended by itself and left others: whether it starts again is decided at the end."""
+    """The leader ended and left other processes: the policy decides once they have ended."""
     core, instance = started(restart=ON_FAILURE)
     core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
     core.handle(sv.AmendOrdered(TALKER, NEVER), 1.5)
@@ -367,7 +367,7 @@ def test_a_policy_for_what_is_being_stopped_counts_afterwards():
 
 
 def test_a_policy_for_what_has_ended_tells_its_end():
-    """And wakes nothing up; nor does one for what was never heard of."""
+    """The order starts nothing; for an unknown instance it has no effect either."""
     core, instance = started()
     core.handle(sv.Exited(TALKER, 1), 1.0)
     assert kinds(core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
@@ -377,7 +377,7 @@ def test_a_policy_for_what_has_ended_tells_its_end():
 
 
 def test_leftovers_are_stopped_before_it_counts_as_ended():
-    """Its leader exits by itself and leaves others: they are stopped, then its exit code counts."""
+    """The leader exits and leaves other processes: they are stopped, then its exit code counts."""
     core, instance = started()
     commands = core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
     assert kinds(commands) == ["Tell", "Signal"]
@@ -387,7 +387,7 @@ def test_leftovers_are_stopped_before_it_counts_as_ended():
 
 
 def test_leftovers_of_a_killed_leader_are_killed_at_once():
-    """Behind SIGKILL there is no milder step: what the leader leaves gets it as well."""
+    """The leftovers get SIGKILL as well, because it is the last step."""
     core, _ = started(stop=sv.StopRule(0.0, 0.0))
     core.handle(sv.StopOrdered(TALKER), 0.0)
     core.handle(sv.TimePassed(), 0.0)
@@ -397,7 +397,7 @@ def test_leftovers_of_a_killed_leader_are_killed_at_once():
 
 
 def test_final_spawn_failure_is_not_repeated():
-    """A missing executable does not come by waiting: another host may have it."""
+    """Waiting does not provide a missing executable, but another host may have it."""
     core = sv.Supervision()
     core.handle(sv.StartOrdered(TALKER, sv.RestartRule("always"), sv.StopRule()), 0.0)
     core.handle(sv.SpawnFailed(TALKER, "no executable"), 0.0)
@@ -413,7 +413,7 @@ def test_transient_spawn_failure_follows_the_policy():
 
 
 def test_stop_before_the_spawn_gives_it_up():
-    """A start that still waits its turn is taken back."""
+    """A pending start is cancelled."""
     core = sv.Supervision()
     core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 0.0)
     assert kinds(core.handle(sv.StopOrdered(TALKER), 0.0)) == ["Tell", "Unspawn"]
@@ -422,7 +422,7 @@ def test_stop_before_the_spawn_gives_it_up():
 
 
 def test_shutdown_leaves_when_all_have_ended():
-    """Everything is stopped, nothing is started any more, and then the supervisor leaves."""
+    """Everything is stopped, nothing is started any more, and then the supervisor exits."""
     core, _ = started()
     assert "Leave" not in kinds(core.handle(sv.ShutdownOrdered(), 1.0))
     core.handle(sv.StartOrdered(("late", 1), sv.RestartRule(), sv.StopRule()), 1.0)
@@ -432,7 +432,7 @@ def test_shutdown_leaves_when_all_have_ended():
 
 @pytest.mark.parametrize("before", [None, sv.Exited(TALKER, 1), sv.RestartOrdered(TALKER)])
 def test_what_a_shutdown_ends_is_withdrawn(before):
-    """Neither the process nor an order has ended it, whatever its exit code says."""
+    """Neither the process nor an order ended it, whatever its exit code is."""
     core, instance = started(restart=sv.RestartRule("on-failure"))
     if before is not None:
         core.handle(before, 0.5)
@@ -443,7 +443,7 @@ def test_what_a_shutdown_ends_is_withdrawn(before):
 
 
 def test_what_was_ordered_to_stop_before_a_shutdown_is_not_withdrawn():
-    """The order that came first counts: its master does not want it back."""
+    """The order that came first counts: its master does not want the instance again."""
     core, instance = started()
     core.handle(sv.StopOrdered(TALKER), 1.0)
     core.handle(sv.ShutdownOrdered(), 1.5)
@@ -459,7 +459,7 @@ def test_a_lost_client_changes_nothing():
 
 
 def test_dead_numbers_are_bounded():
-    """Thousands of jobs with names of their own leave a bounded memory."""
+    """Thousands of jobs with different names need bounded memory."""
     core = sv.Supervision()
     for number in range(sv.MOST_TOMBSTONES + 10):
         key = (f"job{number}", number)
@@ -468,7 +468,7 @@ def test_dead_numbers_are_bounded():
     assert len(core.dead) == sv.MOST_TOMBSTONES
 
 
-# --- what holds in every order of events ------------------------------------------------------
+# --- invariants under random events -----------------------------------------------------------
 
 POLICIES = st.builds(
     sv.RestartRule,
@@ -486,9 +486,9 @@ GRACES = st.builds(sv.StopRule, st.sampled_from([0.0, 1.0]), st.sampled_from([0.
 
 
 class Host(RuleBasedStateMachine):
-    """A host whose processes do as they like, and the machine that supervises them.
+    """Host whose processes behave at random, with the state machine that supervises them.
 
-    `leaders` and `strays` are the truth about what lives; the machine only hears of it.
+    `leaders` and `strays` record which processes live; the state machine only receives events.
     """
 
     def __init__(self):
@@ -565,13 +565,13 @@ class Host(RuleBasedStateMachine):
 
     @rule(ago=st.sampled_from([-1.0, 0.0, 0.5, 4.0]))
     def master_hears(self, ago):
-        """By a word that took so long; what is fenced already stays so."""
+        """Report a contact with the master from this long ago; fenced instances stay fenced."""
         self.happens(sv.Heard(self.now - ago))
         self.renew(min(self.now, self.now - ago), alive=False)
 
     @rule()
     def slave_is_at_work(self):
-        """It knows nothing new of the master."""
+        """Report that the slave runs, without a newer contact with the master."""
         self.happens(sv.Heard(-99.0, self.now))
         self.renew(self.now, alive=True)
 
@@ -597,7 +597,7 @@ class Host(RuleBasedStateMachine):
         data=st.data(), kind=st.sampled_from(["stop", "stop", "restart", "start", "fail", "forget"])
     )
     def order(self, data, kind):
-        """About one that is known, or now and then one that is not (any more)."""
+        """Send an order for a known instance, or now and then for an unknown one."""
         known = [number for _, number in self.core.instances]
         key = ("a", data.draw(st.sampled_from([*known, *known, *known, 0, self.newest])))
         if kind == "stop":
@@ -686,7 +686,7 @@ class Host(RuleBasedStateMachine):
 
     @invariant()
     def what_is_fenced_is_killed_in_time(self):
-        """Nothing of it lives longer than its SIGKILL allows; and the machine wakes up for it."""
+        """Check that fenced instances end in time, and that the state machine wakes up for it."""
         for key in self.leaders | self.strays:
             by = self.dead_by.get(key)
             if by is not None:
@@ -717,7 +717,7 @@ class Host(RuleBasedStateMachine):
                 assert len(recent) <= rule_.attempts
 
     def teardown(self):
-        """From wherever it stands, a shutdown ends: what gets SIGKILL dies, in bounded time."""
+        """Check that a shutdown ends in bounded time from any state, if SIGKILL works."""
         self.happens(sv.ShutdownOrdered())
         for _ in range(100):
             if self.left:
