@@ -1,4 +1,4 @@
-"""Registers the migration strategies."""
+"""Plugin hook that registers the migration strategies."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _PERIODIC: Final = "rosrm_migration.criu_periodic_steps"
 
 @hookimpl
 def register_migration_strategies() -> Sequence[MigrationOffer]:
-    """Offer `relaunch`, for processes without a state, and two for those with one.
+    """Offer `relaunch` for stateless processes, and two strategies for stateful ones.
 
-    `handoff` where it is published on topics; `criu` where it is in memory alone.
+    `handoff` is for state that is published on topics; `criu` for state in memory alone.
     """
     return [
         MigrationOffer(
@@ -68,7 +68,10 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
 def _when_asked(
     step: str, module: str = "rosrm_migration.criu_steps"
 ) -> Callable[[Mapping[str, Any]], Mapping[str, Any]]:
-    """A step of `criu`; a slave that has no such moves never loads what it needs."""
+    """Return a step of `criu` that imports its module on first use.
+
+    A slave without such migrations never loads these modules.
+    """
 
     def execute(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         answer: Mapping[str, Any] = getattr(import_module(module), step)(arguments)
