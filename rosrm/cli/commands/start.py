@@ -102,7 +102,7 @@ def slave(
 
 
 def become(module: str, settings: str) -> None:
-    """Put a runtime in this process's place."""
+    """Replace this process by a runtime."""
     descriptor = hand_over(settings)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -114,7 +114,10 @@ def become(module: str, settings: str) -> None:
 
 
 def _without_this_folder() -> list[str]:
-    """`-m` looks for modules in the working directory first: not wanted, save in a checkout."""
+    """Return the option that stops `-m` from searching the working directory first.
+
+    In a checkout that search is wanted, so there the list is empty.
+    """
     in_checkout = Path(__file__).is_relative_to(Path.cwd())
     return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
 
