@@ -1,4 +1,7 @@
-"""From an assignment to an order for the supervisor: command line, environment, parameters."""
+"""Conversion of an assignment into an order for the supervisor.
+
+The order consists of command line, environment and parameters.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ro
 from rosrm.supervisor.client import LaunchOrder, log_path
 from rosrm.supervisor.spawn import SpawnError, find_executable
 
-#: Seconds for a restore, at most: whoever ordered it gives up sooner.
+#: Most seconds for a restore; the migration that requested it times out earlier.
 _RESTORE: Final = 600.0
 
 
@@ -32,24 +35,25 @@ def launch_order(
     images: Path,
     heard: float = 0.0,
 ) -> LaunchOrder:
-    """What the supervisor is to start for an assignment; its parameters are written to a file.
+    """Return the supervisor's order for an assignment, and write its parameters to a file.
 
     Args:
-        assignment: what is to run.
-        base_environment: the slave's own, its ROS settings included.
+        assignment: to start.
+        base_environment: environment of the slave, with its ROS settings.
         python: the interpreter for modules.
-        where: it will run.
-        state_directory: of this host's supervisor; the parameters lie beside the instance's log.
-        images: the slave's directory, where the image of one that is to be restored lies.
-        heard: when the master last heard this host, monotonic; 0.0: just now.
+        where: host and cluster of the instance.
+        state_directory: of this host's supervisor; the parameters are beside the instance's log.
+        images: the slave's directory, which holds the checkpoint images to restore.
+        heard: monotonic time of the master's last contact with this host, seconds; 0.0: now.
 
     Raises:
-        LaunchError: what was looked for, and where.
+        LaunchError: the program was not found, with the searched places; or another error of the
+            spec on this host.
     """
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where)
     command = _command(spec, environment, python)
-    if spec.checkpointed:  # else the program that restores it would start, and then fail
+    if spec.checkpointed:  # otherwise the shim would start, and fail only then
         _check_program(command[0], environment)
     if spec.ros_node:
         parameters_file = _write_parameters(assignment, state_directory)
@@ -62,7 +66,8 @@ def launch_order(
         argv=_by_way_of_images(assignment, (*command, *arguments), python, images),
         environment=environment,
         working_directory=_working_directory(spec),
-        # One that ended in a move is never started again: the source is there, and may go on.
+        # A destination that ends during a migration is not restarted, because the source still
+        # exists and may continue.
         restart=RestartPolicy("never") if assignment.on_trial else spec.restart,
         stop=spec.stop,
         fence=assignment.fence,
@@ -73,7 +78,7 @@ def launch_order(
 def _by_way_of_images(
     assignment: Assignment, argv: tuple[str, ...], python: str, images: Path
 ) -> tuple[str, ...]:
-    """The program that restores the instance and holds it, where there is an image, or will be."""
+    """Return the command line of the shim if the instance has or will have a checkpoint image."""
     checkpointed = assignment.spec.checkpointed
     if not (checkpointed or assignment.restored):
         return argv
@@ -101,7 +106,7 @@ def _working_directory(spec: ProcessSpec) -> str | None:
 
 
 def _at_home(path: str, where: str) -> str:
-    """Replace a leading `~` by the home of the slave's user on this host."""
+    """Return a path with a leading `~` replaced by the home of the slave's user."""
     if not path.startswith("~"):
         return path
     try:
@@ -111,7 +116,7 @@ def _at_home(path: str, where: str) -> str:
 
 
 def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> tuple[str, ...]:
-    """What comes before the arguments."""
+    """Return the part of the command line before the arguments."""
     if spec.package is not None:
         if spec.executable is None:
             raise LaunchError(f"{spec.name!r} names the package {spec.package!r}, no executable")
@@ -136,7 +141,10 @@ def _check_program(word: str, environment: Mapping[str, str]) -> None:
 
 
 def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:
-    """Beside the instance's log, to be pruned with it."""
+    """Write the parameters beside the instance's log, with which they are pruned; return the path.
+
+    None: there are no parameters.
+    """
     text = parameters_text(assignment.spec.parameters)
     if not text:
         return None
