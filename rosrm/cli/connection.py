@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rosrm.model.rows import Snapshot
     from rosrm.ros.client import MasterClient
 
-#: Seconds from the start of the command within which it says that there is no master: less than 3,
-#: for leaving ROS takes a moment too.
+#: Seconds from the start of the command until the message that there is no master: less than 3,
+#: because leaving ROS takes time too.
 SAID_WITHIN: Final = 2.6
 #: Seconds for finding a master on this machine, counted after the imports.
 LEAST: Final = 1.5
@@ -58,6 +58,6 @@ def say_trouble(snapshot: Snapshot) -> None:
 
 
 def connect(settings: RosSettings) -> MasterClient:
-    """Find the master within a time that is acceptable for a user."""
+    """Find the master within `SAID_WITHIN` s of the command's start, but in at least `LEAST` s."""
     timeout = max(LEAST, SAID_WITHIN - (time.monotonic() - BEGUN))
     return connecting.connect(settings, timeout=timeout, joined=early.take(settings), begun=BEGUN)

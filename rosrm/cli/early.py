@@ -1,7 +1,7 @@
 """DDS participant that is created before the command line is parsed.
 
-Discovery of the master takes 0.1 to 0.3 s of waiting, in threads of DDS. Parsing, and drawing of
-tables, takes as long to import. Both run side by side because the participant comes first.
+The discovery of the master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and for
+tables take as long. Both run in parallel, because the participant is created first.
 """
 
 from __future__ import annotations
@@ -56,6 +56,6 @@ def take(settings: RosSettings) -> Participant | None:
 
 
 def drop() -> None:
-    """Close a participant that no command took: the command line was wrong, for example."""
+    """Close a participant that no command has taken, e.g. after a wrong command line."""
     while _made:
         _made.pop().close()

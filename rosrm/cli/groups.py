@@ -36,13 +36,13 @@ _ELSEWHERE: Final = {
 DISTRIBUTIONS: Final = {"lab": "rosrm-lab", "simulate": "rosrm-simulate"}
 #: Wide enough that no summary of a command is cut.
 _UNCUT: Final = 1000
-#: "WORK......" and "[NAME...]..." say twice that a word may be repeated.
+#: Duplicate marks of repetition, as in "WORK......" and "[NAME...]...".
 _DOTS_TWICE: Final = re.compile(r"(\.\.\.\]?)\.\.\.")
 _BRACES: Final = str.maketrans("", "", "{}")
 
 
 class PlainCommand(TyperCommand):
-    """A command with plain usage lines (`WORK...`, `[NAME...]`) and plain errors."""
+    """Command with plain usage lines (`WORK...`, `[NAME...]`) and plain errors."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; raise errors with rosrm's wording instead of the library's."""
@@ -59,7 +59,7 @@ class PlainCommand(TyperCommand):
 
 
 class PlainGroup(TyperGroup):
-    """A group whose help prints the whole summary of each command."""
+    """Group of commands whose help prints the whole summary of each command."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""

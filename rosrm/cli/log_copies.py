@@ -32,10 +32,10 @@ def since_of(text: str) -> float:
 def copy_logs(client: Client, streams: Sequence[Stream], selection: LogSelection) -> None:
     """Copy the logs of processes to standard output by the times of their lines; follow all.
 
-    A log that is out of reach is reported at once, and the others are copied.
+    An unreachable log is reported at once, and the others are copied.
 
     Raises:
-        typer.Exit: one of them could not be copied.
+        typer.Exit: a log could not be copied.
     """
     readers = client.log_readers([stream.name for stream in streams], selection)
     copies = [_Copy(reader, stream) for reader, stream in zip(readers, streams, strict=True)]

@@ -241,7 +241,7 @@ class LogReader:
             known = f". {name} {standing_for(row.state, duration(row.since))}"
         if row is not None and row.reason:
             known += f": {row.reason}"
-            why = "" if row.reason.startswith(f"{host} is ") else why  # the reason says the same
+            why = "" if row.reason.startswith(f"{host} is ") else why  # same content
         others = [f"`--host {other}`" for other in self._hosts if other not in self._away]
         older = f"; an older part may be read with {listed(others, 'or')}" if others else ""
         raise Refused(
@@ -275,7 +275,7 @@ class LogReader:
         try:
             return self._take(row.host, self._read(row.host, row.number, 0))
         except Refused as refusal:
-            if refusal.code != "unknown":  # its host is about to begin the log
+            if refusal.code != "unknown":  # its host has not created the log yet
                 raise
             return None
 

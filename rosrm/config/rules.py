@@ -1,4 +1,4 @@
-"""Rules that relate several values of a file, and paths relative to the file."""
+"""Rules on names and amounts of a file, and resolution of paths relative to the file."""
 
 from __future__ import annotations
 

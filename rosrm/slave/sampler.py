@@ -350,7 +350,7 @@ class _Watched:
 
     @property
     def is_stale(self) -> bool:
-        """Return True if the newest report says stale, or there is no reading yet."""
+        """Return True if the newest report was of stale readings, or there is no reading yet."""
         return self._reported_stale or not self.measured
 
     def report(self, now: float) -> list[ProbeReport]:

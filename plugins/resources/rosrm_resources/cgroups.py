@@ -16,7 +16,7 @@ from rosrm import ConfigError
 
 @dataclass(frozen=True)
 class Group:
-    """The control group of a process for one controller.
+    """Control group of a process for one controller.
 
     Attributes:
         version: 1 or 2.

@@ -140,7 +140,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
         case "simulation":
             return _check_of_simulations(file)(file, registry)
         case _:
-            for warning in _misspelt_needs(root, registry):  # a wrong file has them too
+            for warning in _misspelt_needs(root, registry):  # also for a wrong file
                 typer.echo(warning, err=True)
             specs = load_work(file, registry)
             for warning in shared_nodes(specs):
@@ -152,11 +152,11 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
 
 
 def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
-    """Return the check that the distribution of the simulator brings.
+    """Return the check of simulation files from the simulator's distribution.
 
     Raises:
-        ConfigError: it is not installed.
-        PluginError: it does not import.
+        ConfigError: the distribution is not installed.
+        PluginError: the check cannot be imported.
     """
     from pkgutil import resolve_name
 
@@ -178,9 +178,9 @@ def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
 
 
 def _misspelt_needs(root: Node, registry: Registry) -> Iterator[str]:
-    """Warn of resources in `needs` that are nearly named as one that a probe installed here reads.
+    """Yield warnings about resources in `needs` that may be misspelt names of known resources.
 
-    Only a warning: another host may have a probe that this machine lacks.
+    These are only warnings, because another host may have a probe that this machine lacks.
     """
     read = registry.resources()
     listed_there = root.get("processes")

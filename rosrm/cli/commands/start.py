@@ -1,7 +1,7 @@
-"""`rosrm master` and `rosrm slave`: check everything, say what starts, and become the runtime.
+"""Commands `rosrm master` and `rosrm slave`: check all settings, then execute the runtime.
 
-The runtime takes this process's place and starts without pydantic, typer and rich, which it has no
-use for; it reads the settings that were checked from an inherited file.
+The runtime replaces this process and starts without pydantic, typer and rich, which it does not
+need. It reads the checked settings from an inherited file.
 """
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
@@ -94,7 +94,7 @@ def slave(
         become("rosrm.slave.stop_all", settings.to_json())
         return
     if settings.probes is None:
-        registry.default_probes()  # raises where there is none
+        registry.default_probes()  # raises if there is none
     remedy = "another `host:` and `state:`"
     with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
         typer.echo(_says_of_host(settings), err=True)

@@ -24,7 +24,7 @@ _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 
 
 def render(story: Mapping[str, Any]) -> RenderableType:
-    """Print the master's explanation of one process."""
+    """Return the master's explanation of one process for a rich console."""
     return Group(*_parts(story))
 
 

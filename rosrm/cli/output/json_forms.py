@@ -27,12 +27,12 @@ def form(row: ProcessRow | EventRow | PluginRow) -> dict[str, Any]:
 
 
 def forms(rows: Sequence[Any]) -> list[dict[str, Any]]:
-    """Return a listing."""
+    """Return the rows of a listing as objects."""
     return [host_form(row) if isinstance(row, HostRow) else form(row) for row in rows]
 
 
 def status_form(snapshot: Snapshot) -> dict[str, Any]:
-    """Return the overview."""
+    """Return the overview of `rosrm status` as an object."""
     return {
         "master": snapshot.master,
         "uptime": snapshot.uptime,

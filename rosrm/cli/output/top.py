@@ -1,8 +1,8 @@
 """Live view: hosts with usage and limits, processes, queue, newest events.
 
-A pure function of a `Snapshot` and the width: `rosrm top` and `make demo` show it. Where room is
-short, the reasons shrink first, then bars, then columns leave; names stay whole. A reason that is
-too long loses the beginning that others share, and then its end.
+The view is a pure function of a `Snapshot` and the width; `rosrm top` and `make demo` show it. If
+room is short, reasons shrink first, then bars, and then columns are hidden; names stay whole. A
+reason that is too long loses the beginning that it shares with others, and then its end.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _LEAST_BAR: Final = 4
 #: Width of the percentage beside a bar: " 100%".
 _NUMBER: Final = 5
 _MOST_RESOURCES: Final = 3
-#: Fraction of its limit from which a usage counts as near the limit.
+#: Fraction of the limit from which a usage counts as near the limit.
 _NEAR: Final = 0.9
 _GAP: Final = 2
 #: Least useful width of a reason; a column is hidden to make room for it.
 _LEAST_REASON: Final = 20
 
-#: States that are listed first if there is too little room.
+#: Resources that are shown first if there is too little room.
 _FIRST: Final = ("memory", "cpu", "gpu", "disk")
 #: States in the order of interest; terminal ones come last.
 _ORDER: Final = (

@@ -141,7 +141,7 @@ def _check_program(word: str, environment: Mapping[str, str]) -> None:
 
 
 def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:
-    """Write the parameters beside the instance's log, with which they are pruned; return the path.
+    """Write the parameters beside the instance's log and return their path; pruned with the log.
 
     None: there are no parameters.
     """
