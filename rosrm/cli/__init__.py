@@ -1,1 +1,1 @@
-"""The `rosrm` command. Only `rosrm.cli.output.top` is of use to other programs."""
+"""The `rosrm` command. Other programs may import `rosrm.cli.output.top` only."""

@@ -1,4 +1,4 @@
-"""`python -m rosrm.cli` is the `rosrm` command."""
+"""Entry point of `python -m rosrm.cli`, which is the `rosrm` command."""
 
 from rosrm.cli.app import main
 

@@ -1,8 +1,8 @@
-"""Where the `rosrm` command begins.
+"""Entry point of the `rosrm` command.
 
-Nothing is imported before Ctrl-C is taken care of, and every command imports what it needs when it
-runs: `rosrm --help` is quick, and needs no ROS. A command that asks the master joins ROS first of
-all (`rosrm.cli.early`).
+No module is imported before Ctrl-C is handled, and every command imports its modules when it runs.
+So `rosrm --help` is quick and needs no ROS. A command that asks the master joins ROS before
+anything else (`rosrm.cli.early`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Connect closed standard streams to /dev/null; else files and sockets take their numbers."""
+    """Connect closed standard streams to /dev/null; otherwise files get their descriptors."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            null = os.open(os.devnull, os.O_RDWR)  # the least free number: that of the stream
+            null = os.open(os.devnull, os.O_RDWR)  # takes the stream's number
             os.set_inheritable(null, True)
             setattr(sys, name, os.fdopen(null, mode, encoding="utf-8"))
 
@@ -59,7 +59,7 @@ def _run() -> None:
 def _leave(code: object) -> None:
     """Exit with a code, or with 1 if the rest of the output cannot be written.
 
-    End the process at once where ROS was used: Fast DDS sleeps 0.1 s at a normal exit.
+    If ROS was used, end the process at once, because Fast DDS sleeps 0.1 s at a normal exit.
     """
     if not (code is None or isinstance(code, int)):
         return
@@ -76,7 +76,7 @@ def _flush(stream: TextIO, status: int) -> bool:
     try:
         stream.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # else Python tries once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # else Python flushes again
         if error.errno != errno.EPIPE and status == 0:
             _say(f"rosrm: the output cannot be written: {error.strerror}")
         return False
@@ -84,7 +84,7 @@ def _flush(stream: TextIO, status: int) -> bool:
 
 
 def _say(text: str) -> None:
-    """Print a line to standard error, if that can be written."""
+    """Print a line to standard error; ignore a closed one."""
     with suppress(OSError):
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""The connection of a command to the master."""
+"""Connection of a command to the master."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from rosrm.model.rows import Snapshot
     from rosrm.ros.client import MasterClient
 
-#: Seconds from the start of the command within which it says that there is no master: less than 3,
-#: for leaving ROS takes a moment too.
+#: Seconds from the start of the command until the message that there is no master: less than 3,
+#: because leaving ROS takes time too.
 SAID_WITHIN: Final = 2.6
-#: However long the imports took, a master on this machine is found in this time.
+#: Seconds for finding a master on this machine, counted after the imports.
 LEAST: Final = 1.5
 
 
@@ -39,7 +39,7 @@ def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
 
 @contextmanager
 def master(ctx: typer.Context, domain: int | None) -> Iterator[Client]:
-    """Make a client of the master for one command."""
+    """Create a client of the master for one command."""
     from rosrm.client.client import Client  # noqa: PLC0415 - `rosrm --help` has no use for it
 
     with Client(connection=connect(ros_settings(ctx, domain)), notify=note) as client:
@@ -52,12 +52,12 @@ def note(text: str) -> None:
 
 
 def say_trouble(snapshot: Snapshot) -> None:
-    """Tell people beside the listing that the master takes no new work, and why."""
+    """Print beside the listing that the master accepts no new work, and why."""
     if snapshot.trouble:
         note(snapshot.trouble)
 
 
 def connect(settings: RosSettings) -> MasterClient:
-    """Find the master within the time that a user is willing to wait."""
+    """Find the master within `SAID_WITHIN` s of the command's start, but in at least `LEAST` s."""
     timeout = max(LEAST, SAID_WITHIN - (time.monotonic() - BEGUN))
     return connecting.connect(settings, timeout=timeout, joined=early.take(settings), begun=BEGUN)

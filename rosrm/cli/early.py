@@ -1,7 +1,7 @@
-"""A DDS participant that is made before the command line is parsed.
+"""DDS participant that is created before the command line is parsed.
 
-Discovery of the master takes 0.1 to 0.3 s of waiting, in threads of DDS. Parsing, and drawing of
-tables, takes as long to import. Both run side by side because the participant comes first.
+The discovery of the master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and for
+tables take as long. Both run in parallel, because the participant is created first.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ ASKING: Final = frozenset({
     "cordon", "uncordon", "drain", "status", "ps", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip
-#: Options with which a command joins ROS in another way, or not at all.
+#: Options with which a command joins ROS with other settings, or not at all.
 _OTHERWISE: Final = ("-h", "--help", "--domain", "--cluster", "--local")
 
 _made: list[Participant] = []
 
 
 def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Join ROS, as the environment says, if the command is sure to ask the master.
+    """Join ROS with the settings of the environment, if the command certainly asks the master.
 
     Args:
         arguments: of the command line.
-        environment: may name a file with the settings of ROS; `connect` reads that.
+        environment: if it names a file with ROS settings, `connect` joins ROS instead.
     """
     if not _is_wanted(arguments, environment):
         return
@@ -51,11 +51,11 @@ def _is_wanted(arguments: Collection[str], environment: Mapping[str, str]) -> bo
 
 
 def take(settings: RosSettings) -> Participant | None:
-    """Hand over the participant if it was made with the same settings; the caller closes it."""
+    """Return the participant if it has the same settings; the caller closes it."""
     return _made.pop() if _made and _made[0].settings == settings else None
 
 
 def drop() -> None:
-    """Close a participant that no command took: the command line was wrong, for example."""
+    """Close a participant that no command has taken, e.g. after a wrong command line."""
     while _made:
         _made.pop().close()

@@ -1,4 +1,4 @@
-"""Groups of commands: their help, their usage lines, and hints after an unknown verb."""
+"""Groups of commands: help, usage lines, and hints for an unknown verb."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from rosrm.wording import get_close_matches, listed
 
-#: Verbs of other tools, and the commands of rosrm that do as much.
+#: Verbs of other tools, and the equivalent commands of rosrm.
 _ELSEWHERE: Final = {
     word: verbs
     for verbs, words in (
@@ -32,20 +32,20 @@ _ELSEWHERE: Final = {
     )
     for word in words.split()
 }
-#: Commands that distributions of their own bring.
+#: Commands of other distributions.
 DISTRIBUTIONS: Final = {"criu": "rosrm-criu", "lab": "rosrm-lab", "simulate": "rosrm-simulate"}
 #: Wide enough that no summary of a command is cut.
 _UNCUT: Final = 1000
-#: "WORK......" and "[NAME...]..." say twice that a word may be repeated.
+#: Duplicate marks of repetition, as in "WORK......" and "[NAME...]...".
 _DOTS_TWICE: Final = re.compile(r"(\.\.\.\]?)\.\.\.")
 _BRACES: Final = str.maketrans("", "", "{}")
 
 
 class PlainCommand(TyperCommand):
-    """A command with plain usage lines (`WORK...`, `[NAME...]`) and plain errors."""
+    """Command with plain usage lines (`WORK...`, `[NAME...]`) and plain errors."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line; raise errors without the words of the library that found them."""
+        """Parse the command line; raise errors with rosrm's wording instead of the library's."""
         try:
             return super().parse_args(ctx, args)
         except BadParameter as error:
@@ -59,7 +59,7 @@ class PlainCommand(TyperCommand):
 
 
 class PlainGroup(TyperGroup):
-    """A group whose help prints the whole summary of each command."""
+    """Group of commands whose help prints the whole summary of each command."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""

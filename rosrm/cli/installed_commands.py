@@ -1,4 +1,4 @@
-"""Commands that other distributions bring, by the entry-point group `rosrm.commands`.
+"""Commands of other distributions, found by the entry-point group `rosrm.commands`.
 
 The search for entry points reads the metadata of every installed distribution, and a listing
 imports the commands. Therefore a command of rosrm itself causes neither.
@@ -27,11 +27,11 @@ def find_commands() -> dict[str, list[PluginAddress]]:
 
 
 def load_command(name: str, addresses: Sequence[PluginAddress]) -> Any:
-    """Import a command; a command that cannot be loaded raises `PluginError` when it is called.
+    """Import a command; if that fails, return a command that raises `PluginError` when called.
 
     Args:
         name: of the command.
-        addresses: of all distributions that bring a command of that name; at least one.
+        addresses: of all distributions with a command of that name; at least one.
     """
     if len(addresses) > 1:
         brought_by = listed([one.distribution for one in addresses])

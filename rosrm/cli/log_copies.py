@@ -1,4 +1,4 @@
-"""`rosrm logs`: copies the logs of processes to standard output, merged by time."""
+"""Copies of process logs on standard output, merged by time, for `rosrm logs`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def since_of(text: str) -> float:
-    """Return the option --since as unix time, 0.0 where it is not given; raises `ConfigError`."""
+    """Return the option --since as unix time, 0.0 if it is not given; raises `ConfigError`."""
     try:
         ago = Quantity("duration", above=True).parse(text) if text else 0.0
     except ValueError as error:
@@ -32,14 +32,14 @@ def since_of(text: str) -> float:
 def copy_logs(client: Client, streams: Sequence[Stream], selection: LogSelection) -> None:
     """Copy the logs of processes to standard output by the times of their lines; follow all.
 
-    A log that is out of reach is reported at once, and the others are copied.
+    An unreachable log is reported at once, and the others are copied.
 
     Raises:
-        typer.Exit: one of them could not be copied.
+        typer.Exit: a log could not be copied.
     """
     readers = client.log_readers([stream.name for stream in streams], selection)
     copies = [_Copy(reader, stream) for reader, stream in zip(readers, streams, strict=True)]
-    # `merge` takes the least of the next pieces: one without a time follows the one before it.
+    # `merge` takes the earliest of the next pieces; one without a time follows its predecessor.
     show(merge(*(copy.begin() for copy in copies), key=itemgetter(0)))
     if selection.follow:
         _follow([copy for copy in copies if not copy.reader.over])
@@ -48,7 +48,7 @@ def copy_logs(client: Client, streams: Sequence[Stream], selection: LogSelection
 
 
 def _follow(copies: Sequence[_Copy]) -> None:
-    """Copy what is new until all processes have ended."""
+    """Copy new output until all processes have ended."""
     while copies:
         news = False
         for copy in copies:
@@ -63,7 +63,7 @@ def _follow(copies: Sequence[_Copy]) -> None:
 
 @dataclass
 class _Copy:
-    """The copy of the log of one process.
+    """Copy of the log of one process.
 
     Attributes:
         reader: of the log.
@@ -76,7 +76,7 @@ class _Copy:
     exit_code: int = 0
 
     def begin(self) -> Iterator[Piece]:
-        """Copy what there is, and yield it in pieces."""
+        """Copy the existing log, and yield it in pieces."""
         try:
             for chunk in self.reader.read():
                 self.stream.write(chunk)
@@ -88,7 +88,7 @@ class _Copy:
         yield from self.stream.take()
 
     def poll(self) -> bool:
-        """Copy what is new; return False if there was nothing."""
+        """Copy new output; return False if there was none."""
         try:
             chunk = self.reader.poll()
         except RosrmError as error:

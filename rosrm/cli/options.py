@@ -1,4 +1,4 @@
-"""Options that several commands have."""
+"""Options shared by several commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosrm.model.ros_settings import HIGHEST_DOMAIN
 
 @dataclass(frozen=True)
 class Common:
-    """What was said before the command's name."""
+    """Options given before the command's name."""
 
     domain: int | None = None
     cluster: Path | None = None

@@ -1,12 +1,12 @@
-"""The process of one command: when it began, and its exit code after Ctrl-C."""
+"""Start time of the command's process, and its exit code after Ctrl-C."""
 
 from __future__ import annotations
 
 import time
 from typing import Final
 
-#: When this process began, by the monotonic clock: time-outs of a command count from here.
+#: Monotonic start time of this process, from which the time-outs of a command count.
 BEGUN: Final = time.monotonic()
 
-#: What a shell gives for a program that Ctrl-C ended.
+#: Exit code of a program that was ended by Ctrl-C, as in a shell.
 INTERRUPTED: Final = 130

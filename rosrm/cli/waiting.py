@@ -1,4 +1,4 @@
-"""`--wait`: prints the progress of a wait, and how it ended."""
+"""Output of `--wait`: progress and result of a wait."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NOTEWORTHY: Final = UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
 
 
 def longest(text: str) -> float | None:
-    """A time-out from the command line, seconds; "" is none. Raises `ConfigError`."""
+    """Return a time-out of the command line in seconds; None for "". Raises `ConfigError`."""
     try:
         return Quantity("duration", above=True).parse(text) if text else None
     except ValueError as error:
@@ -28,7 +28,7 @@ def longest(text: str) -> float | None:
 
 @contextmanager
 def interruptible(what_follows: str) -> Iterator[None]:
-    """Within, a Ctrl-C ends the waiting alone; a message to the user has what follows."""
+    """Return a context in which Ctrl-C ends only the wait, with a message about the rest."""
     try:
         yield
     except KeyboardInterrupt:
@@ -39,14 +39,14 @@ def interruptible(what_follows: str) -> Iterator[None]:
 
 
 def show_change(row: ProcessRow) -> None:
-    """Print the state of an awaited process if the user has to know it."""
+    """Print the state of an awaited process if it needs the user's attention."""
     if row.state in _NOTEWORTHY:
         why = f": {row.reason}" if row.reason else ""
         typer.echo(f"{row.name} {standing(row.state)}{why}", err=True)
 
 
 def show_processes(result: WaitResult) -> None:
-    """Print how a wait for processes ended; exit with 1 if they are not done."""
+    """Print the result of a wait for processes; exit with 1 if they are not done."""
     counts = Counter(row.state.replace("_", " ") for row in result.processes)
     summary = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
     typer.echo(summary or "all processes were removed")
@@ -76,7 +76,7 @@ def show_processes(result: WaitResult) -> None:
 
 
 def show_end(result: WaitResult) -> None:
-    """Print how a migration or a drain ended; exit with 1 if it is not done."""
+    """Print the result of a migration or drain; exit with 1 if it is not done."""
     if result.pending:
         _say_time_is_up(result.pending)
     elif result.done or result.event:

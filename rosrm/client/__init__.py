@@ -1,8 +1,8 @@
-"""The Python client of the master; `rosrm.Client` is its public name.
+"""Python client of the master; `rosrm.Client` is its public name.
 
 client.py       the client: requests, listings, events, logs, waiting
 connecting.py   finds the master, with the settings that commands use
-waiting.py      watches processes and hosts until what is awaited has happened
+waiting.py      waits for states of processes and hosts
 logs.py         reads the logs of processes from the slaves that hold them
-retrying.py     asks again while the master does not answer
+retrying.py     repeats requests while the master does not answer
 """

@@ -1,4 +1,4 @@
-"""The synchronous client of the master, which the command line uses too."""
+"""Synchronous client of the master, which the command line uses too."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def _warn(text: str) -> None:
 
 
 class Client:
-    """A synchronous client of the master; a context manager that closes its connection.
+    """Synchronous client of the master; a context manager that closes its connection.
 
-    It finds the master as the `rosrm` command does: in the domain of ROS_DOMAIN_ID, or with the
-    `ros` section of the file that ROSRM_CLUSTER names. All times are seconds. One thread uses a
+    The client finds the master as the `rosrm` command does: in the domain of ROS_DOMAIN_ID, or with
+    the `ros` section of the file that ROSRM_CLUSTER names. All times are seconds. One thread uses a
     client at a time.
 
-    Each call raises `Refused` with the master's message if the request is turned down, and
+    Each call raises `Refused` with the master's message if the master refuses the request, and
     `NoMaster` if no answer comes in time. `wait`, `wait_for_migration`, `wait_for_drain` and
     `events` continue to ask a silent master until their own time-out.
 
@@ -262,7 +262,7 @@ class Client:
         self, processes: Names, *, until: Until = "settled", timeout: float | None = None,
         previous: Iterable[ProcessRow] | None = None, on_change: OnChange | None = None,
     ) -> WaitResult:  # fmt: skip
-        """Wait for processes, and return how it ended; the result is true if all are done.
+        """Wait for processes, and return the result, which is true if all are done.
 
         The wait ends early when only a user or another host can help: a process has failed, is
         stuck, or is set aside.

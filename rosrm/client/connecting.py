@@ -1,4 +1,4 @@
-"""The connection to the master. ROS is imported here, and not before it is needed."""
+"""Connection to the master. Only this module imports ROS, and only when it is needed."""
 
 from __future__ import annotations
 

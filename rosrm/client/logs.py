@@ -1,6 +1,6 @@
-"""Reads the logs of processes: finds the slaves that hold them, copies them, and follows them.
+"""Reader of process logs, which the slaves hold: finds, copies and follows them.
 
-The numbers of instances ascend over all hosts, so that they order what a process wrote.
+The numbers of instances increase over all hosts, so they order the output of a process.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from rosrm.ros.client import LogPart, MasterClient
 
 _PART: Final = 256 * 1024
-#: Seconds between two looks at logs that have nothing new.
+#: Seconds between two polls of logs without new output.
 PERIOD: Final = 0.3
-#: Offset behind all that is written while the log is read.
+#: Offset beyond any output that is written while the log is read.
 _NO_END: Final = sys.maxsize
 #: Newest events by which the hosts of a process are found.
 _EVENTS: Final = 200
@@ -80,9 +80,9 @@ class LogReader:
         master: asks master and slaves.
         process: that writes.
         selection: of the log.
-        notify: is told about parts out of reach, and about a log without output.
+        notify: takes messages about unreachable parts, and about a log without output.
         silent: hosts that did not answer, with the error; readers that share it ask each once.
-        over: nothing more comes.
+        over: no more output can follow.
     """
 
     master: MasterClient
@@ -100,7 +100,7 @@ class LogReader:
     _away: dict[str, str] = field(default_factory=dict)
 
     def read(self) -> Iterator[LogChunk]:
-        """Yield what there is, the oldest first; raises `RosrmError`."""
+        """Yield the existing output, the oldest first; raises `RosrmError`."""
         found = self._find()
         for host, first, end in self._chosen(found):
             self._started = self._started or any(pid for _, _, pid in first.marks)
@@ -114,7 +114,7 @@ class LogReader:
             self._explain_nothing(found)
 
     def poll(self) -> LogChunk | None:
-        """Return what is new, None if there is nothing; raises `RosrmError`."""
+        """Return new output, None if there is none; raises `RosrmError`."""
         part = self._read(self._host, self._number, self._offset) if self._host else None
         if part is not None and part.content:
             return self._take(self._host, part)
@@ -241,7 +241,7 @@ class LogReader:
             known = f". {name} {standing_for(row.state, duration(row.since))}"
         if row is not None and row.reason:
             known += f": {row.reason}"
-            why = "" if row.reason.startswith(f"{host} is ") else why  # the reason says the same
+            why = "" if row.reason.startswith(f"{host} is ") else why  # same content
         others = [f"`--host {other}`" for other in self._hosts if other not in self._away]
         older = f"; an older part may be read with {listed(others, 'or')}" if others else ""
         raise Refused(
@@ -275,7 +275,7 @@ class LogReader:
         try:
             return self._take(row.host, self._read(row.host, row.number, 0))
         except Refused as refusal:
-            if refusal.code != "unknown":  # its host is about to begin the log
+            if refusal.code != "unknown":  # its host has not created the log yet
                 raise
             return None
 

@@ -1,4 +1,4 @@
-"""Requests that are repeated while the master does not answer."""
+"""Retries of requests while the master does not answer."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def deadline_after(timeout: float | None) -> float:
 
 
 def ask_until_answered(look: Callable[[], T], notify: Notify, deadline: float = math.inf) -> T:
-    """Return the master's answer, however long it takes; notify once when the master is silent.
+    """Return the master's answer, retrying until the deadline; notify once if it is silent.
 
     Args:
         look: asks the master; raises `NoMaster` after some seconds without an answer.
-        notify: is told when the silence begins, and when it ends.
+        notify: takes a message when the silence begins, and one when it ends.
         deadline: monotonic seconds after which the silence is an error.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Watches processes and hosts until what is awaited has happened, or cannot happen any more."""
+"""Waits for states of processes and hosts, until they are reached or can no longer be."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 #: come: just after the start of a cluster its hosts are still registering.
 SETTLED: Final = 5.0
 
-#: What `wait` awaits of a process: "settled": a job has ended, a service runs; "ended": the
-#: process has ended, whatever the cause.
+#: Awaited state of a process. "settled": a job has ended, a service runs; "ended": the process has
+#: ended, whatever the cause.
 Until = Literal["settled", "ended"]
 #: Takes the row of an awaited process, first and with each change of its state.
 OnChange = Callable[[ProcessRow], None]
 _Verdict = Literal["done", "failed", "awaited"]
-#: Differs between two runs of a process: number of the instance, pid, restarts.
+#: Identity of one run of a process: number of the instance, pid, restarts.
 _Identity = tuple[int, int, int]
 
-#: States of a process that nothing but a restart ends.
+#: States of a process that only a restart ends.
 ENDED: Final = frozenset({"finished", "failed", "cancelled"})
 #: States that only a request of a user ends.
 UNTIL_ASKED: Final = frozenset({"failed", "cancelled", "stuck", "checkpointed"})
-#: Kinds of events by which a checkpoint, a restore or a migration ends; whether it was done.
+#: Kinds of events by which a checkpoint, a restore or a migration ends; True: it succeeded.
 _ENDINGS: Final[Mapping[str, bool]] = {
     EventKind.CHECKPOINTED: True, EventKind.RESTORED: True, EventKind.MIGRATED: True,
     EventKind.CHECKPOINT_FAILED: False, EventKind.RESTORE_FAILED: False, EventKind.STAYED: False,
@@ -42,18 +42,18 @@ _ENDINGS: Final[Mapping[str, bool]] = {
 
 @dataclass(frozen=True)
 class WaitResult:
-    """How a wait ended; true if everything that was awaited has happened.
+    """Result of a wait; true if everything awaited has happened.
 
     Attributes:
-        done: everything has happened.
+        done: everything awaited has happened.
         timed_out: the time-out passed before.
         pending: names that are still awaited. Where no time-out passed, these processes are set
             aside, and only another host or a change of one can help.
-        failed: names of the processes that can no longer come to what was awaited.
+        failed: names of the processes that can no longer reach the awaited state.
         missing: names that left the list of the master before they were seen done.
         processes: the last row of each process that is listed.
         event: the event that ended the wait, of a migration or a drain.
-        message: how it ended, of a migration or a drain; "" after a time-out.
+        message: result of a migration or a drain; "" after a time-out.
     """
 
     done: bool
@@ -87,7 +87,7 @@ def wait_for_processes(
         previous: rows from before a restart; each process, a job too, is then awaited until it runs
             in another run than its row there. None: there was no restart.
         on_change: takes rows that are not done, with each change of their states.
-        notify: is told when the master is silent.
+        notify: takes a message when the master is silent.
     """
     deadline = deadline_after(timeout)
     before = (
@@ -166,7 +166,7 @@ def wait_for_migration(
         after: sequence of the newest event before the request.
         timeout: seconds; None: no limit.
         on_change: takes the row of the process with each change of its state.
-        notify: is told when the master is silent.
+        notify: takes a message when the master is silent.
     """
     changes = _Changes(on_change)
 

@@ -1,7 +1,7 @@
-"""Reads `cluster.yaml`, `host.yaml` and `work.yaml`, and refuses what is wrong at the edge.
+"""Configuration files `cluster.yaml`, `host.yaml` and `work.yaml`: loaders with all checks.
 
-The settings themselves (`rosrm.config.settings`) import without pydantic and YAML: the runtimes of
-master and slave need only those, and the loaders here are imported when they are first asked for.
+The settings themselves (`rosrm.config.settings`) import without pydantic and YAML, because the
+runtimes of master and slave need only those. The loaders are imported on first use.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks a document against a dataclass by pydantic, and says what is wrong in our own words."""
+"""Validation of a document against a dataclass by pydantic, with error messages of our own."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 _STRICT: Final = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-#: What a pydantic error of a type wanted to see.
+#: Required kind of value for each type of pydantic error.
 _WANTED: Final = {
     "bool_type": "true or false",
     "int_type": "a whole number",
@@ -48,7 +48,7 @@ _WANTED: Final = {
 
 _UNKNOWN_KEY: Final = frozenset({"unexpected_keyword_argument", "extra_forbidden"})
 
-#: What a bound of annotated_types asks for.
+#: Wording of each bound of annotated_types.
 _BOUNDS: Final = {
     "greater_than": "greater than",
     "greater_than_equal": "at least",
@@ -58,13 +58,13 @@ _BOUNDS: Final = {
 
 
 def validated(wanted: type[T], node: Node, problems: Problems, where: str = "") -> T | None:
-    """The value of a document, or None with every problem noted.
+    """Return the value of a document, or None if there are problems, all of which are noted.
 
     Args:
-        wanted: a dataclass; its annotations say what is allowed.
+        wanted: a dataclass; its annotations define the allowed values.
         node: the document or a part of it.
-        problems: where to note what is wrong.
-        where: goes before the path of each value in messages.
+        problems: receives every problem.
+        where: prefix of each value's path in messages.
     """
     try:
         holder: Any = _holder(cast(Any, wanted)).model_validate_json(
@@ -72,7 +72,7 @@ def validated(wanted: type[T], node: Node, problems: Problems, where: str = "") 
         )
     except ValidationError as error:
         found = [dict(one) for one in error.errors(include_url=False)]
-        # Another member of a union may know the key that the one which was tried does not.
+        # A key that is unknown to the tried member of a union may belong to another member.
         for one in [one for one in found if not _is_known(wanted, one)] or found:
             _note(wanted, node, one, problems, where)
         return None
@@ -109,7 +109,7 @@ def _lies_in(node: Node, place: Place) -> bool:
 
 
 def described(value: Any) -> str:
-    """A given value for a message, short."""
+    """Return a short description of a given value for a message."""
     if value is None:
         return "nothing (null)"
     if isinstance(value, Mapping):
@@ -121,7 +121,7 @@ def described(value: Any) -> str:
 
 
 def near(given: str, allowed: Mapping[str, Any] | list[str] | tuple[str, ...]) -> str:
-    """'; did you mean X?' or '.', and what is allowed."""
+    """Return '; did you mean X?' or '.', followed by the list of allowed names."""
     close = get_close_matches(given, list(allowed), 1)
     meant = f"; did you mean {close[0]!r}?" if close else "."
     return f"{meant} Allowed: {', '.join(allowed) or 'none'}"
@@ -129,7 +129,7 @@ def near(given: str, allowed: Mapping[str, Any] | list[str] | tuple[str, ...]) -
 
 @cache
 def _holder(wanted: type[Any]) -> type[BaseModel]:
-    """A model around the dataclass: this is how pydantic passes strictness on to all inside it."""
+    """Return a model around the dataclass, through which strictness applies to all nested types."""
     return create_model("Holder", __config__=_STRICT, value=(wanted, ...))
 
 
@@ -150,7 +150,7 @@ def _note(
 
 
 def _named(path: tuple[str | int, ...], where: str) -> str:
-    """A path as people write it, after what it is a part of: `options of X: many[2].delay`."""
+    """Return a path in readable form after its section: `options of X: many[2].delay`."""
     text = ""
     for step in path:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
@@ -184,7 +184,7 @@ def _not_one_of(given: Any, expected: str) -> str:
 
 
 def _is_known(wanted: type[Any], error: Mapping[str, Any]) -> bool:
-    """Return True if an error is an unknown key which some type at its place has."""
+    """Return True if an error reports an unknown key that some type at its place has."""
     path = _path(wanted, error["loc"][1:])
     return error["type"] in _UNKNOWN_KEY and path[-1] in _keys(wanted, path[:-1])
 
@@ -210,7 +210,7 @@ def _path(wanted: Any, steps: Iterable[str | int]) -> tuple[str | int, ...]:
 
 
 def _types_at(wanted: Any, path: tuple[str | int, ...]) -> list[Any]:
-    """Return the types that may stand at a path."""
+    """Return the types that are allowed at a path."""
     found = [wanted]
     for step in path:
         found = [inner for one in found for inner in _inside(one, step)]
@@ -218,7 +218,7 @@ def _types_at(wanted: Any, path: tuple[str | int, ...]) -> list[Any]:
 
 
 def _inside(wanted: Any, step: str | int) -> Iterator[Any]:
-    """The types that may stand under a key or index of a type, unwrapped."""
+    """Yield the unwrapped types that are allowed under a key or index of a type."""
     if is_dataclass(wanted) and isinstance(wanted, type):
         hint = get_type_hints(wanted, include_extras=True).get(str(step))
         yield from _unwrapped(hint)

@@ -1,4 +1,4 @@
-"""`cluster.yaml`: the settings of a master."""
+"""Loader of `cluster.yaml`, the settings of a master."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
 from rosrm.extensions.registry import Registry
 
-#: Sections that the rules about times read.
+#: Sections that the rules on times read.
 _OF_TIME: Final = ("liveness", "control")
-#: Beat periods, in which a quiet slave is heard once, that a silence must outlast.
+#: Beat periods that `liveness.suspect` must cover; a slave without news sends one message in each.
 _BEATS: Final = 3
-#: Three times 0.2 s is a little more than 0.6 s.
+#: Tolerance for floating point: three times 0.2 s is slightly more than 0.6 s.
 _ROUNDING: Final = 1e-9
 
 
 def load_cluster(path: str | Path, registry: Registry | None = None) -> ClusterConfig:
-    """Read a master's settings; raises one `ConfigError` for everything that is wrong.
+    """Read a master's settings; raises one `ConfigError` with all problems.
 
     Args:
         path: of the file.
-        registry: the installed plugins; without it the names of plugins and their options are taken
-            as they are.
+        registry: the installed plugins; without it the names and options of plugins are not
+            checked.
     """
     return checked_cluster(read(path), path, registry)
 
 
 def default_cluster(registry: Registry | None = None) -> ClusterConfig:
-    """The settings of a master without a file, its plugins checked as those of one."""
+    """Return the settings of a master without a file, with its plugins checked as for a file."""
     return checked_cluster(parse("", "the default settings"), "", registry)
 
 
 def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> ClusterConfig:
-    """A master's settings from a document that was read; otherwise as `load_cluster`."""
+    """Return a master's settings from a parsed document; otherwise as `load_cluster`."""
     problems = Problems()
     check_kind(root, "cluster")
     config, wrong = salvaged(ClusterConfig, root, problems)
@@ -88,12 +88,12 @@ def _check_beats(root: Node, config: ClusterConfig, problems: Problems) -> None:
 
 
 def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> ClusterConfig:
-    """The same with the options of plugins checked; a default choice is looked up as well."""
+    """Return the settings with checked options of plugins, including plugins chosen by default."""
     scoring = _given(root, "scoring") or config.scoring.policy
     checkpoint = _checkpoint(root, config, plugins)
     named = root.get("migration", "strategies")
     if named is None:
-        # Of the default ones those that are installed; with none of them the first is missed.
+        # Use the installed default strategies; if there is none, report the first as missing.
         default = list(config.migration.strategies)
         there = [name for name in default if plugins.has("migration", name)]
         strategies = {
@@ -114,7 +114,7 @@ def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> Cl
 
 
 def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> str | None:
-    """As given; else the default one where it is installed, or where its options are given."""
+    """Return the given policy, or the default one if it is installed or its options are given."""
     policy, options = config.checkpoint.policy, root.get("checkpoint", "options")
     if root.get("checkpoint", "policy") is not None or policy is None:
         return policy

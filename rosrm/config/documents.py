@@ -1,7 +1,7 @@
-"""YAML with the place of every value, for messages that name line and column.
+"""YAML documents with the place of every value, for messages with line and column.
 
-Plain words are read as YAML 1.2 reads them: only `true` and `false` are booleans (not `on` or
-`no`), `010` is ten, and nothing becomes a date.
+Plain scalars follow YAML 1.2: only `true` and `false` are booleans (not `on` or `no`), `010` is
+ten, and no text becomes a date.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import yaml
 
 from rosrm.errors import ConfigError
 
-#: Most values in one file; those behind an alias count each time that it stands for them.
+#: Most values in one file; values behind an alias count at each use of the alias.
 MOST_VALUES: Final = 200_000
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Place:
-    """A line and a column of a file, from 1; line 0: an option of the command line."""
+    """Line and column of a file, from 1; line 0: an option of the command line."""
 
     file: str
     line: int
@@ -35,14 +35,14 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """One value of a document, its place, and the place of the key before it, if any."""
+    """Value of a document with its place and the place of its key, if any."""
 
     value: Value
     place: Place
     key_place: Place | None = None
 
     def plain(self) -> Any:
-        """The value alone, as JSON has it."""
+        """Return the value without places, in JSON types."""
         if isinstance(self.value, Mapping):
             return {key: item.plain() for key, item in self.value.items()}
         if isinstance(self.value, tuple):
@@ -50,14 +50,14 @@ class Node:
         return self.value
 
     def get(self, *path: str | int) -> Node | None:
-        """The value at a path, None where there is none."""
+        """Return the node at a path; None if there is none."""
         node: Node | None = self
         for step in path:
             node = None if node is None else node.child(step)
         return node
 
     def deepest(self, path: tuple[str | int, ...]) -> Node:
-        """The value at a path or, where that is missing, what would hold it."""
+        """Return the node at a path or, if that is missing, its deepest existing ancestor."""
         node = self
         for step in path:
             inner = node.child(step)
@@ -67,7 +67,7 @@ class Node:
         return node
 
     def child(self, step: str | int) -> Node | None:
-        """The value under a key or index."""
+        """Return the node under a key or index; None if there is none."""
         if isinstance(self.value, Mapping) and isinstance(step, str):
             return self.value.get(step)
         if isinstance(self.value, tuple) and isinstance(step, int) and step < len(self.value):
@@ -76,7 +76,7 @@ class Node:
 
     @property
     def items(self) -> Mapping[str, Node]:
-        """The members of a mapping; none for anything else."""
+        """Return the members of a mapping; none for any other value."""
         return self.value if isinstance(self.value, Mapping) else {}
 
 
@@ -85,7 +85,7 @@ Value = Union[None, bool, int, float, str, "tuple[Node, ...]", "Mapping[str, Nod
 
 @dataclass
 class Problems:
-    """Everything that is wrong with a file, to be said at once."""
+    """Problems of a file, collected to be reported together."""
 
     found: dict[tuple[Place, str], None] = field(default_factory=dict)
 
@@ -93,11 +93,11 @@ class Problems:
         return bool(self.found)
 
     def add(self, place: Place, text: str) -> None:
-        """Note a problem; the same one at the same place is noted once."""
+        """Note a problem; duplicates at the same place are dropped."""
         self.found[place, text] = None
 
     def raise_any(self) -> None:
-        """Raise one `ConfigError` for all of them, if there are any."""
+        """Raise one `ConfigError` for all problems, if there are any."""
         if not self.found:
             return
         lines = list(_allowed_once(f"{place}: {text}" for place, text in sorted(self.found)))
@@ -110,7 +110,7 @@ class Problems:
 
 
 def _allowed_once(lines: Iterable[str]) -> Iterator[str]:
-    """Yield the lines; each list of what is allowed is given with the first of them alone."""
+    """Yield the lines; print each list of allowed values only with its first line."""
     said = set()
     for line in lines:
         fault, mark, allowed = line.partition(" Allowed: ")
@@ -119,7 +119,7 @@ def _allowed_once(lines: Iterable[str]) -> Iterator[str]:
 
 
 def read(path: str | Path) -> Node:
-    """Read a file; raises `ConfigError` for what is unreadable, with line and column.
+    """Read a file; raises `ConfigError` with line and column if it is unreadable.
 
     `-` is the standard input.
     """
@@ -127,7 +127,11 @@ def read(path: str | Path) -> Node:
 
 
 def parse(text: str, file: str) -> Node:
-    """The document in a text; an empty one is an empty mapping."""
+    """Return the document in a text; an empty text gives an empty mapping.
+
+    Raises:
+        ConfigError: the text is not valid YAML.
+    """
     try:
         root = _Loader(text).get_single_node()
         return Node({}, Place(file, 1, 1)) if root is None else _Builder(file).build(root)
@@ -187,11 +191,11 @@ def _said(error: yaml.MarkedYAMLError) -> str:
     return " ".join(part for part in (error.context, error.problem) if part)
 
 
-# --- YAML 1.2's words -------------------------------------------------------------------------
+# --- YAML 1.2's scalars -----------------------------------------------------------------------
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes nodes with marks, with the words of YAML 1.2's core schema."""
+    """YAML loader that composes nodes with marks by the core schema of YAML 1.2."""
 
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012 - PyYAML's own shape
 
@@ -227,7 +231,7 @@ _SCALARS: Final[Mapping[str, Any]] = {
 
 
 class _Builder:
-    """Turns PyYAML's nodes into ours, noting every fault of form on the way."""
+    """Conversion of PyYAML's nodes into ours, which collects all errors of form."""
 
     def __init__(self, file: str) -> None:
         self._file = file

@@ -1,10 +1,11 @@
-"""`foreach`: one entry of a work file for many processes alike.
+"""Expansion of `foreach`: one entry of a work file for many similar processes.
 
     foreach: {i: "range(0, 60)", size: [small, large]}     # every pair: 120 processes
     foreach: [{i: 1, mb: 8}, {i: 2, mb: 80}]               # these two
 
-In every text of the entry `{i}` stands for the value, `{i:02d}` for the value in Python's format;
-a text that is nothing but `{i}` becomes the value itself, number or text. `{{` is a plain brace.
+In every text of the entry `{i}` is replaced by the value, and `{i:02d}` by the value in Python's
+format. A text that consists of `{i}` alone becomes the value itself, number or text. `{{` is a
+plain brace.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Final
 from rosrm.config.checking import described, near
 from rosrm.config.documents import Node, Problems
 
-#: Most processes that one entry may stand for.
+#: Most processes that one entry may expand to.
 MOST: Final = 10_000
 
 Scalar = bool | int | float | str
@@ -31,7 +32,7 @@ _WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
 
 
 def rows_of(foreach: Node, problems: Problems) -> list[Row]:
-    """The values that each process is made with; none, with every fault noted, if there is any."""
+    """Return the values for each process; none if there are problems, all of which are noted."""
     faults = Problems()
     rows = _rows(foreach, faults)
     if not rows and not faults:
@@ -54,7 +55,7 @@ def _rows(foreach: Node, problems: Problems) -> list[Row]:
 
 
 def substituted(node: Node, row: Row, problems: Problems) -> Node:
-    """A document with the values of one row put into every text of it, keys too."""
+    """Return a document with the values of one row substituted in all its texts and keys."""
     if isinstance(node.value, str):
         return Node(_text(node, node.value, row, problems), node.place, node.key_place)
     if isinstance(node.value, tuple):

@@ -1,4 +1,4 @@
-"""`host.yaml`: the settings of a slave."""
+"""Loader of `host.yaml`, the settings of a slave."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import Registry
 
-#: What a slice is measured against, and so must be given for it.
+#: Resources whose budget is required for the scope "slice".
 _OF_A_SLICE = ("memory", "cpu")
 
 
 def load_host(path: str | Path, registry: Registry | None = None) -> HostConfig:
-    """Read a slave's settings; raises one `ConfigError` for everything that is wrong.
+    """Read a slave's settings; raises one `ConfigError` with all problems.
 
     Args:
         path: of the file.
-        registry: the installed plugins; without it the names of plugins and their options are taken
-            as they are.
+        registry: the installed plugins; without it the names and options of plugins are not
+            checked.
     """
     root, problems = read(path), Problems()
     check_kind(root, "host")

@@ -1,4 +1,4 @@
-"""The kind of a configuration file, by its keys or else by its name."""
+"""Kind of a configuration file, by its keys or else by its name."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import ConfigError
 from rosrm.wording import get_close_matches
 
-#: Keys of a simulation's workload. The distribution `rosrm-simulate` reads such a file; its keys
-#: are here because a file that is given to the wrong command is named without that distribution.
+#: Keys of a simulation's workload. The distribution `rosrm-simulate` reads such a file. The keys
+#: are here so that other commands recognise such a file without that distribution.
 SIMULATION_KEYS: Final = (
     "name", "seed", "until", "hosts", "processes", "model", "cluster", "variants",
 )  # fmt: skip
@@ -29,7 +29,7 @@ _KEYS: Final = {
 _NEEDED: Final = {"work": "processes", "simulation": "hosts"}
 #: End of a file's name, before `.yaml`.
 _NAMES: Final = {"cluster": "cluster", "host": "host", "work": "work", "sim": "simulation"}
-#: What uses a file of each kind.
+#: Command that uses a file of each kind.
 _COMMANDS: Final = {
     "cluster": "rosrm master --config",
     "host": "rosrm slave --config",
@@ -42,7 +42,7 @@ def kind_of(root: Node) -> str:
     """Return the kind of file: "cluster", "host", "work" or "simulation".
 
     Raises:
-        ConfigError: its keys fit none, or several as well, and its name tells none.
+        ConfigError: its keys fit no kind, or several equally, and its name fits none either.
     """
     best = _best(set(root.items))
     if len(best) == 1:
@@ -67,7 +67,7 @@ def kind_of(root: Node) -> str:
 
 
 def check_kind(root: Node, wanted: str) -> None:
-    """Raise `ConfigError` if most keys are those of another kind of file."""
+    """Raise `ConfigError` if most keys belong to another kind of file."""
     given = set(root.items)
     best = _best(given)
     if len(best) != 1 or best[0] == wanted:
@@ -82,13 +82,13 @@ def check_kind(root: Node, wanted: str) -> None:
 
 
 def _best(given: AbstractSet[str]) -> list[str]:
-    """Return the kinds with most of the keys; none if no kind has any of them."""
+    """Return the kinds that match most of the keys; none if no kind matches any key."""
     fits = {kind: len(_belonging(given, kind)) for kind in _KEYS}
     most = max(fits.values())
     return [kind for kind, count in fits.items() if count == most > 0]
 
 
 def _belonging(given: AbstractSet[str], kind: str) -> AbstractSet[str]:
-    """Return the keys that a kind of file has; none if its needed key is missing."""
+    """Return the keys that belong to a kind of file; none if its required key is missing."""
     without = kind in _NEEDED and _NEEDED[kind] not in given
     return frozenset() if without else given & _KEYS[kind]

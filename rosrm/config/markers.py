@@ -1,7 +1,6 @@
-"""Marks on settings whose form in a file differs from their value.
+"""Annotations of settings whose form in a file differs from their value.
 
-pydantic calls the hooks below when it reads a file; nothing else does, so that the settings can be
-imported without it.
+Only pydantic calls the hooks below, when it reads a file. So the settings import without pydantic.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ from typing import Any, Final
 
 @dataclass(frozen=True)
 class NullIsEmpty:
-    """Options may be left out after the colon: null stands for none."""
+    """Mark of options that may be left out after the colon; null means no options."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to put `{}` for null."""
+        """Return the schema that replaces null by `{}`."""
         from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_before_validator_function(
@@ -28,17 +27,17 @@ class NullIsEmpty:
 
 @dataclass(frozen=True)
 class OptionsByName:
-    """Plugins are named in a list, or in a mapping from name to options."""
+    """Mark of plugins given as a list of names, or as a mapping from name to options."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to make a list of names a mapping to no options."""
+        """Return the schema that converts a list of names into a mapping to no options."""
         from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_before_validator_function(self.named, handler(source))
 
     @staticmethod
     def named(given: Any) -> Any:
-        """A list of names as a mapping; anything else as it is."""
+        """Return a list of names as a mapping; any other value unchanged."""
         if not isinstance(given, list):
             return given
         strange = [name for name in given if not isinstance(name, str)]
@@ -52,16 +51,16 @@ class OptionsByName:
 
 @dataclass(frozen=True)
 class RosSection:
-    """The section `ros` is nested in a file and flat as a value."""
+    """Mark of the section `ros`, which is nested in a file and flat as a value."""
 
     def in_file(self) -> type[Any]:
-        """The form in a file."""
+        """Return the type of the section as written in a file."""
         from rosrm.config.ros import RosInFile  # noqa: PLC0415 - only files need pydantic
 
         return RosInFile
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to read the file's form and to make the value of it."""
+        """Return the schema that reads the file's form and converts it into the value."""
         from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         form: Any = self.in_file()
@@ -72,17 +71,17 @@ class RosSection:
 
 @dataclass(frozen=True)
 class PlainWord:
-    """Text that may be written without quotes even where YAML sees a number or a boolean."""
+    """Mark of text that needs no quotes even if YAML reads a number or a boolean."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to make text of a scalar."""
+        """Return the schema that converts a scalar into text."""
         from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_before_validator_function(self.text, handler(source))
 
     @staticmethod
     def text(given: Any) -> Any:
-        """A scalar as text; anything else as it is."""
+        """Return a scalar as text; any other value unchanged."""
         if isinstance(given, bool):
             return "true" if given else "false"
         return str(given) if isinstance(given, (int, float)) else given
@@ -90,17 +89,21 @@ class PlainWord:
 
 @dataclass(frozen=True)
 class Words:
-    """A list of words, or one text that is split as a shell would."""
+    """Mark of a list of words, or of one text that is split as a shell splits it."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to split a text."""
+        """Return the schema that splits a text into words."""
         from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_before_validator_function(self.split, handler(source))
 
     @staticmethod
     def split(given: Any) -> Any:
-        """A text or list as words; anything else as it is."""
+        """Return a text or list as words; any other value unchanged.
+
+        Raises:
+            ValueError: the text cannot be split, or has shell syntax outside quotes.
+        """
         if not isinstance(given, str):
             return tuple(given) if isinstance(given, list) else given
         try:
@@ -119,7 +122,7 @@ class Words:
 
 #: Quoted and escaped parts of a text.
 _QUOTED: Final = re.compile(r"""\\.|'[^']*'|"(?:\\.|[^"\\])*\"""", re.DOTALL)
-#: Syntax that a shell would act on, `~` at the start of an argument included.
+#: Syntax that a shell would interpret, including `~` at the start of an argument.
 _SHELL_SYNTAX: Final = re.compile(r"&&|\|\||>>|<<|[|&;<>`*]|\$[\w{(]+|(?<=\s)~(?=/|\s|$)")
 
 

@@ -1,4 +1,4 @@
-"""Makes an entry of a work file complete: shorthands written out, `defaults` merged under it."""
+"""Completion of work file entries: shorthands written out, `defaults` merged in."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Final
 
 from rosrm.config.documents import Node
 
-#: What says which program runs: an entry's own word displaces all of the defaults'.
+#: Keys that select the program; one of them in an entry replaces all of them in the defaults.
 _PROGRAM: Final = ("package", "executable", "module", "command")
 
 
 def written_out(entry: Node) -> Node:
-    """The same with every shorthand in its long form, so that merging knows the parts."""
+    """Return an entry with all shorthands in long form, as merging requires."""
     members = {
         name: _LONG_FORMS[name](node) if name in _LONG_FORMS else node
         for name, node in entry.items.items()
@@ -21,7 +21,7 @@ def written_out(entry: Node) -> Node:
 
 
 def merged(defaults: Node, entry: Node) -> Node:
-    """An entry with the defaults under it, mappings merged in depth; both written out."""
+    """Return an entry with defaults for missing keys, mappings merged deeply; both written out."""
     under = dict(defaults.items)
     if any(name in entry.items for name in _PROGRAM):
         under = {name: node for name, node in under.items() if name not in _PROGRAM}
@@ -31,7 +31,7 @@ def merged(defaults: Node, entry: Node) -> Node:
 
 
 def in_depth(under: Node, over: Node) -> Node:
-    """One document over another: mappings in depth, anything else as a whole."""
+    """Return `over` merged over `under`: mappings deeply, other values as a whole."""
     if not isinstance(under.value, Mapping) or not isinstance(over.value, Mapping):
         return over
     members = dict(under.items)
@@ -46,7 +46,7 @@ def _without(node: Node, name: str) -> Node:
 
 
 def _word(name: str) -> Callable[[Node], Node]:
-    """`restart: always` stands for `restart: {when: always}`."""
+    """Return the conversion of `restart: always` to `restart: {when: always}`, for any key."""
 
     def long_form(node: Node) -> Node:
         if isinstance(node.value, Mapping):
@@ -57,7 +57,7 @@ def _word(name: str) -> Callable[[Node], Node]:
 
 
 def _pairs(node: Node) -> Node:
-    """`[[from, to]]` stands for `{from: to}`, as in ROS 2 launch."""
+    """Convert `[[from, to]]` to `{from: to}`, as in ROS 2 launch."""
     if not isinstance(node.value, tuple):
         return node
     members: dict[str, Node] = {}

@@ -1,4 +1,4 @@
-"""Names that are given twice in a file."""
+"""Check for duplicate names in a file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from rosrm.config.documents import Node, Place, Problems
 
 
 def refuse_namesakes(nodes: Sequence[Node], what: str, problems: Problems) -> None:
-    """A name is given once in a list; `what` is said of what has it."""
+    """Note every duplicate name in a list of entries.
+
+    Args:
+        nodes: the entries.
+        what: kind of the entries, for messages.
+        problems: receives every problem.
+    """
     first: dict[str, Place] = {}
     for node in nodes:
         name = node.get("name")

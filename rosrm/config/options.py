@@ -1,4 +1,4 @@
-"""Checks the plugins that a file names, and their options, against what is installed."""
+"""Check of the plugins that a file names, and of their options, against the installed ones."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from rosrm.extensions.units import IsResource
 from rosrm.model.codec import to_plain
 from rosrm.model.values import ProcessSpec
 
-#: Stands among `probes` for all that are read where the file names none.
+#: Entry of `probes` that selects all probes that are read by default.
 DEFAULT_PROBES: Final = "default"
 
 
 def _holds_resources(hint: Any) -> bool:
-    """Return True if the keys or items of an option are marked as names of resources."""
+    """Return True if the keys or items of an option are annotated as names of resources."""
     marks = getattr(next(iter(get_args(hint)), None), "__metadata__", ())
     return any(isinstance(mark, IsResource) for mark in marks)
 
 
 class PluginCheck:
-    """Looks every chosen plugin up; without a registry it lets names and options pass as they are.
+    """Check of every chosen plugin; without a registry, names and options are not checked.
 
-    Options come back as plain JSON values in base units, as the runtimes take them.
+    Options are returned as plain JSON values in base units, as the runtimes expect them.
     """
 
     def __init__(self, registry: Registry | None, problems: Problems) -> None:
@@ -36,7 +36,7 @@ class PluginCheck:
         self._problems = problems
 
     def has(self, kind: str, name: str) -> bool:
-        """Whether a plugin is installed; without a registry it is taken to be."""
+        """Return True if a plugin is installed; always True without a registry."""
         return self._registry is None or name in self._registry.names(kind)
 
     def standby_fault(self, spec: ProcessSpec) -> str:
@@ -54,14 +54,14 @@ class PluginCheck:
     def choice(
         self, kind: str, name: str, named: Node, options: Node | None, *, own: bool = False
     ) -> Mapping[str, Any]:
-        """The options of one chosen plugin.
+        """Return the options of one chosen plugin.
 
         Args:
             kind: as in `Registry.offer`.
             name: of the offer.
-            named: where the file names it.
-            options: as the file gives them; None: it gives none.
-            own: they are of one process.
+            named: value that names the plugin in the file.
+            options: as given in the file; None: none.
+            own: True for the options of one process.
         """
         given = options if options is not None and options.value is not None else None
         plain = {} if given is None or not given.items else given.plain()
@@ -89,7 +89,7 @@ class PluginCheck:
             return {}
 
     def _check_names(self, wanted: type[Any], given: Node, title: str) -> None:
-        """Note names of resources that no probe reads, where an option is marked to hold such."""
+        """Note unknown names of resources in options that are annotated to hold such names."""
         for name, hint in get_type_hints(wanted, include_extras=True).items():
             node = given.child(name)
             if node is not None and _holds_resources(hint):
@@ -102,8 +102,8 @@ class PluginCheck:
 
         Args:
             named: a mapping from resources, or a list of them.
-            where: goes before each message.
-            probes: that are chosen; None: any that is installed.
+            where: prefix of each message.
+            probes: the chosen ones; None: all installed ones.
         """
         if self._registry is None or named is None:
             return
@@ -121,9 +121,9 @@ class PluginCheck:
             self._problems.add(node.key_place or node.place, f"{where}: {note}")
 
     def by_name(self, kind: str, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
-        """The options of each plugin in a list of names or a mapping from name to options.
+        """Return the options of each plugin in a list of names or a mapping from name to options.
 
-        Among probes `default` stands for the default ones.
+        For probes, the name `default` selects the default ones.
         """
         if chosen is None:
             return {}

@@ -1,4 +1,4 @@
-"""One process as a work file describes it, and the rules that it must keep."""
+"""Process entry of a work file, and its validation rules."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ListOfWords = Annotated[tuple[Text, ...], Words()]
 
 @dataclass(frozen=True, slots=True)
 class RestartInFile:
-    """Policy for restarts of an ended process on its host; `when` defaults by its kind."""
+    """Policy for restarts of an ended process on its host; `kind` gives the default of `when`."""
 
     when: Literal["never", "on-failure", "always"] | None = None
     delay: Seconds = _RESTART.delay
@@ -49,7 +49,7 @@ class RestartInFile:
 
 @dataclass(frozen=True, slots=True)
 class MigrationInFile:
-    """How a process moves to another host; no strategy: it stays."""
+    """Migration of a process to another host; no strategy: the process stays."""
 
     strategy: str | None = None
     overlap: bool = True
@@ -58,7 +58,7 @@ class MigrationInFile:
 
 @dataclass(frozen=True, slots=True)
 class ReadinessInFile:
-    """When an instance counts as ready."""
+    """Condition for an instance to count as ready."""
 
     kind: Literal["auto", "graph", "running"] = "auto"
     timeout: PositiveSeconds = _READINESS.timeout
@@ -66,7 +66,7 @@ class ReadinessInFile:
 
 @dataclass(frozen=True, slots=True)
 class StopInFile:
-    """The time between SIGINT, SIGTERM and SIGKILL."""
+    """Seconds between SIGINT, SIGTERM and SIGKILL."""
 
     interrupt_grace: Seconds = _STOP.interrupt_grace
     terminate_grace: Seconds = _STOP.terminate_grace
@@ -74,7 +74,7 @@ class StopInFile:
 
 @dataclass(frozen=True, slots=True)
 class HostLossInFile:
-    """What becomes of it when its host is lost."""
+    """Reaction of the master when the host of a process is lost."""
 
     then: Literal["wait", "elsewhere", "stop"] = "wait"
     delay: Seconds = 0.0
@@ -82,7 +82,7 @@ class HostLossInFile:
 
 @dataclass(frozen=True, slots=True)
 class IsolationInFile:
-    """What its host does with it when it does not reach the master; no time: soon enough."""
+    """Reaction of a host that cannot reach the master; 0 s: before the process runs elsewhere."""
 
     then: Literal["keep", "stop"] = "keep"
     after: Seconds = 0.0
@@ -90,7 +90,7 @@ class IsolationInFile:
 
 @dataclass(frozen=True, slots=True)
 class StandbyInFile:
-    """A second instance on another host, that follows the state."""
+    """Second instance on another host that follows the state."""
 
     wanted: bool = True
     apart_by: tuple[Text, ...] = ()
@@ -98,7 +98,7 @@ class StandbyInFile:
 
 @dataclass(frozen=True, slots=True)
 class HealthInFile:
-    """What it must do to count as healthy."""
+    """Conditions for an instance to count as healthy."""
 
     topic: str = ""
     rate: Annotated[float, Quantity(low=0.0, high=10_000.0, hint="Hz")] = 0.0
@@ -108,7 +108,7 @@ class HealthInFile:
 
 @dataclass(frozen=True, slots=True)
 class LabelsInFile:
-    """The host labels that a process requires, prefers or avoids."""
+    """Host labels that a process requires, prefers or avoids."""
 
     required: Labels = field(default_factory=lambda: EMPTY)
     preferred: Labels = field(default_factory=lambda: EMPTY)
@@ -117,7 +117,7 @@ class LabelsInFile:
 
 @dataclass(frozen=True, slots=True)
 class ProcessInFile:
-    """One process, in the words of ROS 2 launch; shorthands have been written out."""
+    """One process, with the keys of ROS 2 launch; shorthands are written out already."""
 
     name: str
     namespace: str = ""
@@ -146,18 +146,22 @@ class ProcessInFile:
 
     @property
     def is_ros(self) -> bool:
-        """A ROS node: as said, else whatever comes from a ROS package."""
+        """Return True for a ROS node: as given by `ros`, else for programs of a ROS package."""
         return self.package is not None if self.ros is None else self.ros
 
     @property
     def restart_policy(self) -> RestartPolicy:
-        """Return the policy; a service restarts after a power cut, a job may not be repeatable."""
+        """Return the restart policy.
+
+        By default a service restarts on failure, as after a power cut. A job never restarts,
+        because it may not be repeatable.
+        """
         when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
         policy: RestartPolicy = _same(RestartPolicy, self.restart)
         return replace(policy, when=when)
 
     def spec(self) -> ProcessSpec:
-        """The same as the core takes it."""
+        """Return the process as the spec that the core uses."""
         return ProcessSpec(
             name=self.name,
             namespace=self.namespace,
@@ -189,12 +193,12 @@ class ProcessInFile:
 
 
 def _same(wanted: type[Any], of: Any) -> Any:
-    """A value of the core with the fields of its form in the file."""
+    """Return a value of the core with the fields of its form in the file."""
     return wanted(**{f.name: getattr(of, f.name) for f in fields(wanted)})
 
 
 def flattened(parameters: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested parameters by their dotted names, as ROS has them."""
+    """Yield nested parameters by their dotted names, as in ROS."""
     for name, value in parameters.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{before}{name}.")
@@ -213,7 +217,7 @@ _ROS_ONLY: Final = ("namespace", "parameters", "remappings")
 
 @dataclass(frozen=True, slots=True)
 class Complaint:
-    """A rule that is broken: the path of the culprit in the entry, and what is wrong."""
+    """Violation of a rule: path of the wrong value in the entry, and a description."""
 
     path: tuple[str, ...]
     text: str
@@ -222,11 +226,11 @@ class Complaint:
 def complaints(
     process: ProcessInFile, wrong: AbstractSet[str] = frozenset()
 ) -> Iterator[Complaint]:
-    """Yield every rule that a process breaks.
+    """Yield every violation of a rule by a process.
 
     Args:
-        process: as far as it could be read.
-        wrong: keys whose values could not be read; rules that read them are left out.
+        process: the entry; unreadable values have their defaults.
+        wrong: keys whose values could not be read; rules that read them are skipped.
     """
     for rule, keys in _RULES:
         if wrong.isdisjoint(keys):
@@ -341,7 +345,7 @@ def _fault_of_parameter(value: Any) -> str:
 
 _Rule = Callable[[ProcessInFile], Iterator[Complaint]]
 _PROGRAM: Final = ("package", "executable", "module", "command")
-#: Each rule, and the keys that it reads.
+#: Each rule with the keys that it reads.
 _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_program, _PROGRAM),
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),

@@ -1,4 +1,4 @@
-"""The section `ros` of both files."""
+"""Section `ros` of `cluster.yaml` and `host.yaml`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _transports(given: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class DiscoveryInFile:
-    """How participants find each other: by multicast within a range, or by a server."""
+    """Discovery of participants: by multicast within a range, or by a server."""
 
     range: Literal["", "localhost", "subnet", "off", "system_default"] = ""
     server: Annotated[str, AfterValidator(_server)] = _DEFAULT.discovery_server
@@ -45,7 +45,7 @@ class DiscoveryInFile:
 
 @dataclass(frozen=True, slots=True)
 class RosInFile:
-    """The section as it is written."""
+    """Section `ros` as written in a file."""
 
     domain: Annotated[int, Quantity(high=232, whole=True)] | None = _DEFAULT.domain
     discovery: DiscoveryInFile = field(default_factory=DiscoveryInFile)
@@ -53,7 +53,7 @@ class RosInFile:
     namespace: Annotated[str, AfterValidator(_namespace)] = _DEFAULT.namespace
 
     def settings(self) -> RosSettings:
-        """The same as a value."""
+        """Return the section as settings."""
         return RosSettings(
             domain=self.domain,
             discovery_range=self.discovery.range,

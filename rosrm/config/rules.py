@@ -1,4 +1,4 @@
-"""Rules of a file that no single value can break."""
+"""Rules on names and amounts of a file, and resolution of paths relative to the file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 
 
 def check_name(node: Node | None, what: str, problems: Problems) -> None:
-    """Names become names of files and topics."""
+    """Note a name that cannot become a part of file names and topics."""
     if node is None or not isinstance(node.value, str) or _NAME.fullmatch(node.value):
         return
     problems.add(
@@ -27,12 +27,12 @@ def check_name(node: Node | None, what: str, problems: Problems) -> None:
 def check_amounts(
     node: Node | None, where: str, problems: Problems, *, above: bool = False
 ) -> None:
-    """Amounts carry the units of their resource; a budget is above 0."""
+    """Note amounts whose unit does not fit their resource; with `above`, also those not above 0."""
     for resource, amount in (node.items if node else {}).items():
         try:
             ANY_AMOUNT.parse(amount.plain())
         except ValueError:
-            continue  # no amount of anything: noted already
+            continue  # not an amount at all, which was noted before
         try:
             value = amount_of(resource, amount.plain())
         except ValueError as error:
@@ -43,14 +43,14 @@ def check_amounts(
 
 
 def settled(directory: Path, file: str | Path) -> Path:
-    """A directory that a file names: `~` is the user's, a relative one is beside the file."""
+    """Return a directory with `~` expanded; a relative one is joined to the file's directory."""
     return Path(file).absolute().parent / directory.expanduser()
 
 
 def settled_on_host(path: str, file: str | Path) -> str:
     """Return a path for the host that runs a process.
 
-    A relative path is beside the file. `~` stays for the slave, because the home of its user may
-    be another one there.
+    A relative path is joined to the file's directory. `~` stays for the slave, because the home of
+    its user may differ there.
     """
     return path if path.startswith("~") else os.path.normpath(Path(file).absolute().parent / path)

@@ -1,8 +1,8 @@
-"""The settings of a master and of a slave: plain frozen values with their defaults.
+"""Settings of a master and of a slave: plain frozen values with their defaults.
 
-`cluster.yaml` and `host.yaml` have the same shape and the same names (`ros` alone is nested there),
-and the annotations say what is allowed. `rosrm.config` reads and checks the files; the runtimes get
-what was checked as JSON, and import this module without pydantic.
+`cluster.yaml` and `host.yaml` have the same structure and names (only `ros` is nested there). The
+annotations define the allowed values. `rosrm.config` reads and checks the files. The runtimes
+receive the checked settings as JSON, and import this module without pydantic.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import EMPTY
 
-#: Upper limits where the file sets none: memory as in the paper, CPU and disk with a reserve.
+#: Default upper limits: memory as in the paper, CPU and disk with a reserve.
 DEFAULT_LIMITS: Final[Mapping[str, float]] = {"memory": 0.8, "cpu": 0.9, "disk": 0.9}
 
 _CORE: Final = CoreSettings()
@@ -42,16 +42,16 @@ Scope = Literal["machine", "cgroup", "slice"]
 
 
 def default_state(name: str, role: str) -> Path:
-    """Where a master or slave of a name keeps its files when nothing else is said."""
+    """Return the default state directory of a master or slave of a name."""
     base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(base) / "rosrm" / name / role
 
 
 def default_scope() -> Scope:
-    """What a slave measures when its file does not say: ROSRM_SCOPE, or the machine.
+    """Return the default scope of a slave's probes: ROSRM_SCOPE, or "machine".
 
     Raises:
-        ConfigError: the variable has another word.
+        ConfigError: the variable has a value that is not allowed.
     """
     scopes: Mapping[str, Scope] = {"": "machine", "machine": "machine", "cgroup": "cgroup"}
     word = os.environ.get("ROSRM_SCOPE", "")
@@ -65,7 +65,7 @@ def default_scope() -> Scope:
 
 @dataclass(frozen=True, slots=True)
 class ScoringChoice:
-    """The policy that orders the hosts that fit, by name, with its own options."""
+    """Name and options of the scoring policy, which orders the hosts that fit."""
 
     policy: str = "weighted"
     options: Options = field(default_factory=lambda: EMPTY)
@@ -73,7 +73,7 @@ class ScoringChoice:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointChoice:
-    """The policy that keeps states on other hosts, with its own options; None: there is none."""
+    """Name and options of the policy for replicas on other hosts; None: no replication."""
 
     policy: str | None = "other-host"
     options: Options = field(default_factory=lambda: EMPTY)
@@ -81,15 +81,16 @@ class CheckpointChoice:
 
 @dataclass(frozen=True, slots=True)
 class MigrationSettings:
-    """What may move, and how calmly.
+    """Migration strategies and the limits on migrations.
 
     Attributes:
-        strategies: that specs may name, each with its options; the first is preferred.
-        cooldown: seconds after a move in which a process is not moved again by itself.
-        hysteresis: seconds that a host must be over a limit before anything moves.
+        strategies: those that specs may name, each with its options; the first is preferred.
+        cooldown: seconds after a migration in which the master does not migrate the process again
+            without a request.
+        hysteresis: seconds that a host must be over a limit before the master evicts a process.
         headroom: fraction by which a destination stays under each of its limits.
-        max_in_flight: most moves at a time.
-        automatic: the master moves processes from hosts that are over a limit.
+        max_in_flight: most migrations at a time.
+        automatic: the master evicts processes from hosts that are over a limit.
     """
 
     strategies: Annotated[Mapping[str, Options], OptionsByName()] = field(
@@ -104,10 +105,10 @@ class MigrationSettings:
 
 @dataclass(frozen=True, slots=True)
 class QueueSettings:
-    """The order of what waits.
+    """Order of the queue.
 
     Attributes:
-        backfill: those behind a process that waits for room may pass it.
+        backfill: processes may overtake a process that waits for room.
     """
 
     backfill: bool = _CORE.backfill
@@ -115,11 +116,12 @@ class QueueSettings:
 
 @dataclass(frozen=True, slots=True)
 class ProcessDefaults:
-    """What is assumed of a process that says nothing.
+    """Default demand of processes.
 
     Attributes:
-        needs: amounts by resource, of a process that declares none and of which none were learned.
-        settle: seconds after which such an estimate no longer counts against its host.
+        needs: amounts by resource, for a process that declares none and for which none were
+            learned.
+        settle: seconds after which such an estimate no longer counts as load of its host.
     """
 
     needs: Mapping[str, Amount] = field(default_factory=lambda: dict(_CORE.default_needs))
@@ -128,11 +130,11 @@ class ProcessDefaults:
 
 @dataclass(frozen=True, slots=True)
 class LivenessSettings:
-    """When a silent host is no longer trusted.
+    """Time limits for silent hosts.
 
     Attributes:
-        suspect: seconds of silence after which it gets no new work.
-        lease: seconds of silence after which it is lost.
+        suspect: seconds without contact after which a host gets no new work.
+        lease: seconds without contact after which a host is lost.
     """
 
     suspect: PositiveSeconds = _CORE.suspect
@@ -141,12 +143,12 @@ class LivenessSettings:
 
 @dataclass(frozen=True, slots=True)
 class ControlSettings:
-    """The requests between the parts.
+    """Times of the requests between master and slaves.
 
     Attributes:
         max_age: seconds, by the receiver's clock, after which a request is refused as stale.
         beat_period: seconds between the master's beats.
-        order_retry: seconds after which an order that was not answered is given again.
+        order_retry: seconds after which an unanswered order is sent again.
     """
 
     max_age: PositiveSeconds = 5.0
@@ -156,12 +158,12 @@ class ControlSettings:
 
 @dataclass(frozen=True, slots=True)
 class JournalSettings:
-    """The durable record.
+    """Durable journal of events and intents.
 
     Attributes:
         sync: "normal" survives a SIGKILL of the master; "full" a power failure too.
-        keep_events: newest events kept.
-        keep_ended: processes that are over and still known, those that ended last.
+        keep_events: number of newest events kept.
+        keep_ended: number of terminal processes that are not garbage-collected, the last to end.
     """
 
     sync: Literal["normal", "full"] = "normal"
@@ -171,12 +173,12 @@ class JournalSettings:
 
 @dataclass(frozen=True, slots=True)
 class RecordSettings:
-    """The record of a run, for `rosrm simulate`.
+    """Recording of a master's run, for `rosrm simulate`.
 
     Attributes:
-        directory: for the files, one for each run; empty: nothing is recorded.
-        max_size: bytes of one file; then the record ends, and the master goes on.
-        keep: newest files kept.
+        directory: for the files, one for each run; empty: no recording.
+        max_size: most bytes of one file; there the recording ends, and the master continues.
+        keep: number of newest files kept.
     """
 
     directory: Path = Path()
@@ -186,22 +188,22 @@ class RecordSettings:
 
 @dataclass(frozen=True, slots=True)
 class ClusterConfig:
-    """A master's settings: `cluster.yaml`.
+    """Settings of a master (`cluster.yaml`).
 
     Attributes:
         name: of the cluster and its master.
         ros: domain, discovery and transports.
         state: the master's directory; by default under XDG_STATE_HOME.
         scoring: the policy that orders the hosts that fit.
-        migration: what moves.
-        queue: what waits.
+        migration: strategies and limits of migrations.
+        queue: order of the queue.
         defaults: of processes.
-        liveness: of hosts.
-        control: of requests.
-        journal: of events and intent.
-        record: of everything that the master is told, to be replayed.
-        checkpoint: the policy that keeps states of processes on other hosts, if any.
-        delivery_timeout: seconds within which a slave must take up an assignment.
+        liveness: time limits for silent hosts.
+        control: times of requests.
+        journal: of events and intents.
+        record: recording of all events that the master receives, for replay.
+        checkpoint: the policy that places replicas of snapshots on other hosts, if any.
+        delivery_timeout: seconds within which a slave must accept an assignment.
     """
 
     name: str = "rosrm"
@@ -219,12 +221,12 @@ class ClusterConfig:
     delivery_timeout: PositiveSeconds = _CORE.delivery_timeout
 
     def __post_init__(self) -> None:
-        """Fill in the state directory, which depends on the name."""
+        """Set the default of the state directory, which depends on the name."""
         if self.state == Path():
             object.__setattr__(self, "state", default_state(self.name, "master"))
 
     def core(self) -> CoreSettings:
-        """The part that the master's core is told."""
+        """Return the part of the settings that the master's core uses."""
         return CoreSettings(
             backfill=self.queue.backfill,
             default_needs=self.defaults.needs,
@@ -242,12 +244,12 @@ class ClusterConfig:
         )
 
     def to_json(self) -> str:
-        """As the master's runtime reads it."""
+        """Return the settings as JSON for the master's runtime."""
         return json.dumps(to_plain(self))
 
     @classmethod
     def from_json(cls, text: str | bytes) -> ClusterConfig:
-        """The inverse of `to_json`; raises `ValueError`."""
+        """Return the settings from the result of `to_json`; raises `ValueError`."""
         return from_plain(cls, json.loads(text))
 
 
@@ -256,11 +258,11 @@ class ClusterConfig:
 
 @dataclass(frozen=True, slots=True)
 class LogSettings:
-    """The logs of the processes.
+    """Logs of the processes.
 
     Attributes:
-        max_bytes: of one log file; then it is rotated.
-        keep: rotated files kept beside the current one.
+        max_bytes: size at which a log file is rotated.
+        keep: number of rotated files kept beside the current one.
     """
 
     max_bytes: Annotated[int, Quantity("size", low=4096, whole=True)] = 10_000_000
@@ -269,12 +271,12 @@ class LogSettings:
 
 @dataclass(frozen=True, slots=True)
 class KeepSettings:
-    """The kept states of stateful processes.
+    """Snapshots of stateful processes, and replicas for other hosts.
 
     Attributes:
-        every: seconds by which the state that a node keeps here may be behind.
-        max_bytes: of the states of other hosts' processes that are kept here, all together.
-        max_rate: bytes a second that are sent to other hosts, all together.
+        every: most seconds by which a node's snapshot on this host may be behind its state.
+        max_bytes: most bytes of all replicas of other hosts' processes on this host.
+        max_rate: most bytes a second sent to other hosts, in total.
     """
 
     every: Seconds = 1.0
@@ -284,11 +286,11 @@ class KeepSettings:
 
 @dataclass(frozen=True, slots=True)
 class HostControlSettings:
-    """The requests that a slave takes.
+    """Requests that a slave accepts.
 
     Attributes:
-        max_age: seconds, by the slave's clock, after which a request is refused as stale; never
-            less than three readings take.
+        max_age: seconds, by the slave's clock, after which a request is refused as stale; at
+            least three periods of readings.
     """
 
     max_age: PositiveSeconds = 5.0
@@ -296,25 +298,26 @@ class HostControlSettings:
 
 @dataclass(frozen=True, slots=True)
 class HostConfig:
-    """A slave's settings: `host.yaml`.
+    """Settings of a slave (`host.yaml`).
 
     Attributes:
-        host: name of the host; one live slave for each name.
+        host: name of the host; each name has at most one live slave.
         ros: domain, discovery and transports.
         state: the slave's directory; by default under XDG_STATE_HOME.
-        labels: what processes may require, prefer or avoid.
+        labels: that processes may require, prefer or avoid.
         scope: what the probes measure: the machine, the cgroup that the slave runs in, or the
             slave's own process tree against `budget`.
-        budget: amounts by resource that the scope "slice" counts as 1.0.
-        limits: upper limits, fractions by resource; those not named keep their default.
+        budget: amounts by resource that correspond to usage 1.0 in the scope "slice".
+        limits: upper limits, fractions by resource; resources that are not named keep the default.
         rate: of `resource_info`, Hz.
-        probes: chosen by name, each with its options; None: the default ones.
-        max_processes: most processes held at a time; 0: no bound.
-        max_starting: most processes started at a time, until they are ready; 0: no bound.
+        probes: names of the chosen probes, each with its options; None: the default ones.
+        max_processes: most processes held at a time; 0: no limit.
+        max_starting: most processes that start at a time, until they are ready; 0: no limit.
         logs: of the processes.
         control: of requests.
-        keep: of states.
-        on_stop: a slave that is stopped stops its processes, or keeps them with the supervisor.
+        keep: of snapshots.
+        on_stop: "stop": a slave that is stopped stops its processes; "keep": the supervisor keeps
+            them running.
     """
 
     host: str = field(default_factory=socket.gethostname)
@@ -334,21 +337,21 @@ class HostConfig:
     on_stop: Literal["stop", "keep"] = "stop"
 
     def __post_init__(self) -> None:
-        """Fill in the state directory, which depends on the name, and the default limits."""
+        """Set the defaults of the state directory, which depends on the name, and of the limits."""
         if self.state == Path():
             object.__setattr__(self, "state", default_state(self.host, "slave"))
         object.__setattr__(self, "limits", {**DEFAULT_LIMITS, **self.limits})
 
     @property
     def period(self) -> float:
-        """Of `resource_info`, seconds."""
+        """Return the period of `resource_info` in seconds."""
         return 1.0 / self.rate
 
     def to_json(self) -> str:
-        """As the slave's runtime reads it."""
+        """Return the settings as JSON for the slave's runtime."""
         return json.dumps(to_plain(self))
 
     @classmethod
     def from_json(cls, text: str | bytes) -> HostConfig:
-        """The inverse of `to_json`; raises `ValueError`."""
+        """Return the settings from the result of `to_json`; raises `ValueError`."""
         return from_plain(cls, json.loads(text))

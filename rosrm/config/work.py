@@ -1,4 +1,4 @@
-"""`work.yaml`: the processes to run."""
+"""Loader of `work.yaml`, the processes to run."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
 
 _SECTIONS: Final = ("processes", "defaults")
-#: Of one entry alone: neither makes sense for all.
+#: Keys that are allowed in an entry but not in `defaults`.
 _NOT_IN_DEFAULTS: Final = ("name", "foreach")
 
 
 def load_work(path: str | Path, registry: Registry | None = None) -> tuple[ProcessSpec, ...]:
-    """Read the processes of a file; raises one `ConfigError` for everything that is wrong.
+    """Read the processes of a file; raises one `ConfigError` with all problems.
 
     Args:
         path: of the file.
-        registry: the installed plugins, to check the migration strategies against; without it they
-            are taken as they are (the master checks them).
+        registry: the installed plugins, to check the migration strategies against; without it the
+            strategies are checked by the master only.
     """
     return _specs(read(path), path, registry)
 
@@ -39,8 +39,7 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
 def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
     """Return the processes of a mapping, which is one process or a whole work file.
 
-    Relative paths start at the current directory. Raises one `ConfigError` for everything that is
-    wrong.
+    Relative paths start at the current directory. Raises one `ConfigError` with all problems.
     """
     if "processes" in work:
         return _specs(node_of(work, Place("work", 0, 0)), "work", None)
@@ -77,7 +76,7 @@ def _entries(root: Node, problems: Problems) -> Sequence[Node]:
             problems.add(place, f"unknown key {name!r}{near(name, _SECTIONS)}")
     processes = root.get("processes")
     if processes is None and any(get_close_matches(name, ["processes"]) for name in root.items):
-        return ()  # misspelt, as was noted
+        return ()  # misspelt, and noted above
     if processes is None or not isinstance(processes.value, tuple) or not processes.value:
         place = (processes or root).place
         problems.add(place, "processes: a list of at least one process is required")
@@ -100,7 +99,7 @@ def _defaults(root: Node, problems: Problems) -> Node:
 
 
 def _expanded(entry: Node, problems: Problems) -> Iterator[Node]:
-    """The entry itself or, with `foreach`, one for each of its rows."""
+    """Yield the entry itself or, with `foreach`, one entry for each row."""
     foreach = entry.get("foreach")
     if foreach is None:
         yield entry
@@ -136,10 +135,10 @@ def _process(
 
 
 def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] | None:
-    """Return the checked options that a process gives; for the rest the cluster's hold.
+    """Return the checked options that a process gives; None if the process names no strategy.
 
-    The name and the options are checked whatever else is wrong in `migration`. None: the process
-    names no strategy.
+    Options that the process does not give have the cluster's values. Name and options are checked
+    even if there are other errors in `migration`.
     """
     strategy, given = node.get("migration", "strategy"), node.get("migration", "options")
     if strategy is None or not isinstance(strategy.value, str):

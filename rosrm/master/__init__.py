@@ -1,1 +1,1 @@
-"""The master's runtime: it carries out what the core decides."""
+"""Runtime of the master, which executes the decisions of the core."""

@@ -1,9 +1,9 @@
-"""Starts the master's runtime from settings that were checked before: `rosrm master` executes this.
+"""Entry point of the master's runtime, executed by `rosrm master` with checked settings.
 
-It imports neither pydantic nor typer nor rich: the memory of a master is budgeted.
+This module imports neither pydantic nor typer nor rich, because the master's memory is budgeted.
 """
 
-# ruff: noqa: E402 - Ctrl-C must end us without a traceback also while the rest is being imported
+# ruff: noqa: E402 - Ctrl-C must end us without a traceback also during the imports
 from __future__ import annotations
 
 import signal
@@ -20,7 +20,7 @@ from rosrm.runtime.bootstrap import Handover, run
 
 
 def serve(handover: Handover) -> int:
-    """Make what the configuration names, and be the master."""
+    """Create the configured plugins and run the master; return the exit code."""
     config = ClusterConfig.from_json(handover.settings)
     registry = Registry.load(handover.plugins)
     name = config.scoring.policy
@@ -36,7 +36,10 @@ def serve(handover: Handover) -> int:
 
 
 def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:
-    """What the file names was checked; settings without a file have a default, here or not."""
+    """Return the checkpoint policy, or None if it is the default one and not installed.
+
+    A policy that a file names was checked before, but the default may be missing.
+    """
     policy = config.checkpoint.policy
     is_default = policy == CheckpointChoice().policy
     return None if is_default and policy not in registry.names("checkpoint") else policy

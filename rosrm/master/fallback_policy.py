@@ -1,4 +1,4 @@
-"""The scoring policy that decides where the chosen one raises, hangs or answers nonsense."""
+"""Fallback scoring policy, for a chosen one that raises, hangs or returns invalid scores."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _log = logging.getLogger("rosrm.master")
 
 
 def fallback_of(registry: Registry, chosen: str) -> tuple[str, ScoringPolicy] | None:
-    """The default policy with its name; None: it is the chosen one, not installed, or broken."""
+    """Return the default policy with its name; None: it is chosen, not installed, or broken."""
     name = ScoringChoice().policy
     if name == chosen or name not in registry.names("scoring"):
         return None

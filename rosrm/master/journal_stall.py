@@ -1,9 +1,9 @@
-"""A master whose journal cannot be written: what it has decided waits, and it decides nothing more.
+"""Journal stall: the state of a master that cannot write its journal.
 
-What of one turn could not be made durable is neither carried out nor lost: it is tried again until
-it can be written, and only then is it carried out and is anything else decided. Meanwhile the
-master beats, takes readings and answers whoever only reads; other requests are refused. The core's
-clock stands still, so that no deadline passes by it and no host counts as silent.
+The decisions of the last turn are neither executed nor lost. The master retries to write them, and
+executes them and decides again only after that succeeds. During the stall the master sends beats,
+receives readings and answers queries; it refuses other requests. The core's clock is stopped, so
+that no deadline passes and no host counts as silent.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from rosrm.core.master.commands import Command, Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.journal_stall import note_readings
 
-#: Status batches that are kept for later; slaves are asked again for what is beyond.
+#: Most status batches kept for later; slaves are asked again for the rest.
 _MOST_STATUSES: Final = 10_000
-#: Requests that are turned away.
+#: Requests that are refused.
 _REFUSED: Final = (
     happened.HostRegistered,
     happened.SubmissionReceived,
@@ -31,20 +31,20 @@ _REFUSED: Final = (
     happened.HostStateRequested,
     happened.PruneRequested,
 )
-#: These come again by themselves.
+#: Events that are dropped, because they recur.
 _DROPPED: Final = (happened.TimePassed, happened.UsagesReceived, happened.PeerRefused)
 
 
 @dataclass(slots=True)
 class Standstill:
-    """From the moment at which a group could not be written until it is.
+    """Journal stall, from the first failed write of a group until the write succeeds.
 
     Attributes:
-        commands: what could not be made durable, in order.
-        reason: why, for people.
-        since: monotonic seconds.
-        core_now: the time that it is for the core meanwhile.
-        tried: when writing it was tried last.
+        commands: the commands that are not durable yet, in order.
+        reason: of the failure, as text for the user.
+        since: monotonic time of the first failure, seconds.
+        core_now: time of the core's stopped clock.
+        tried: monotonic time of the last attempt to write, seconds.
     """
 
     commands: Sequence[Command]
@@ -59,14 +59,14 @@ class Standstill:
     def take(
         self, state: MasterState, events: Iterable[happened.Event], reply: Callable[[Reply], None]
     ) -> None:
-        """Note what can be noted, turn requests away, keep the rest for later."""
+        """Apply readings, refuse requests, and keep other events for later."""
         for event in events:
             if isinstance(event, happened.ReadingsReceived):
                 note_readings(state, event, self.core_now)
             elif isinstance(event, _REFUSED):
                 reply(Reply(event.request, False, "journal", self.refusal))
             elif isinstance(event, happened.ProcessRequested | happened.KeptStatesReceived):
-                self._newest[type(event), event.host_id] = event  # no other counts any more
+                self._newest[type(event), event.host_id] = event  # replaces older ones
             elif not isinstance(event, _DROPPED):
                 self._keep(event)
 
@@ -78,12 +78,12 @@ class Standstill:
         self._waiting.append(event)
 
     def waiting(self) -> list[happened.Event]:
-        """What is to be decided afterwards, in order."""
+        """Return the events to decide after the stall, in order."""
         return [*self._waiting, *self._newest.values()]
 
     @property
     def refusal(self) -> str:
-        """What a request is told."""
+        """Return the reason with which requests are refused."""
         return (
             f"the master accepts no new work: {self.reason}. Running processes continue, and the "
             f"master accepts work again as soon as it can write"

@@ -1,4 +1,4 @@
-"""Deadlines for the calls of plugins, so that a third party's loop cannot hang the master."""
+"""Deadlines for calls of plugins, so that an endless loop in one cannot block the master."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ T = TypeVar("T")
 
 
 class Deadlines:
-    """A deadline for each call of each plugin.
+    """Deadline for each call of each plugin.
 
-    The core treats a late call like any other failure: that decision is made without the plugin. A
-    plugin that was late is not asked again for a while: a master that waits for it with every
-    reading would have no time for its slaves.
+    The core treats a late call like any other failure, and decides without the plugin. A plugin
+    that was late is not called again for a while. Otherwise the master would wait for the plugin
+    at every reading, and have no time for its slaves.
 
     Args:
         seconds: for one call.
-        pause: seconds for which a plugin is not asked after a late call.
+        pause: seconds for which a plugin is not called after a late call.
 
     Attributes:
         spent: seconds that all calls took so far.
@@ -39,7 +39,7 @@ class Deadlines:
             raise RuntimeError("the deadlines work by a signal and need the main thread")
 
     def __call__(self, plugin: Plugin, call: Callable[[], T]) -> T:
-        """Return the answer of a call; raises `PluginError` or what the plugin raised."""
+        """Return the answer of a call; raises `PluginError` or the plugin's own exception."""
         late_at, told = self._late.get(plugin, (float("-inf"), ""))
         began = time.monotonic()
         if began - late_at < self._pause:
@@ -47,7 +47,7 @@ class Deadlines:
         try:
             return limited(self._seconds, call, partial(self._expired, plugin))
         except TimeoutError as fault:
-            if plugin in self._late:  # the pause says where the plugin was when the time was up
+            if plugin in self._late:  # name the code that was running at the deadline
                 told = describe_plugin_fault(fault)
                 self._late[plugin] = (self._late[plugin][0], told)
             raise

@@ -1,4 +1,4 @@
-"""What may be read of the master at any time, also while it decides nothing."""
+"""Queries to the master that it answers at any time, also during a journal stall."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _DEFAULT_EVENTS: Final = 1000
 
 
 class Reading:
-    """Answers whoever asks how things are.
+    """Answers to read-only requests.
 
     Args:
-        master: its name.
+        master: name of the master.
         state: of its core.
-        journal: holds the event record.
-        plugins: what `rosrm plugins` shows of the master.
-        uptime: seconds since its start.
-        core_now: the time that it is for the core.
-        trouble: why it takes no new work; "": it does.
+        journal: holds the events.
+        plugins: rows of `rosrm plugins` for the master's own plugins.
+        uptime: returns the seconds since the master's start.
+        core_now: returns the time of the core's clock.
+        trouble: returns the reason why the master accepts no new work; "": it does.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Reading:
         self._trouble = trouble
 
     def snapshot(self, request: Any) -> Snapshot:
-        """The listings that were asked for."""
+        """Return the requested listings."""
         now = self._core_now()
         state = self._state
         return Snapshot(
@@ -102,13 +102,13 @@ class Reading:
         return rows
 
     def explain(self, name: str) -> str | None:
-        """The story of a process as JSON."""
+        """Return the explanation of a process as JSON; None if the process is unknown."""
         story = listing.explanation(self._state, name, self._core_now())
         return None if story is None else json.dumps(story, default=dict)
 
 
 def _failing_rows(host: Host) -> list[PluginRow]:
-    """Return what fails on a host; a probe goes by the resource that it reads."""
+    """Return the failing plugins of a host; a probe is named by the resource that it reads."""
     return [
         PluginRow(kind, name, "", "failing", known.error, host.name)
         for (kind, name), known in host.failing.items()

@@ -1,7 +1,7 @@
-"""Writes the record of a master's run, beside the loop that decides.
+"""Recording of a master's run, written by a thread of its own.
 
-The loop only puts what happened into a queue; a thread encodes and writes it. A record is bounded
-in size, and whatever goes wrong with it ends the record, never the master.
+The master's loop only queues events; the thread encodes and writes them. A recording is bounded in
+size. Any error ends the recording, never the master.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from rosrm.recording.reader import Header
 
 _log = logging.getLogger("rosrm.master")
 
-#: Bytes of memory that may wait to be written, as `_weight` counts them; a disk that falls further
-#: behind ends the record. At a thousand hosts it is more than a minute.
+#: Most bytes of memory in the queue, as `_weight` counts them; a disk that falls further behind
+#: ends the recording. With a thousand hosts the queue holds more than a minute.
 _BACKLOG: Final = 256 * 2**20
-#: Bytes that an event takes beside its readings, and each status or command that comes with it.
+#: Bytes of an event without its readings, and of each of its statuses and commands.
 _EACH: Final = 1536
-#: Seconds that the end of the master waits for what is still to be written.
+#: Seconds for which the end of the master waits for the queue to be written.
 _LAST_WORDS: Final = 10.0
 _SUFFIX: Final = ".rosrec"
 
@@ -43,13 +43,14 @@ class _Noted(NamedTuple):
 
 
 class Recorder:
-    """The record of one run of a master.
+    """Recording of one run of a master.
 
     Args:
-        directory: for the file, `MASTER-EPOCH.rosrec`; it is made where it does not exist.
-        header: what the master begins with.
-        max_size: bytes; a record that would be larger ends there.
-        keep: files of this master kept in the directory, this one included; older ones are deleted.
+        directory: for the file `MASTER-EPOCH.rosrec`; created if it does not exist.
+        header: initial state of the master.
+        max_size: most bytes; a recording that would be larger ends.
+        keep: number of files of this master kept in the directory, this one included; older ones
+            are deleted.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -77,11 +78,11 @@ class Recorder:
 
     @property
     def waiting(self) -> int:
-        """Bytes of memory, roughly, of what waits to be written."""
+        """Return the approximate bytes of memory in the queue."""
         return self._put - self._done
 
     def note(self, event: Event, now: float, wall: float, commands: Sequence[Command]) -> None:
-        """Something happened, and this came of it; returns at once."""
+        """Queue an event with the commands decided on it; returns at once."""
         if self._why:
             return
         weight = _weight(event, commands)
@@ -94,7 +95,7 @@ class Recorder:
         self._queue.put(_Noted(event, now, wall, commands, weight))
 
     def close(self, why: str) -> None:
-        """Write what waits and the end of the record; `why` the master ends."""
+        """Write the queue and the end of the recording, with the reason why the master ends."""
         if not self._why:
             self._why = why
         self._queue.put(None)
@@ -103,7 +104,7 @@ class Recorder:
             _log.warning("the record %s was not written to its end", self.path)
 
     def _end(self, why: str) -> None:
-        """Nothing more is recorded, and that is said."""
+        """End the recording, and log the reason."""
         self._why = why
         self._queue.put(None)
         _log.warning("the record %s ends here: %s", self.path, why)
@@ -137,16 +138,16 @@ class Recorder:
                 self._file.flush()
 
     def _forget(self) -> None:
-        """Nobody writes what still waits: it need not be held until the master ends."""
+        """Empty the queue after the end of the recording, to free its memory."""
         while not self._queue.empty():
             noted = self._queue.get()
             self._done += 0 if noted is None else noted.weight
 
 
 def _weight(event: Event, commands: Sequence[Command]) -> int:
-    """Bytes of memory that an event and its commands hold until they are written, roughly.
+    """Return the approximate bytes of memory that an event and its commands hold until written.
 
-    What is submitted is held by the master anyway.
+    Submitted specs do not count, because the master holds them anyway.
     """
     weight = _EACH * (1 + len(commands))
     if isinstance(event, ReadingsReceived):
@@ -159,7 +160,7 @@ def _weight(event: Event, commands: Sequence[Command]) -> int:
 
 
 def _encoded(noted: _Noted) -> bytes:
-    """The frames of an event and of what was decided."""
+    """Return the frames of an event and of the decisions on it."""
     written = frame(*encode(noted.event, noted.now, noted.wall))
     decided = decisions(noted.commands)
     if decided:
@@ -168,26 +169,26 @@ def _encoded(noted: _Noted) -> bytes:
 
 
 def _told(fault: Exception) -> str:
-    """What went wrong, in words."""
+    """Return a description of an exception."""
     if isinstance(fault, OSError):
         return fault.strerror or str(fault)
     return f"{type(fault).__name__}: {fault}"
 
 
 def _new_file(directory: Path, stem: str) -> tuple[Path, BinaryIO]:
-    """A file that nobody has; readable by its owner alone, as it holds all that was submitted."""
+    """Create a new file, readable by its owner alone, because it holds all submitted specs."""
     path, number = directory / f"{stem}{_SUFFIX}", 1
     while True:
         try:
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             return path, os.fdopen(descriptor, "wb")
-        except FileExistsError:  # an epoch comes again when the journal was lost
+        except FileExistsError:  # an epoch is repeated if the journal was lost
             number += 1
             path = directory / f"{stem}.{number}{_SUFFIX}"
 
 
 def _make_room(directory: Path, master: str, keep: int) -> None:
-    """Delete the oldest records of a master beyond so many."""
+    """Delete the oldest recordings of a master beyond `keep`."""
     found = [path for path in directory.glob(f"*{_SUFFIX}") if _is_of(path, master)]
     oldest_first = sorted(found, key=lambda path: path.stat().st_mtime_ns)
     for path in oldest_first[: max(0, len(oldest_first) - keep)]:

@@ -1,4 +1,4 @@
-"""The master's loop: take events in, let the core decide, make intent durable, carry it out."""
+"""Main loop of the master: receive events, let the core decide, journal intents, execute."""
 
 from __future__ import annotations
 
@@ -59,24 +59,25 @@ from rosrm.wording import counted, listed
 
 _log = logging.getLogger("rosrm.master")
 
-#: Seconds between two looks at readings and deadlines, where nothing else happens meanwhile: each
-#: costs the same however many readings came (docs/decisions/0014).
+#: Period of the tick in seconds, which checks readings and deadlines. A tick costs the same for any
+#: number of readings (docs/decisions/0014).
 _TICK: Final = 0.05
-#: Seconds in which a master that runs already would be discovered.
+#: Seconds for the discovery of another running master.
 _DISCOVERY: Final = 1.0
-#: Thresholds of the garbage collector: with Python's own a burst of submissions is a third slower.
+#: Thresholds of the garbage collector; with Python's defaults a burst of submissions takes a third
+#: longer.
 _COLLECT_AT: Final = (10_000, 20, 20)
-#: Seconds within which two masters came up at once.
+#: Seconds within which two starts of masters count as simultaneous.
 _AT_ONCE: Final = 1.0
-#: Seconds for the decisions of one turn, beyond which they do not count for the core.
+#: Seconds of plugin calls in one turn beyond which the core's clock is set back by them.
 _BLOCKED: Final = 0.5
-#: Seconds between two attempts to write what could not be written.
+#: Seconds between two attempts to write the journal during a stall.
 _TRY_AGAIN: Final = 0.5
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 def monotonic_ns() -> int:
-    """The master's beat."""
+    """Return the clock of the master's beats: monotonic nanoseconds."""
     return time.monotonic_ns()
 
 
@@ -84,18 +85,18 @@ class MasterRuntime:
     """One master.
 
     Args:
-        config: as checked.
-        policy: the scoring policy that the configuration names.
-        strategies: the migration strategies that it names.
-        plugins: what `rosrm plugins` shows of the master.
-        fallback: the scoring policy that decides where the first fails, with its name.
-        checkpoint: the policy that keeps states; None: they are kept on their own hosts alone.
-        declared: what the offers of all these declare.
+        config: checked settings.
+        policy: the configured scoring policy.
+        strategies: the configured migration strategies.
+        plugins: rows of `rosrm plugins` for the master's own plugins.
+        fallback: name and scoring policy to use if `policy` fails.
+        checkpoint: the policy that places replicas; None: snapshots stay on their own hosts.
+        declared: declarations of the offers of these plugins.
 
     Raises:
         Refused: another master runs on this domain, or on this state directory.
         JournalError: the journal cannot be used.
-        ConfigError: a record is wanted and cannot be written.
+        ConfigError: a recording is configured and cannot be written.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class MasterRuntime:
         self._recorder: Recorder | None = None
         self._held: Standstill | None = None
         self._deadlines = Deadlines()
-        self._behind = 0.0  # seconds by which the core's clock is behind, as it was blocked
+        self._behind = 0.0  # seconds that the core's clock is behind, after blocked time
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -130,7 +131,7 @@ class MasterRuntime:
                 sync=config.journal.sync, keep_events=config.journal.keep_events,
             )  # fmt: skip
             opened.callback(self._journal.close)
-            # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
+            # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_stop_signals(self._stop)
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
@@ -171,7 +172,8 @@ class MasterRuntime:
         started = f"master {self._config.name} started, epoch {epoch}"
         self._journal.write(
             [Record(EventKind.MASTER_STARTED, message=started)],
-            # As one: from the boot the next master cannot tell what this one had to wait for.
+            # Both in one group, because from the boot id alone the next master cannot tell which
+            # hosts this one waited for.
             [
                 Intent("cluster", "epoch", {"epoch": epoch, "boot": _boot()}),
                 journal_gap.intent(state),
@@ -182,7 +184,7 @@ class MasterRuntime:
         return state
 
     def _last_run(self) -> tuple[int, bool, int]:
-        """The newest record, whether the machine fell since, and the last epoch."""
+        """Return the newest sequence, True if the machine crashed since, and the last epoch."""
         known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
         last = self._journal.records(newest=1)
         stopped = not last or last[0].record.kind is EventKind.MASTER_STOPPED
@@ -190,7 +192,7 @@ class MasterRuntime:
         return self._journal.last_sequence, fell, int(known["epoch"])
 
     def _record_from(self, state: MasterState, now: float) -> None:
-        """Begin the record of this run, if one is wanted, with what the state was restored from."""
+        """Begin the recording of this run, if configured, with the intents that were restored."""
         wanted, config = self._config.record, self._config
         if wanted.directory == Path():
             return
@@ -228,7 +230,7 @@ class MasterRuntime:
 
     def run(self) -> int:
         """Serve until SIGINT, SIGTERM or SIGHUP; returns the exit code."""
-        # What is there by now stays: the collector need not go through it with every burst of work.
+        # Exclude all objects of the start from garbage collection, because they stay.
         gc.collect()
         gc.freeze()
         gc.set_threshold(*_COLLECT_AT)
@@ -274,9 +276,9 @@ class MasterRuntime:
             self._judge_rival(rival, now)
 
     def _judge_rival(self, rival: Any, now: float) -> None:
-        """Two masters that came up unseen: the younger gives way.
+        """Stop this master if it is the younger one of two.
 
-        Of two that came up at once both may think so, or neither: then a number decides.
+        For two simultaneous starts the uptimes are ambiguous, so the incarnations decide.
         """
         older_by = now - self._started - rival.uptime
         if abs(older_by) < _AT_ONCE:
@@ -290,7 +292,7 @@ class MasterRuntime:
         self._stopping = reason
 
     def _take_in(self, now: float) -> None:
-        """Everything that happened goes to the core, in order, as one durable group."""
+        """Pass all received events to the core in order, and execute its commands as a group."""
         if self._held is not None and not self._write_held(self._held, now):
             self._held.take(self._state, self._endpoint.take_events(), self._endpoint.reply)
             return
@@ -309,9 +311,10 @@ class MasterRuntime:
             self._leave_out_blocked(self._deadlines.spent - spent)
 
     def _leave_out_blocked(self, blocked: float) -> None:
-        """Hold the core's clock back by the seconds for which plugins kept the master from work.
+        """Set the core's clock back by the seconds for which plugins blocked the master.
 
-        The master took no answer in during that time, so no time-out of a step must pass with it.
+        The master received no answer in that time, so the time must not count for the time-out of a
+        step.
         """
         if blocked > _BLOCKED:
             self._behind += blocked
@@ -330,7 +333,7 @@ class MasterRuntime:
         self._act_on(commands, stored, now)
 
     def _write_held(self, held: Standstill, now: float) -> bool:
-        """Try again to write what could not be written; False: it cannot still."""
+        """Retry to write the commands of a journal stall; return False if that fails again."""
         if now - held.tried < _TRY_AGAIN:
             return False
         held.tried = now
@@ -358,9 +361,9 @@ class MasterRuntime:
     def _act_on(
         self, commands: Sequence[Command], stored: Sequence[StoredRecord], now: float
     ) -> None:
-        """All of it is durable: carry it out."""
-        # What a slave can begin with goes first, people's answers and the log come after.
-        # A registration opens the link that orders to this host need.
+        """Execute commands that are durable now."""
+        # Messages to slaves go first, so that they can begin; replies to users and the log follow.
+        # The reply to a registration opens the link that orders to this host need.
         replies = [command for command in commands if isinstance(command, Reply)]
         for reply in replies:
             if reply.host_id:
@@ -417,7 +420,7 @@ def what_runs(state: MasterState) -> str:
 
 
 def _boot() -> str:
-    """Another one after each start of this machine."""
+    """Return the boot id of this machine, which changes at each boot; "" if unknown."""
     try:
         return _BOOT_ID.read_text().strip()
     except OSError:

@@ -1,1 +1,1 @@
-"""The slave's runtime: it samples, starts, watches and stops on one host."""
+"""Runtime of the slave: sampling, and starting, watching and stopping processes on one host."""

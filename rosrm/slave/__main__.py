@@ -1,9 +1,9 @@
-"""Starts the slave's runtime from settings that were checked before: `rosrm slave` executes this.
+"""Entry point of the slave's runtime, executed by `rosrm slave` with checked settings.
 
-It imports neither pydantic nor typer nor rich: the memory of a slave is budgeted.
+This module imports neither pydantic nor typer nor rich, because the slave's memory is budgeted.
 """
 
-# ruff: noqa: E402 - Ctrl-C must end us without a traceback also while the rest is being imported
+# ruff: noqa: E402 - Ctrl-C must end us without a traceback also during the imports
 from __future__ import annotations
 
 import signal
@@ -19,7 +19,7 @@ from rosrm.slave.runtime import SlaveRuntime
 
 
 def serve(handover: Handover) -> int:
-    """Load the plugins and be the slave."""
+    """Load the plugins and run the slave; return the exit code."""
     config = HostConfig.from_json(handover.settings)
     return SlaveRuntime(config, Registry.load(handover.plugins)).run()
 

@@ -1,4 +1,4 @@
-"""Executors: what plugins have done on this host in the open step of a plan."""
+"""Executors: functions of plugins that run on this host in the open step of a plan."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from rosrm.extensions.discovery import definition
 from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given
 from rosrm.extensions.registry import Executor, OfferedExecutor
 
-#: Told of the outcome: "" or the code of a failure, why it failed, and the result as JSON.
+#: Takes the outcome: "" or the code of a failure, the reason of a failure, the result as JSON.
 Done = Callable[[str, str, str], None]
-#: Code of a failure that the executor states by a `ValueError` or an error of rosrm: it is an
-#: answer, and no fault of the plugin.
+#: Code of a failure that the executor reports by a `ValueError` or an error of rosrm. Such a
+#: failure is a valid answer, not an error of the plugin.
 UNABLE: Final = "unable"
 
 
 @dataclass(frozen=True, slots=True)
 class Here:
-    """What an executor is told of its host, as `here`.
+    """Description of the host for an executor, passed as the argument `here`.
 
     Attributes:
-        host: its name.
+        host: name of the host.
         state: the slave's directory.
-        pids: of the leaders of the instances, by `process#number`; 0 of one that is to be started,
-            at first or again.
+        pids: pids of the leaders of the instances, by `process#number`; 0 for an instance that
+            waits for a start or restart.
     """
 
     host: str
@@ -40,7 +40,7 @@ class Here:
     pids: Mapping[str, int]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the description as JSON types."""
         live = {instance: pid for instance, pid in self.pids.items() if pid}
         return {
             "host": self.host, "state": str(self.state), "pids": live,
@@ -49,18 +49,18 @@ class Here:
 
 
 class Executors:
-    """The executors of a host, and which migration strategies fail by them.
+    """Executors of a host, and the migration strategies that fail because of them.
 
     Args:
-        offered: by name.
-        broken: strategies whose offers are broken here, and why.
-        post: has something called in the loop.
-        changed: called in the loop when `failing` has changed, with what to say about it.
+        offered: executors by name.
+        broken: strategies whose offers are broken on this host, with the reasons.
+        post: schedules a call in the loop.
+        changed: called in the loop with a message when `failing` has changed.
         clock: monotonic seconds.
 
     Attributes:
-        failing: strategy to its last error. One whose offer is broken fails for good. Any other is
-            taken out by a good answer that comes `WORKS_AFTER` seconds after its last failure.
+        failing: last error by strategy. A strategy whose offer is broken stays. Any other is
+            removed by a valid answer at least `WORKS_AFTER` seconds after its last failure.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class Executors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all executors."""
+        """Return the names of all executors."""
         return tuple(self._offered)
 
     def failing_plugins(self) -> dict[Plugin, str]:
-        """Return what fails by kind and name, and why."""
+        """Return the errors of failing plugins by kind and name."""
         return {("migration", strategy): error for strategy, error in self.failing.items()}
 
     def execute(
@@ -93,11 +93,11 @@ class Executors:
             name: of the executor.
             arguments: a JSON object.
             timeout: seconds, after which its strategy counts as failing.
-            here: where it runs.
+            here: description of this host.
             done: called in the loop with the outcome.
 
         Raises:
-            Refused: there is none of this name.
+            Refused: there is no executor of this name.
         """
         offered = self._offered.get(name)
         if offered is None:
@@ -143,7 +143,7 @@ class Executors:
 
 
 def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Run an executor; returns as `Done` is called."""
+    """Run an executor; return the arguments of `Done`."""
     try:
         result: object = function(arguments)
         if not isinstance(result, Mapping):
@@ -161,7 +161,7 @@ def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> tup
 
 
 def _no_json(value: object, path: str) -> str:
-    """Return where an answer holds what JSON cannot, and its type; "" if it does nowhere."""
+    """Return path and type of the first value that JSON cannot hold; "" if there is none."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             if not _is_plain(key):

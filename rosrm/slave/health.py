@@ -1,4 +1,4 @@
-"""Looks at the instances whose health is watched; what follows, the slave's core says."""
+"""Health checks of instances; the slave's core decides on their results."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 from rosrm.supervisor.procfs import read_stat
 
-#: State in /proc of what a signal has stopped; "t" is what a debugger holds.
+#: State in /proc of a process that a signal has stopped; "t" means stopped by a debugger.
 _STOPPED: Final = "T"
 
 
 class HealthWatch:
-    """Looks at each instance that is watched, and listens only to what is asked for.
+    """Health checks of the watched instances, subscribed only to the configured topics.
 
     Args:
-        participant: in which a node is made when the first one asks for a topic or a state.
-        graph: tells whose a publisher is.
-        sessions: the processes of each instance.
+        participant: creates a node when the first instance needs a topic or a lifecycle state.
+        graph: maps publishers to processes.
+        sessions: process tree of each instance.
         launchers: of this host.
 
     Attributes:
-        watches: there was something to look at.
+        watches: True if the last call of `look` had instances to check.
     """
 
     def __init__(
@@ -45,10 +45,10 @@ class HealthWatch:
         self._ears: dict[tuple[InstanceId, int], HealthEar] = {}
 
     def look(self, watched: Mapping[InstanceId, Held], now: float) -> Iterator[LookedAt]:
-        """One look at each.
+        """Yield the result of one check of each watched instance.
 
         Args:
-            watched: all that are.
+            watched: all watched instances.
             now: monotonic seconds.
         """
         self.watches = bool(watched)

@@ -1,4 +1,4 @@
-"""Parts of what an instance wrote, over the rotations of its log, for `rosrm logs`."""
+"""Reader of instance logs across rotated files, for `rosrm logs`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from rosrm.supervisor.client import log_path, logged_instances, newest_log
 
 #: Most bytes in one answer.
 _MOST: Final = 1 << 20
-#: Most marks in one answer; with more of them the answer ends sooner.
+#: Most marks in one answer; an answer with more marks is shortened.
 _MOST_MARKS: Final = 4096
-#: Bytes between two looks for the beginnings of lines.
+#: Bytes of a block in the search for line ends.
 _BLOCK: Final = 1 << 16
-#: How often a read that a rotation crossed is tried again.
+#: Attempts to read a log that is rotated during the read.
 _TRIES: Final = 5
 
 
 class _Segment(NamedTuple):
-    """A file of a log: its first byte and the one behind its last, from the instance's first."""
+    """File of a log, with the offsets of its first byte and its end in the instance's output."""
 
     path: Path
     begin: int
@@ -33,7 +33,7 @@ class _Segment(NamedTuple):
 
 
 def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice:
-    """Read a part of what an instance wrote.
+    """Read a part of an instance's output.
 
     Args:
         state_directory: of the supervisor.
@@ -41,7 +41,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice
         ended: the instance has ended.
 
     Raises:
-        Refused: there is no log of it.
+        Refused: this host has no log of the instance.
     """
     instance = InstanceId(query.process, query.number)
     path = log_path(state_directory, instance)
@@ -53,7 +53,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice
         except FileNotFoundError:
             if not path.exists():
                 break
-            continue  # rotated between two looks
+            continue  # rotated during the read
         if log_index.base(str(path)) == before:
             return part
     raise Refused(f"this host has no log of {instance} (any more): {path}", "unknown")
@@ -68,7 +68,7 @@ def newest_instance(state_directory: Path, process: str) -> InstanceId:
 
 
 def nothing_yet(query: LogQuery) -> LogSlice:
-    """Return the answer for an instance that is being started: its file is opened with it."""
+    """Return an empty answer for an instance that is starting, whose file does not exist yet."""
     return LogSlice(query.number, (), b"", query.offset, query.offset, False, ())
 
 
@@ -82,7 +82,7 @@ def _segments(path: Path) -> list[_Segment]:
     for file in reversed(files):
         size = file.stat().st_size
         begin = log_index.base(str(file))
-        if begin is None:  # written before there were indices
+        if begin is None:  # written by a version without indices
             begin = segments[-1].end if segments else 0
         segments.append(_Segment(file, begin, begin + size))
     return segments
@@ -106,7 +106,7 @@ def _read(
 
 
 def _start(segments: Sequence[_Segment], query: LogQuery) -> int:
-    """Return where a query begins."""
+    """Return the offset at which a query begins."""
     if query.tail:
         return _before_lines(segments, query.tail)
     if query.since:
@@ -115,12 +115,12 @@ def _start(segments: Sequence[_Segment], query: LogQuery) -> int:
 
 
 def _whole_line(segment: _Segment) -> int:
-    """Return where the first whole line of a file begins, if what lies before it was dropped.
+    """Return the offset of the first whole line of a file, if earlier output was dropped.
 
-    A line that is the only one stays, whole or not.
+    A file with a single line keeps that line, even if it is incomplete.
     """
     with log_index.Index(str(segment.path)) as index:
-        first = index.marks(0, 2)  # of the file, and of a program that was started there
+        first = index.marks(0, 2)  # marks of the file, and of a program that starts there
     if segment.begin == 0 or any(mark.pid and mark.offset == segment.begin for mark in first):
         return segment.begin
     with segment.path.open("rb") as log:
@@ -129,7 +129,7 @@ def _whole_line(segment: _Segment) -> int:
 
 
 def _before_lines(segments: Sequence[_Segment], lines: int) -> int:
-    """Return where the last lines begin; an unfinished one counts."""
+    """Return the offset of the last `lines` lines; an unfinished line counts."""
     wanted, at_end = lines, True
     for segment in reversed(segments):
         with segment.path.open("rb") as log:
@@ -149,7 +149,7 @@ def _before_lines(segments: Sequence[_Segment], lines: int) -> int:
 
 
 def _written_since(segments: Sequence[_Segment], since: float) -> int:
-    """Return where that begins which was written at a time or later."""
+    """Return the offset of output that was written at a time or later."""
     for segment in segments:
         with log_index.Index(str(segment.path)) as index:
             late = index.find(lambda mark: mark.time >= since)
@@ -157,7 +157,7 @@ def _written_since(segments: Sequence[_Segment], since: float) -> int:
                 return index.mark(late - 1).offset
             if late < index.count:
                 return _whole_line(segment) if segment is segments[0] else segment.begin
-    # The last look at a log that grows may be older than its newest bytes.
+    # The newest bytes of a growing log may be later than its last mark.
     with log_index.Index(str(segments[-1].path)) as index:
         return index.mark(index.count - 1).offset if index.count else segments[-1].begin
 
@@ -165,13 +165,13 @@ def _written_since(segments: Sequence[_Segment], since: float) -> int:
 def _marks(
     segment: _Segment, begin: int, end: int, *, now: bool
 ) -> tuple[list[tuple[float, int, int]], int]:
-    """Return the marks of a part, one behind its end included, and where the part has to end.
+    """Return the marks of a part, including one after its end, and the end of the part.
 
     Args:
-        segment: that the part lies in.
+        segment: file with the part.
         begin: offset of the part.
-        end: offset behind it.
-        now: the file is written to: what no look has found yet was written just now.
+        end: offset after the part.
+        now: the file is still written; bytes without a mark count as written now.
     """
     with log_index.Index(str(segment.path)) as index:
         first = index.find(lambda mark: mark.offset >= begin)

@@ -1,4 +1,4 @@
-"""What the supervisor remembers for a later run of the slave: how one is ready, and healthy."""
+"""Memos that the supervisor stores for a later run of the slave: readiness and health checks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm.model.values import Health
 
 
 def to_memo(memo: Memo) -> str:
-    """As a text; "": there is nothing to remember."""
+    """Return a memo as text; "" if it is empty."""
     if memo.awaited is None and memo.watch is None:
         return ""
     awaited = None if memo.awaited is None else astuple(memo.awaited)
@@ -20,7 +20,7 @@ def to_memo(memo: Memo) -> str:
 
 
 def from_memo(text: str) -> Memo | None:
-    """The inverse of `to_memo`; None for what another version of the slave may have written."""
+    """Return the memo of a text; None if another version of the slave wrote it."""
     try:
         fields = json.loads(text)
         awaited, watch = fields["awaited"], fields["watch"]

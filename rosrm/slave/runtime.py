@@ -1,4 +1,4 @@
-"""The slave's loop: sample, report, ask for work, launch it, watch it."""
+"""Main loop of the slave: sample, report, ask for work, launch instances, watch them."""
 
 from __future__ import annotations
 
@@ -54,19 +54,19 @@ from rosrm.wording import counted
 
 _log = logging.getLogger("rosrm.slave")
 
-#: Seconds between two looks at the ROS graph while an instance is awaited in it.
+#: Seconds between two checks of the ROS graph while an instance is awaited in it.
 _LOOK_AT_GRAPH: Final = 0.05
-#: Seconds between two reports of what each instance uses.
+#: Seconds between two measurements of the usage of each instance.
 _USAGE_PERIOD: Final = 1.0
-#: Seconds between two words to the user that there is no master yet.
+#: Seconds between two messages to the user that no master was found yet.
 _PATIENCE_TOLD: Final = 10.0
-#: At slow rates a request is still meant after so many of our own beats.
+#: Periods of readings for which a request stays valid at slow rates.
 _BEATS_MISSED: Final = 3
 
 #: Seconds in which `--stop-all` looks for the master before it stops the processes.
 _MASTER_PATIENCE: Final = 5.0
 
-#: Told of the outcome of an order: why it was refused; "": it is done.
+#: Takes the outcome of an order: the reason of a refusal; "": the order was executed.
 Settled = Callable[[str], None]
 
 
@@ -74,7 +74,7 @@ class SlaveRuntime:
     """One slave.
 
     Args:
-        config: as checked.
+        config: checked settings.
         registry: the installed plugins.
 
     Raises:
@@ -116,7 +116,7 @@ class SlaveRuntime:
             self._sampler = Sampler(probes.made)
             opened.callback(self._sampler.close)
             first = self._sampler.first().reports
-            # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
+            # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_stop_signals(self._stop)
             self._supervisor = SupervisorLink(
                 config.state / "supervisor", config.logs, post=self._post, take=self.take,
@@ -177,14 +177,14 @@ class SlaveRuntime:
         )  # fmt: skip
 
     def _adopt(self) -> None:
-        """Take over what a former run of this slave left with the supervisor."""
+        """Re-adopt the instances that a former run of this slave left with the supervisor."""
         held = self._supervisor.take_over()
         self._work(time.monotonic())
         if held:
             self.say(self._found(held))
 
     def _found(self, held: int) -> str:
-        """Return what became of the processes that a former run of the slave had started."""
+        """Return a sentence about the processes that a former run of the slave had started."""
         live, states = self._state.live(), [one.state for one in self._state.statuses()]
         waiting = states.count(InstanceState.BACKOFF) + states.count(InstanceState.STARTING)
         running, ended = live - waiting, held - live
@@ -205,7 +205,7 @@ class SlaveRuntime:
             return self._ending.carry_out(self._stopping)
 
     def stop_all(self) -> int:
-        """Stop what a former slave left running, and report it; returns the exit code.
+        """Stop the processes of a former slave, and report their ends; returns the exit code.
 
         The slave registers, if it finds the master in time, accepts no work, and ends.
         """
@@ -245,7 +245,7 @@ class SlaveRuntime:
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
                 self._usage.look(now)
-                self.take(core.TimePassed())  # cycles may be far between, and fences wait for us
+                self.take(core.TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
@@ -263,7 +263,7 @@ class SlaveRuntime:
             self._participant.spin(max(0.0, wake - time.monotonic()))
             now = time.monotonic()
             self._work(now)
-            if self._accepting:  # what came with the last answer is under way: ask for more
+            if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
 
     def _stop(self, number: int, _frame: Any) -> None:
@@ -275,7 +275,7 @@ class SlaveRuntime:
         self._ending.say_progress()
 
     def _cycle(self, now: float) -> None:
-        """What is done at the rate of `resource_info`."""
+        """Do the work that is due at the rate of `resource_info`."""
         self._endpoint.go_on(now)
         self._keeping.tick(now)
         sample = self._sampler.latest(now)
@@ -324,7 +324,7 @@ class SlaveRuntime:
     # --- core and supervisor -------------------------------------------------------------
 
     def take(self, event: core.Event) -> None:
-        """Something happened."""
+        """Queue an event for the core."""
         self._events.append(event)
         if isinstance(event, core.Registered):
             self._keeping.say_again()
@@ -332,12 +332,12 @@ class SlaveRuntime:
                 self._endpoint.publish_statuses((), complete=False)
 
     def _post(self, call: Callable[[], None]) -> None:
-        """Have something called in the loop; may be called from any thread."""
+        """Schedule a call in the loop; may be called from any thread."""
         self._from_threads.append(call)
         self._wake()
 
     def _work(self, now: float) -> None:
-        """Let the core decide about everything that happened, and carry it out."""
+        """Pass all queued events to the core, and execute its commands."""
         while self._from_threads:
             self._participant.guard.call(self._from_threads.popleft())
         while self._events:
@@ -354,7 +354,7 @@ class SlaveRuntime:
 
     def _carry_out(self, command: core.Command) -> None:
         if isinstance(command, core.Launch):
-            if not self._ending.keeps:  # the master was told that nothing more begins here
+            if not self._ending.keeps:  # the master expects no new start
                 self._starter.launch(command.assignments)
         elif isinstance(command, core.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
@@ -365,17 +365,17 @@ class SlaveRuntime:
             self._have_supervisor(command)
 
     def _have_supervisor(self, command: core.Command) -> None:
-        """Have the supervisor carry something out, unless the instance waits for its start."""
+        """Send a command to the supervisor, unless the instance still waits for its start."""
         if self._starter.call_off(command):
             return
         if isinstance(command, core.Fail):
             self.say(f"{command.instance} is {command.reason}")
-        if isinstance(command, core.Restart):  # by hand
+        if isinstance(command, core.Restart):  # on request of a user
             self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
 
     def _wake(self) -> None:
-        # The participant may be closed already, when the last words come.
+        # The participant may be closed already when the last messages of the supervisor arrive.
         with contextlib.suppress(Exception):
             self._participant.wake()
 
@@ -387,27 +387,27 @@ class SlaveRuntime:
         if status.state.ended:
             self._starter.ended(status.instance)
 
-    # --- what the endpoint asks ----------------------------------------------------------
+    # --- calls of the endpoint -----------------------------------------------------------
 
     def statuses(self) -> Sequence[InstanceStatus]:
-        """All that this host holds."""
+        """Return the statuses of all instances on this host."""
         return self._state.statuses()
 
     def kept_states(self) -> Sequence[KeptState]:
-        """All the states that this host keeps."""
+        """Return all snapshots on this host."""
         return self._keeping.states()
 
     def set_restart(self, instance: InstanceId, restart: RestartPolicy, settled: Settled) -> None:
-        """Give an instance another restart policy; `settled` when it is on record."""
+        """Set the restart policy of an instance; call `settled` when the supervisor recorded it."""
         self._unsettled.setdefault((instance, restart), []).append(settled)
         self.take(core.RestartPolicySet(instance, restart))
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
-        """Ship the state of an instance to these hosts from now on."""
+        """Replicate the snapshots of an instance to these hosts from now on."""
         self._keeping.keep(instance, hosts, every)
 
     def drop_kept(self, instance: InstanceId) -> None:
-        """Delete what is kept of a process, of instances up to this one."""
+        """Delete the snapshots of a process, of instances up to this one."""
         lives = any(
             one.process == instance.process and one.number <= instance.number
             for one, held in self._state.held.items()
@@ -416,11 +416,11 @@ class SlaveRuntime:
         self._keeping.drop(instance, lives=lives)
 
     def say(self, message: str) -> None:
-        """Tell the user."""
+        """Log a message for the user."""
         _log.info("%s", message)
 
     def read_log(self, query: LogQuery) -> LogSlice:
-        """A part of a log; raises `Refused`."""
+        """Return a part of a log; raises `Refused`."""
         if not query.number:
             query = replace(query, number=self._newest_instance(query.process).number)
         held = self._state.held.get(InstanceId(query.process, query.number))
@@ -447,5 +447,5 @@ class SlaveRuntime:
 
 
 def _random_number() -> int:
-    """Not 0; `secrets` would do the same and bring a MiB of modules along."""
+    """Return a random number other than 0; unlike `secrets`, this loads no MiB of modules."""
     return int.from_bytes(os.urandom(7), "big") | 1

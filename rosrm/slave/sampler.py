@@ -1,23 +1,24 @@
-"""Reads the probes of a host without ever waiting for one.
+"""Sampler of a host's probes that never waits for one.
 
-The slave's 10 Hz loop is the only clock: each call of `Sampler.latest` hands the probes that are
-due to a thread and returns what earlier reads have brought, so it takes microseconds whatever the
-probes do. The rules:
+The slave's 10 Hz loop is the only clock. Each call of `Sampler.latest` hands the probes that are
+due to a thread, and returns the results of earlier reads. So it takes microseconds, independent of
+the probes. The rules:
 
-- A probe begins in a thread of its own. Ten quick reads in a row earn it a place in the thread that
-  all quick probes share (one wake-up a cycle, not one a probe); one slow read loses it again.
-- A read that is slow while others queue behind it keeps the thread it hangs in; the others get a
-  fresh one at the next cycle. A probe is never read twice at a time, so a hanging probe costs one
-  thread, however long it hangs.
-- A probe that is late, raises or answers nonsense makes its readings *stale*: they keep their last
-  value, never zero. Why is reported once, and so is the recovery. A probe that changes often stays
-  stale until its changes are rarer, so the mark and the newest report always agree. Recoveries are
-  held back so, failures never. Another error of a stale probe is reported at most every 10 s.
-- Before its first reading a resource counts as full and stale, so that no work is drawn to a host
-  that has not been measured.
+- A probe begins in a thread of its own. After ten quick reads in a row it moves to the thread that
+  all quick probes share (one wake-up a cycle, not one a probe); one slow read moves it back.
+- A slow read keeps the thread in which it hangs; probes queued behind it get a new thread at the
+  next cycle. A probe is never read twice at a time, so a hanging probe costs one thread, however
+  long it hangs.
+- A probe that is late, raises or returns invalid values makes its readings *stale*: they keep their
+  last value, never zero. The reason is reported once, and so is the recovery. A probe that changes
+  often stays stale until its changes are rarer, so the mark and the newest report always agree.
+  Only recoveries are held back in this way, never failures. Another error of a stale probe is
+  reported at most every 10 s.
+- Before its first reading a resource counts as full and stale, so that a host that was not measured
+  attracts no work.
 
-Readings are one cycle old. A read in the loop itself would cost some 30 us a cycle less, but then a
-probe that was quick a thousand times could still hang the loop at the next read.
+Readings are one cycle old. A read in the loop itself would save some 30 us a cycle, but then a
+probe that was quick a thousand times could still block the loop at the next read.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ if TYPE_CHECKING:
 
 #: A read that takes longer, in seconds, is too slow to share a thread.
 QUICK: Final = 0.05
-#: As many quick reads in a row earn a probe its place in the shared thread.
+#: Quick reads in a row after which a probe moves to the shared thread.
 TRUSTED_AFTER: Final = 10
-#: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
+#: Most reports of one probe in REPORT_WINDOW seconds, so that a flapping probe floods no log.
 REPORTS: Final = 6
 REPORT_WINDOW: Final = 60.0
 #: Seconds after a report before another error of a probe that is still stale is reported.
@@ -54,11 +55,13 @@ ANOTHER_ERROR: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class ProbeReport:
-    """The readings of a probe went stale, or came back.
+    """Change of a probe's readings to stale, or back.
 
     Attributes:
-        resources: names of the readings concerned; none of a probe that could not be made and
-            whose resources others read.
+        probe: name of the probe.
+        resources: names of the readings; none for a probe that could not be created and whose
+            resources other probes read.
+        stale: True if the readings became stale.
         reason: why they are stale; "" on recovery.
     """
 
@@ -68,7 +71,7 @@ class ProbeReport:
     reason: str
 
     def __str__(self) -> str:
-        """One sentence for the event record."""
+        """Return one sentence for the event record."""
         names = ", ".join(self.resources)
         if self.stale and not names:
             return f"probe {self.probe} fails: {self.reason}"
@@ -79,12 +82,12 @@ class ProbeReport:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The newest readings of all probes.
+    """Newest readings of all probes.
 
     Attributes:
         usage: (RESOURCE_SLOTS,) float32 fractions of the capacity, by slot; 0 where not in use.
         stale: bit i: the reading of slot i is older than its deadline.
-        reports: what has changed since the sample before.
+        reports: changes since the previous sample.
     """
 
     usage: npt.NDArray[np.float32]
@@ -94,11 +97,13 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    """What a read brought: values in the order of the probe's resources, or why there are none.
+    """Result of a read.
 
     Attributes:
-        seconds: that the read took.
-        age: seconds since it was asked for, which a busy machine can make much longer.
+        values: in the order of the probe's resources; () after a failure.
+        reason: of a failure; "" otherwise.
+        seconds: duration of the read.
+        age: seconds since the read was queued, which can be much longer on a busy machine.
     """
 
     values: tuple[float, ...]
@@ -108,10 +113,10 @@ class _Outcome:
 
 
 class Sampler:
-    """Reads probes in the background; `latest` is called by one loop, never waits.
+    """Background reader of probes; one loop calls `latest`, which never waits.
 
     Args:
-        probes: as the registry made and checked them; the order of their resources gives the
+        probes: created and checked by the registry; the order of their resources gives the
             slots.
         clock: monotonic seconds, the same as the `now` of `latest`.
     """
@@ -135,11 +140,11 @@ class Sampler:
 
     @property
     def present(self) -> int:
-        """Bit i: slot i is in use."""
+        """Return a bit mask; bit i: slot i is in use."""
         return (1 << len(self.resources)) - 1
 
     def latest(self, now: float) -> Sample:
-        """The newest readings, and a new read of each probe that is due. Never waits.
+        """Return the newest readings, and queue a read of each probe that is due. Never waits.
 
         Args:
             now: monotonic seconds.
@@ -157,13 +162,13 @@ class Sampler:
         return Sample(np.array(self._usage, np.float32), stale, tuple(reports))
 
     def settle(self, timeout: float) -> bool:
-        """Wait until no read is under way.
+        """Wait until no read is running.
 
         Args:
             timeout: seconds.
 
         Returns:
-            False: it passed and a read still runs.
+            False if a read still runs after the time-out.
         """
         end = time.monotonic() + timeout
         while any(watched.busy for watched in self._watched):
@@ -173,10 +178,10 @@ class Sampler:
         return True
 
     def first(self, timeout: float = 2.0) -> Sample:
-        """Read every probe once and wait for the answers: the sample to register with.
+        """Read every probe once, wait for the answers, and return the sample for the registration.
 
         Args:
-            timeout: seconds; a probe that has not answered by then stays stale.
+            timeout: seconds; a probe without an answer by then stays stale.
         """
         reports = self.latest(self._clock()).reports
         self.settle(timeout)
@@ -190,10 +195,10 @@ class Sampler:
             timeout: seconds for all of them together.
 
         Returns:
-            Names of the probes that hang or raised, and so were left unclosed.
+            Names of the probes that hang or raised, and so stay unclosed.
         """
         for watched in self._watched:
-            # One that hangs in a thread it took with it must not be closed under its own read.
+            # A probe that hangs in its own thread must not be closed during its read.
             if watched.lane.alive() or not watched.busy:
                 watched.lane.put(watched.close)
         lanes = {id(lane): lane for lane in [*(w.lane for w in self._watched), self._shared]}
@@ -205,7 +210,7 @@ class Sampler:
         return tuple(watched.name for watched in self._watched if not watched.closed)
 
     def _mind_running(self, watched: _Watched, now: float) -> None:
-        """A read is under way: free those behind it when it is slow, mark it when it is late."""
+        """Check a running read: move the queue behind a slow one, and mark a late one."""
         if watched.running(now) > QUICK and watched.lane is self._shared:
             stuck, self._shared = self._shared, self._shared.succeed()
             for other in self._watched:
@@ -216,7 +221,7 @@ class Sampler:
             watched.reason = f"no answer within {watched.deadline:g} s"
 
     def _take_outcome(self, watched: _Watched, outcome: _Outcome) -> None:
-        """A read has ended: publish its values, and choose the thread of the next."""
+        """Store the values of a finished read, and choose the thread of the next read."""
         watched.outcome, watched.measured = None, True
         if outcome.values:
             self._usage[watched.slots] = outcome.values
@@ -238,7 +243,7 @@ class Sampler:
 
 
 class _Lane:
-    """A thread that carries out one call after another; it starts with the first."""
+    """Thread that executes queued calls in order, started with the first call."""
 
     def __init__(
         self, name: str, queue: SimpleQueue[Callable[[], None] | None] | None = None
@@ -255,45 +260,46 @@ class _Lane:
         self._queue.put(call)
 
     def succeed(self) -> _Lane:
-        """Leave the thread to the call that it hangs in; a new one takes over the queue."""
+        """Move the queue to a new thread, and leave the old one to the call in which it hangs."""
         self._dismissed = True
         lane = _Lane(self._name, self._queue)
         lane._start()
         return lane
 
     def end(self) -> None:
-        """End the thread when it has carried out what is queued."""
+        """End the thread after all queued calls."""
         self._queue.put(None)
 
     def alive(self) -> bool:
-        """Its thread still runs."""
+        """Return True if the thread runs."""
         return self._thread is not None and self._thread.is_alive()
 
     def join(self, timeout: float) -> None:
-        """Wait for the end of the thread, at most `timeout` seconds."""
+        """Wait at most `timeout` seconds for the end of the thread."""
         if self._thread is not None:
             self._thread.join(timeout)
 
     def _start(self) -> None:
-        # A daemon: a probe that hangs in the kernel must not keep the slave from ending.
+        # A daemon, because a probe that hangs in the kernel must not keep the slave from ending.
         self._thread = threading.Thread(target=self._serve, name=self._name, daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
-        # Without a time-out, as it waits for orders alone: `end` is always among them.
+        # No time-out is needed, because the queue always ends with the None of `end`.
         while (call := self._queue.get()) is not None:
             call()
             if self._dismissed:
                 return
-        if self._dismissed:  # it was free after all, and has taken the end meant for its successor
+        if self._dismissed:  # it took the None of its successor
             self._queue.put(None)
 
 
 class _Watched:
-    """One probe under watch.
+    """One probe with the state of its reads.
 
-    Handed to and fro by `busy`: while it is True only the reading thread writes `started` and
-    `outcome`, and clears `busy` last; while it is False only the loop writes.
+    `busy` passes the ownership between the threads. While it is True, only the reading thread
+    writes `_started` and `outcome`, and clears `busy` last. While it is False, only the loop
+    writes.
     """
 
     def __init__(
@@ -328,10 +334,10 @@ class _Watched:
         self._report_times: list[float] = []
 
     def prepare(self, now: float) -> Callable[[], None]:
-        """The read to carry out, counted as under way from now on."""
+        """Return the read to queue, which counts as running from now on."""
         following = self._nominal + self._period
         self._nominal = following if following > now else now + self._period
-        # A quarter of a period early is due as well, so that jitter skips no cycle.
+        # Due a quarter of a period early, so that jitter skips no cycle.
         self.due = self._nominal - self._period / 4
         self._started = None
         self.asked = now
@@ -339,18 +345,18 @@ class _Watched:
         return self._read
 
     def running(self, now: float) -> float:
-        """Seconds since the read under way began; 0 while it is queued."""
+        """Return the seconds since the running read began; 0 while it is queued."""
         return 0.0 if self._started is None else now - self._started
 
     @property
     def is_stale(self) -> bool:
-        """The readings are old by the newest report, or there are none yet."""
+        """Return True if the newest report was of stale readings, or there is no reading yet."""
         return self._reported_stale or not self.measured
 
     def report(self, now: float) -> list[ProbeReport]:
-        """The readings went stale or came back: what there is to say, bounded in number.
+        """Return the reports on changes to stale or back, limited in number.
 
-        A recovery is put off where no report would be left for the next failure.
+        A recovery is delayed if otherwise no report would be left for the next failure.
         """
         if self.reason and self._reported_stale:
             return self._report_another_error(now)
@@ -377,7 +383,7 @@ class _Watched:
         """Close the probe, in the thread that reads it."""
         try:
             self._probe.close()
-        except BaseException:  # noqa: BLE001 - a plugin's fault must not stop the slave's end
+        except BaseException:  # noqa: BLE001 - a plugin's error must not stop the slave's end
             return
         self.closed = True
 
@@ -424,7 +430,7 @@ def read_values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
 
 
 def _fraction(reading: Reading) -> float:
-    """Return the usage of a reading; raise `PluginError` where it is none."""
+    """Return the usage of a reading; raise `PluginError` if it is not a valid fraction."""
     try:
         usage = float(reading.usage)
     except (TypeError, ValueError, OverflowError):

@@ -1,9 +1,9 @@
-"""The sessions (process trees) that the slave runs, and what they use.
+"""Sessions (process trees) of the slave's instances, and their usage.
 
-Told of each session's leader, it finds the other members by their session id in one walk a second:
-`getsid` for each process of the host, which costs a microsecond each and reads no file. A member
-that begins a session of its own (a daemon) leaves the tree, as it does for job control. Where a
-launcher's program leads the session, the launcher knows the members: they may have another session.
+The slave adds the leader of each session. One walk a second finds the other processes by their
+session id: `getsid` for each process of the host, which takes a microsecond and reads no file. A
+process that begins a session of its own (a daemon) leaves the tree, as in job control. Where
+a launcher's program leads the session, the launcher knows the members.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 
 @dataclass(frozen=True, slots=True)
 class SessionUsage:
-    """What one session uses.
+    """Usage of one session.
 
     Attributes:
-        cpu: cores, mean since the walk before.
-        memory: bytes, resident, sum over the members (shared pages count in each).
+        cpu: cores, mean since the previous walk.
+        memory: resident bytes, summed over the processes (shared pages count in each).
     """
 
     cpu: float
@@ -36,13 +36,14 @@ class SessionUsage:
 
 
 class SessionTable:
-    """Implements `Sessions` of the contracts; the loop calls all but `pids` and `ended_cpu_time`.
+    """Implementation of the contract `Sessions`.
 
-    Those two may be called from any thread at any time: they return what was assigned in one step.
+    `pids` and `ended_cpu_time` may be called from any thread, because they return values that are
+    assigned in one step. Only the loop calls the other methods.
 
     Args:
-        proc: where the process file system is mounted.
-        session_of: session id of a process; raises `OSError` where it has ended.
+        proc: mount point of the process file system.
+        session_of: returns the session id of a process; raises `OSError` if it has ended.
         launchers: of this host.
     """
 
@@ -64,33 +65,33 @@ class SessionTable:
         self._walked: float | None = None
 
     def pids(self) -> tuple[int, ...]:
-        """Every known process of the sessions, leaders first; up to one walk behind."""
+        """Return every known process of the sessions, leaders first; up to one walk behind."""
         return self._pids
 
     def ended_cpu_time(self) -> float:
-        """Seconds of CPU that ended sessions used; never falls."""
+        """Return the CPU seconds of ended sessions; the value never decreases."""
         return self._ended_cpu_time
 
     def members(self, leader: int) -> tuple[int, ...]:
-        """The known processes of one session, its leader first; () where it is not known."""
+        """Return the known processes of one session, its leader first; () if it is unknown."""
         return self._members.get(leader, ())
 
     def known_as(self, leader: int) -> tuple[int, ...]:
-        """As `members`; below a launcher's program also by the pids that they see themselves.
+        """Return `members` and, below a launcher's program, also their pids as they see them.
 
-        These are what Fast DDS writes into the names of endpoints.
+        Fast DDS writes these pids into the names of endpoints.
         """
         members = self.members(leader)
         if leader not in self._led or not self._launchers.leads(leader):
             return members
         own = []
         for pid in members:
-            with contextlib.suppress(OSError):  # it has ended meanwhile
+            with contextlib.suppress(OSError):  # it has ended
                 own.append(inner_pid(pid))
         return (*members, *own)
 
     def add(self, leader: int) -> None:
-        """A session has begun; its leader counts at once.
+        """Add a session that has begun; its leader counts at once.
 
         Args:
             leader: pid, which is also the session id.
@@ -101,11 +102,11 @@ class SessionTable:
         self._collect_pids()
 
     def remove(self, leader: int, cpu_time: float) -> None:
-        """A session has ended (its leader was reaped).
+        """Remove a session that has ended (its leader was reaped).
 
         Args:
-            leader: pid; of one that ended before it was added, the time counts all the same.
-            cpu_time: seconds that it and its reaped children used, as `wait4` reports them.
+            leader: pid; the time counts even if the session was never added.
+            cpu_time: seconds used by the leader and its reaped children, as reported by `wait4`.
         """
         self._members.pop(leader, None)
         self._led.discard(leader)
@@ -115,11 +116,11 @@ class SessionTable:
         self._ended_cpu_time += max(0.0, cpu_time)
 
     def usage(self) -> Mapping[int, SessionUsage]:
-        """By leader, as of the newest `refresh`; a session not yet walked is left out."""
+        """Return the usage by leader, as of the last `refresh`; new sessions are left out."""
         return self._usage
 
     def refresh(self, now: float) -> None:
-        """Find the members and read what they use; call it once a second.
+        """Find the processes of all sessions and read their usage; call this once a second.
 
         Args:
             now: monotonic seconds.
@@ -148,7 +149,7 @@ class SessionTable:
             pid = int(entry)
             try:
                 leader = self._session_of(pid)
-            except OSError:  # it has ended meanwhile
+            except OSError:  # it has ended
                 continue
             if leader != pid and leader in found:
                 found[leader].append(pid)
@@ -165,12 +166,12 @@ class SessionTable:
         self._pids = tuple(pid for pids in self._members.values() for pid in pids)
 
     def _read(self, members: tuple[int, ...]) -> tuple[float, int]:
-        """CPU time in seconds (with that of reaped children) and resident bytes of some pids."""
+        """Return the CPU seconds (with those of reaped children) and resident bytes of pids."""
         ticks = pages = 0
         for pid in members:
             try:
                 descriptor = os.open(f"{self._proc}/{pid}/stat", os.O_RDONLY)
-            except OSError:  # it has ended meanwhile
+            except OSError:  # it has ended
                 continue
             try:
                 line = os.read(descriptor, 1024)

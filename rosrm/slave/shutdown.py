@@ -1,4 +1,4 @@
-"""The end of a slave: the master is informed, then the processes are stopped or left running."""
+"""Shutdown of a slave: inform the master, then stop the processes or leave them running."""
 
 from __future__ import annotations
 
@@ -19,29 +19,30 @@ from rosrm.wording import counted, listed
 
 _log = logging.getLogger("rosrm.slave")
 
-#: The option of `rosrm slave`, and the cause of the end that it brings.
+#: Option of `rosrm slave`, and the name of this cause of a shutdown.
 STOP_ALL: Final = "--stop-all"
-#: Seconds for the master to take note that this slave ends.
+#: Seconds for the master to acknowledge the end of this slave.
 _LEAVE_PATIENCE: Final = 2.0
-#: Seconds for a re-adopted process to end: this run of the slave does not know its `stop`.
+#: Seconds for a re-adopted process to end, because this run of the slave does not know its `stop`.
 _LONGEST_STOP: Final = 600.0
 
 
 @dataclass
 class Ending:
-    """Ends one slave, whatever happens to its master and its supervisor on the way.
+    """Shutdown of one slave, also without its master or its supervisor.
 
     Attributes:
         config: of the host.
-        state: what the slave holds; it is only looked at here.
+        state: instances of the slave; read-only here.
         starter: starts processes.
         supervisor: stops them.
         endpoint: informs the master.
         serve: runs the loop of the slave while its argument returns True.
-        say: tells the user.
-        has_begun: the slave accepts no work any more.
-        keeps: no process is started any more, because the master knows those that are left running.
-        supervisor_left: there is no supervisor any more.
+        say: logs a message for the user.
+        has_begun: the slave accepts no more work.
+        keeps: the slave starts no more processes, because it has reported the running ones to the
+            master.
+        supervisor_left: the supervisor has ended or failed.
     """
 
     config: HostConfig
@@ -56,10 +57,10 @@ class Ending:
     supervisor_left: bool = False
     _supervisor_fault: str = field(init=False, default="")
     _is_informed: bool = field(init=False, default=False)
-    _kill_at: float = field(init=False, default=0.0)  # monotonic; 0.0: nothing is stopped
+    _kill_at: float = field(init=False, default=0.0)  # monotonic; 0.0: no stop began
 
     def note_supervisor_left(self, fault: str) -> None:
-        """Note that there is no supervisor any more; without a fault it has stopped everything."""
+        """Note the end of the supervisor; without a fault it has stopped everything."""
         self.supervisor_left, self._supervisor_fault = True, fault
         self.endpoint.failure = self.endpoint.failure or fault
 
@@ -104,7 +105,7 @@ class Ending:
         return self._stop_processes(1 if failure else 0, live, cause)
 
     def say_progress(self) -> None:
-        """Log what is still being stopped and how long that may take: the user signals again."""
+        """Log the processes that still stop and the time until SIGKILL, after another signal."""
         left = _live(self._begun())
         if self._kill_at and left:
             names = listed(str(one.instance) for one in left)
@@ -122,7 +123,7 @@ class Ending:
 
     def _stop_processes(self, code: int, live: int, cause: str) -> int:
         longest = self._longest_stop()
-        self._kill_at = self._next_kill()  # the answer of the master may have taken a while
+        self._kill_at = self._next_kill()  # again, because the master's answer may take a while
         self.supervisor.shut_down()
         deadline = time.monotonic() + longest
         self.serve(lambda: not self.supervisor_left and time.monotonic() < deadline)
@@ -139,7 +140,7 @@ class Ending:
         return code
 
     def _inform_master(self, kept: Sequence[InstanceStatus] = ()) -> None:
-        """Report the end of this slave, and wait until the master knows or is silent."""
+        """Report the end of this slave, and wait for the master's acknowledgement or a time-out."""
 
         def informed() -> None:
             self._is_informed = True
@@ -149,7 +150,7 @@ class Ending:
         self.serve(lambda: not self._is_informed and time.monotonic() < deadline)
 
     def _begun(self) -> list[InstanceStatus]:
-        """All instances, without those that still wait for their start."""
+        """Return the statuses of all instances except those that still wait for their start."""
         return [one for one in self.state.statuses() if self.starter.has_begun(one.instance)]
 
     def _longest_stop(self) -> float:
@@ -157,7 +158,7 @@ class Ending:
         return max(longest, default=StopPolicy().timeout)
 
     def _next_kill(self) -> float:
-        """Return when SIGKILL is sent at the latest; infinite: the `stop` of one is not known."""
+        """Return the latest monotonic time of SIGKILL; infinite if a `stop` is unknown."""
         graces = [
             math.inf if stop is None else stop.interrupt_grace + stop.terminate_grace
             for stop in self._stops()
@@ -169,14 +170,14 @@ class Ending:
         return [None if held.spec is None else held.spec.stop for held in live]
 
     def _kill_after(self) -> str:
-        """Return the end of a sentence: when SIGKILL follows; "": unknown, or it was sent."""
+        """Return the end of a sentence with the time until SIGKILL; "": unknown, or it was sent."""
         left = self._kill_at - time.monotonic()
         if not 0.0 < left < math.inf:
             return ""
         return f"; processes that run after {math.ceil(left)} s are killed (SIGKILL)"
 
     def _unfinished(self) -> str:
-        """Return what the supervisor has reported last of each process that has not ended."""
+        """Return a sentence with the last known state of each process that has not ended."""
         left = _live(self._begun())
         supervisor = f"the supervisor (pid {self.supervisor.pid})"
         stopping = [str(one.instance) for one in left if one.state is InstanceState.STOPPING]

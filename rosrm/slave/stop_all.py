@@ -1,10 +1,10 @@
-"""Ends what a slave that is gone left running on its host: `rosrm slave --stop-all` executes this.
+"""Entry point of `rosrm slave --stop-all`: stops the processes that a former slave left running.
 
-It is the slave once more, which registers, accepts no work and ends. So the master learns what has
-ended, as at the end of any slave. As `rosrm.slave`, it imports little.
+A new slave registers, accepts no work and ends. So the master receives the ends of the processes,
+as at the end of any slave. Like `rosrm.slave`, this module imports little.
 """
 
-# ruff: noqa: E402 - Ctrl-C must end us without a traceback also while the rest is being imported
+# ruff: noqa: E402 - Ctrl-C must end us without a traceback also during the imports
 from __future__ import annotations
 
 import signal
@@ -21,9 +21,9 @@ from rosrm.slave.runtime import SlaveRuntime
 
 
 def serve(handover: Handover) -> int:
-    """Take over what runs, and end it."""
+    """Re-adopt the running processes and stop them; return the exit code."""
     config = HostConfig.from_json(handover.settings)
-    # Without probes, because nothing is measured: a probe that is broken must not prevent the end.
+    # Without probes, so that a broken probe cannot prevent the end; readings are not needed.
     ending = replace(config, on_stop="stop", probes={})
     return SlaveRuntime(ending, Registry.load(handover.plugins)).stop_all()
 

@@ -1,4 +1,4 @@
-"""The slave's end of its supervisor: orders go out at once, words come in by a thread."""
+"""Connection of the slave to its supervisor: orders are sent at once, a thread receives."""
 
 from __future__ import annotations
 
@@ -27,29 +27,30 @@ from rosrm.supervisor.client import (
 )
 from rosrm.wording import counted
 
-#: Seconds for another supervisor to be ready, or for one that is busy to answer.
+#: Seconds for a new supervisor to be ready, or for a busy one to answer.
 _PATIENCE: Final = 30.0
-#: Seconds for which orders may wait before the user hears of it.
+#: Seconds for which orders may wait before a message to the user.
 _TOLD_AFTER: Final = 5.0
 
 
 class SupervisorLink:
-    """One supervisor after the other: one that was killed is replaced, and takes over.
+    """Connection to the current supervisor; a supervisor that was killed is replaced.
 
-    Nothing here makes the loop wait: a thread hears the supervisor and finds the next one. Launches
-    that the former one has said nothing of are given to the next one again: that starts nothing
-    twice. Other orders that come meanwhile are lost; the core and the master give them again, as
-    long as they are not followed. Orders to one that is stopped wait until it goes on.
+    No call blocks the loop: a thread receives the supervisor's messages and connects to the next
+    supervisor. Launches that the former supervisor has not acknowledged are sent again to the next
+    one; the supervisor starts no instance twice. Other orders during the replacement are lost, but
+    core and master repeat them until they are executed. Orders to a supervisor that is stopped by a
+    signal wait until it continues.
 
     Args:
         state: directory of the supervisor.
-        logs: bounds of what the processes print.
-        post: has something called in the loop; may be called from any thread.
-        take: takes in what happened.
-        follow: told of each new status of an instance.
-        say: tells the user.
-        ended: called once, when there is no supervisor any more: with what is wrong; "": it has
-            ended as it was told to.
+        logs: limits on the logs of the processes.
+        post: schedules a call in the loop; may be called from any thread.
+        take: takes events for the core.
+        follow: takes each new status of an instance.
+        say: logs a message for the user.
+        ended: called once, when there is no supervisor any more, with the fault; "": the supervisor
+            ended as requested.
 
     Raises:
         SupervisorError: the supervisor cannot be started or reached.
@@ -71,27 +72,27 @@ class SupervisorLink:
         self._client = SupervisorClient.connect(state, log=self._limits)
 
     def close(self) -> None:
-        """Leave it; it goes on with what it has."""
+        """Close the connection; the supervisor continues to run its instances."""
         self._is_closed = True
         self._client.close()
 
     @property
     def pid(self) -> int:
-        """Pid of the supervisor."""
+        """Return the pid of the supervisor."""
         return self._client.pid
 
-    # --- what it is told -----------------------------------------------------------------
+    # --- orders --------------------------------------------------------------------------
 
     def start(self, orders: Sequence[LaunchOrder]) -> None:
-        """Have instances started."""
+        """Send launch orders."""
         self._unanswered.update((order.instance, order) for order in orders)
-        # One that was killed takes no order; its reader says so, and it is replaced.
+        # The receiving thread detects a killed supervisor and replaces it.
         with contextlib.suppress(SupervisorGone):
             self._client.start(orders)
         self._say_if_it_waits()
 
     def carry_out(self, command: core.Command) -> None:
-        """Have done what the core asks of it."""
+        """Send a command of the core."""
         with contextlib.suppress(SupervisorGone):
             self._tell(command)
         self._say_if_it_waits()
@@ -129,22 +130,22 @@ class SupervisorLink:
             raise TypeError(command)
 
     def shut_down(self) -> None:
-        """Have it stop all processes, and end."""
+        """Order the supervisor to stop all processes and end."""
         self._is_shutting_down = True
         with contextlib.suppress(SupervisorGone):
             self._client.shutdown()
 
-    # --- what it tells -------------------------------------------------------------------
+    # --- messages ------------------------------------------------------------------------
 
     def listen(self) -> None:
-        """Hear it from now on."""
+        """Start the thread that receives messages."""
         thread = threading.Thread(
             target=self._hear_all, args=[self._client], name="supervisor", daemon=True
         )
         thread.start()
 
     def _hear_all(self, client: SupervisorClient) -> None:
-        """Runs in a thread of its own: the words of one after the other, into the loop."""
+        """Pass the messages of all successive supervisors to the loop, in a thread of its own."""
         try:
             while True:
                 self._hear(client)
@@ -155,7 +156,7 @@ class SupervisorLink:
                 self._post(partial(self._end, error))
 
     def _hear(self, client: SupervisorClient) -> None:
-        """Until another one is to take over; raises SupervisorError where none is."""
+        """Receive until the supervisor must be replaced; raises `SupervisorError` at the end."""
         try:
             while True:
                 told = client.receive(None)
@@ -166,7 +167,7 @@ class SupervisorLink:
             self._post(partial(self._say, f"{gone}; connecting to the next one"))
 
     def _next(self) -> SupervisorClient:
-        """The one that takes over, or the same, where it took no orders."""
+        """Return a connection to the next supervisor, or to the same one if it was silent."""
         told = False
         while True:
             try:
@@ -189,10 +190,10 @@ class SupervisorLink:
                 self._take(core.RestartPolicyRecorded(one.instance, one.restart))
 
     def take_over(self) -> int:
-        """Take in what the supervisor knows; what it does not know does not run.
+        """Re-adopt the supervisor's instances; instances unknown to the supervisor do not run.
 
         Returns:
-            how many instances it holds.
+            Number of instances of the supervisor.
         """
         client = self._client
         for note in client.notes:
@@ -206,7 +207,7 @@ class SupervisorLink:
         return len(client.instances)
 
     def _launch_again(self, client: SupervisorClient) -> list[InstanceStatus]:
-        """Have started what the former one did not take; what it took the next one knows."""
+        """Repeat the launch orders that no supervisor has acknowledged; return their statuses."""
         for status in client.instances:
             self._unanswered.pop(status.instance, None)
         with contextlib.suppress(SupervisorGone):
@@ -214,7 +215,7 @@ class SupervisorLink:
         return [InstanceStatus(one, InstanceState.STARTING) for one in self._unanswered]
 
     def _replace(self, client: SupervisorClient) -> None:
-        """Another one is there."""
+        """Replace the connection, and re-adopt the instances."""
         former = self._client
         former.close()
         self._client = client
@@ -226,10 +227,10 @@ class SupervisorLink:
         which = "the same" if client.pid == former.pid else "a new"
         manages = counted(live, "process", "processes")
         self._say(f"{which} supervisor (pid {client.pid}) manages {manages}")
-        if self._is_shutting_down:  # the former one may not have heard of it
+        if self._is_shutting_down:  # the former one may have missed it
             self.shut_down()
 
     def _end(self, error: SupervisorError) -> None:
-        """It has ended as it was told to; or it is gone, and there is no other one."""
+        """Report the orderly end of the supervisor, or its failure without a successor."""
         orderly = isinstance(error, SupervisorEnded)
         self._ended("" if orderly else f"the supervisor of this host is gone: {error}")

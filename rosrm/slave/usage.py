@@ -1,4 +1,4 @@
-"""What each instance uses: its session is followed, and said once the readings show it."""
+"""Usage of each instance, measured by its session and published after the readings show it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Final
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.sessions import SessionTable, SessionUsage
 
-#: Readings that go out between looking at what each instance uses and saying it: so the master
-#: never takes a need for met that does not show in the readings which it has.
+#: Readings that are published between the measurement of the usage and its publication. So the
+#: master never releases a reservation before its readings include the load.
 _READINGS_FIRST: Final = 3
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.STOPPING})
 
 
 class UsageWatch:
-    """Follows the sessions of the instances.
+    """Measurement of the sessions of the instances.
 
     Args:
         sessions: the table that the probes use too.
@@ -29,15 +29,15 @@ class UsageWatch:
         self._say_in = 0
 
     def follow(self, status: InstanceStatus) -> None:
-        """Keep the table of sessions by what has become of an instance."""
+        """Update the table of sessions by the new status of an instance."""
         leader = self._leaders.get(status.instance, 0)
         runs = status.state in _RUNS and status.pid
         if leader and (leader != status.pid or not runs):
             self._sessions.remove(leader, status.cpu_time)
             del self._leaders[status.instance]
         elif status.state.ended and status.instance in self._starting:
-            # Too short to have been seen running: its time counts too. That of an instance which
-            # ended before this slave started does not.
+            # The instance ended before it was seen running, and its CPU time counts too. The time
+            # of an instance that ended before this slave started does not.
             self._sessions.remove(status.pid, status.cpu_time)
         if status.state is InstanceState.STARTING:
             self._starting.add(status.instance)
@@ -48,7 +48,7 @@ class UsageWatch:
             self._leaders[status.instance] = status.pid
 
     def look(self, now: float) -> None:
-        """See what each instance uses, unless what was seen last has not been said yet."""
+        """Measure the usage of each instance, unless the last result is not published yet."""
         if not self._leaders or self._seen:
             return
         self._sessions.refresh(now)
@@ -57,7 +57,7 @@ class UsageWatch:
         self._say_in = _READINGS_FIRST
 
     def after_reading(self) -> Mapping[int, SessionUsage]:
-        """A reading went out: what is to be said now, by instance number; empty: nothing."""
+        """Count a published reading; return the usage to publish, by instance number, or {}."""
         self._say_in -= 1
         if not self._seen or self._say_in > 0:
             return {}

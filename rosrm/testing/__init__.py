@@ -1,6 +1,7 @@
-"""For authors of plugins: fakes, and contracts as test classes to inherit.
+"""Test support for authors of plugins: fakes, and contracts as test classes to inherit.
 
-A contract is what the core relies on; rosrm's own plugins pass the same ones. With pytest::
+A contract tests the guarantees on which the core relies; rosrm's own plugins pass it too. With
+pytest::
 
     from rosrm.testing import ProbeContract
     from thermometer.plugin import register_probes
@@ -9,9 +10,9 @@ A contract is what the core relies on; rosrm's own plugins pass the same ones. W
         offer = register_probes()[0]
         options = {"sensor": "cpu"}
 
-`options` is written as in a file of the configuration: `{"period": "500ms"}` is allowed. Each call
-has the time limit that rosrm grants, and a failure says in a sentence what is wrong. Where a plugin
-says that it is absent (`SkipPlugin`), its contract is skipped with that reason.
+`options` has the form of a configuration file: `{"period": "500ms"}` is allowed. Each call has the
+time limit of master or slave, and a failure describes the error in a sentence. If a plugin reports
+itself absent (`SkipPlugin`), its contract is skipped with that reason.
 """
 
 from rosrm.extensions.registry import Registry

@@ -1,4 +1,4 @@
-"""Calls of a plugin by its contract, with the limits and checks of master and slave."""
+"""Calls of a plugin by its contract, with the time limits and checks of master and slave."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _HOOK_OF: Final = {kind: hook for hook, (kind, _) in HOOKS.items()}
 
 
 class ContractBroken(AssertionError):
-    """A plugin breaks its contract; the text says how."""
+    """Violation of a contract by a plugin, with a description."""
 
 
 def call(hook: str, seconds: float, ask: Callable[[], T]) -> T:
     """Return the answer of a plugin.
 
     Args:
-        hook: that is called, for messages.
-        seconds: the limit of master or slave for this call.
+        hook: name of the called hook, for messages.
+        seconds: time limit of master or slave for this call.
         ask: calls the hook and checks the answer; raises `PluginError` for a wrong one.
 
     Raises:
-        ContractBroken: the call took longer, or its answer is wrong.
+        ContractBroken: the call exceeded its limit, or its answer is wrong.
     """
     late = ""
 
@@ -61,7 +61,7 @@ def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str,
     """Return options as `rosrm config check` reads them from a file, as plain values.
 
     Raises:
-        ContractBroken: for an unknown name, or a value that is not allowed.
+        ContractBroken: a name is unknown, or a value is not allowed.
     """
     problems = Problems()
     value = validated(wanted, parse(json.dumps(to_plain(given)), "options"), problems)
@@ -71,17 +71,17 @@ def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str,
 
 
 def made(kind: str, offer: ChosenOffer, options: Mapping[str, Any], *context: Any) -> Any:
-    """Return the object of an offer, made and checked as by master or slave.
+    """Return the object of an offer, created and checked as by master or slave.
 
     Args:
         kind: as in `Registry.offer`.
         offer: of the plugin.
-        options: as a file gives them.
+        options: in the form of a file.
         context: of a probe.
 
     Raises:
-        ContractBroken: the offer or what it makes is wrong.
-        SkipTest: the plugin says that it is absent here.
+        ContractBroken: the offer or its object is wrong.
+        SkipTest: the plugin reports itself absent on this host.
     """
     hook = _HOOK_OF[kind]
     plugin = SimpleNamespace(**{hook: hookimpl(specname=hook)(lambda: [offer])})
@@ -108,10 +108,10 @@ def made(kind: str, offer: ChosenOffer, options: Mapping[str, Any], *context: An
 
 
 def as_json(what: str, value: object) -> Mapping[str, Any]:
-    """Return a JSON object as it arrives on the other side.
+    """Return a mapping as its receiver gets it: converted to JSON and back.
 
     Raises:
-        ContractBroken: it is none; `what` begins the message.
+        ContractBroken: `value` is no JSON object; `what` begins the message.
     """
     if not isinstance(value, Mapping):
         given = "None" if value is None else repr(value)

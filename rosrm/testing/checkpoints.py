@@ -1,4 +1,4 @@
-"""What the master relies on in a checkpoint policy."""
+"""Contract of checkpoint policies with the master."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.values import EMPTY, MigrationPolicy, ProcessSpec
 from rosrm.testing.calls import call, made
 
-#: Orders of the hosts that keep a state, of those that are tried.
+#: Number of orders of the replicas' hosts that are tested.
 _ORDERS: Final = 24
 
 
 class CheckpointContract:
-    """What the master relies on in a checkpoint policy.
+    """Contract of a checkpoint policy with the master.
 
     Attributes:
-        offer: what is tested.
-        options: by name, as cluster.yaml has them; the others have their defaults.
+        offer: the tested offer.
+        options: by name, as in cluster.yaml; the others have their defaults.
         spec: of a stateful process.
     """
 
@@ -42,16 +42,16 @@ class CheckpointContract:
     )
 
     def make(self) -> CheckpointPolicy:
-        """A new policy; override it where more is needed."""
+        """Return a new policy; override this if the policy needs more."""
         policy: CheckpointPolicy = made("checkpoint", self.offer, self.options)
         return policy
 
     def _choice(self, policy: CheckpointPolicy, view: CheckpointView) -> CheckpointChoice | None:
-        """Return a choice; the limit and the checks are those of the master."""
+        """Return a choice, with the time limit and checks of the master."""
         return call("choose", CALL_LIMIT, lambda: sound_choice(policy.choose(view), view))
 
     def views(self) -> Sequence[CheckpointView]:
-        """A process on one of five hosts: kept nowhere else yet, kept already, and all alone."""
+        """Return views of a process: without a replica, with replicas, and on the only host."""
         hosts = {f"h{n}": {"rack": str(n % 2), "room": "1"} for n in range(5)}
         fresh = CheckpointView(self.spec, "h0", None, 1000, (), hosts)
         return [
@@ -62,12 +62,12 @@ class CheckpointContract:
         ]
 
     def test_chooses_hosts_that_are_there(self) -> None:
-        """Each once, never the process's own; and every so many seconds, more than 0."""
+        """The policy chooses distinct other hosts that exist, and a period above 0 s."""
         for view in self.views():
             self._choice(self.make(), view)
 
     def test_is_pure(self) -> None:
-        """The same view gives the same choice, also with another object of the policy."""
+        """The policy chooses the same for the same view, also as another object."""
         policy, twin = self.make(), self.make()
         for view in self.views():
             first = self._choice(policy, view)
@@ -75,9 +75,9 @@ class CheckpointContract:
                 assert again == first, f"for the same view it chose {first}, then {again}"
 
     def test_stays_with_its_choice(self) -> None:
-        """Once its hosts keep the state, nothing travels to another one.
+        """The policy keeps its hosts once they hold replicas, in any order of the list.
 
-        In whatever order they are listed: the newest goes first, and that changes by the second.
+        The list begins with the newest replica, so its order changes from second to second.
         """
         for view in self.views():
             choice = self._choice(self.make(), view)
@@ -90,7 +90,7 @@ class CheckpointContract:
                     )
 
     def test_sets_a_pace_for_dumps_of_memory(self) -> None:
-        """Of a policy that does: seconds, more than none, the same for the same view, or none."""
+        """A policy with a pace returns more than 0 s or None, the same for the same view."""
         policy: object = self.make()
         twin: object = self.make()
         if not (implements(policy, MemoryPacing) and implements(twin, MemoryPacing)):

@@ -1,4 +1,4 @@
-"""A journal in memory, and what the master relies on in one."""
+"""In-memory journal, and the contract of journals with the master."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rosrm.model.event_kinds import EventKind
 
 @dataclass
 class MemoryJournal:
-    """A journal that forgets; implements `rosrm.extensions.contracts.Journal`.
+    """In-memory implementation of `rosrm.extensions.contracts.Journal`.
 
     Attributes:
         stored: every record, oldest first.
@@ -45,13 +45,13 @@ class MemoryJournal:
         return stored
 
     def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
-        """All intents of a table by key."""
+        """Return all intents of a table by key."""
         return dict(self.tables.get(table, {}))
 
     def records(
         self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
     ) -> Sequence[StoredRecord]:
-        """The newest matching records after a sequence, oldest first."""
+        """Return the newest matching records after a sequence, oldest first."""
         matching = [
             stored
             for stored in self.stored
@@ -62,25 +62,25 @@ class MemoryJournal:
         return matching[max(0, len(matching) - newest) :]
 
     def close(self) -> None:
-        """Remember that it was."""
+        """Set `closed`."""
         self.closed = True
 
 
 class JournalContract:
-    """What the master relies on in a journal. Override `open`.
+    """Contract of a journal with the master. Override `open`.
 
     Attributes:
-        durable: what was written is there again when the journal is opened anew.
+        durable: True if a reopened journal has the written records and intents.
     """
 
     durable: ClassVar[bool] = True
 
     def open(self, directory: Path) -> Journal:
-        """The journal in a directory, made where it is not there yet."""
+        """Return the journal in a directory, created if it does not exist."""
         raise NotImplementedError
 
     def test_numbers_records_without_a_gap(self, tmp_path: Path) -> None:
-        """Sequences go 1, 2, 3, ... over all groups; time stamps are kept."""
+        """The journal numbers records 1, 2, 3, ... over all groups, and keeps their time stamps."""
         journal = self.open(tmp_path)
         assert isinstance(journal, Journal)
         first = journal.write(
@@ -93,7 +93,10 @@ class JournalContract:
         journal.close()
 
     def test_selects_records(self, tmp_path: Path) -> None:
-        """By process, by host (moves from it too), after a sequence; of too many the newest."""
+        """The journal selects records by process, by host and after a sequence.
+
+        The records of a host include migrations from it. Of too many records the newest count.
+        """
         journal = self.open(tmp_path)
         moved = Record(EventKind.MIGRATED, facts={"from": "source", "to": "i"})
         journal.write(
@@ -120,7 +123,7 @@ class JournalContract:
         journal.close()
 
     def test_newest_intent_counts(self, tmp_path: Path) -> None:
-        """A later value replaces the earlier one, also within a group; None takes the key away."""
+        """A later intent replaces an earlier one, also within a group; None removes the key."""
         journal = self.open(tmp_path)
         journal.write([], [Intent("process", "p", {"n": 1}), Intent("process", "q", {"n": 1})], 0)
         journal.write([], [Intent("process", "p", {"n": 2}), Intent("process", "p", {"n": 3})], 0)
@@ -130,7 +133,7 @@ class JournalContract:
         journal.close()
 
     def test_survives_being_closed(self, tmp_path: Path) -> None:
-        """Records, intents and the count go on where they were."""
+        """A reopened journal has its records and intents, and continues the sequence."""
         if not self.durable:
             raise SkipTest("this journal is not durable")
         journal = self.open(tmp_path)

@@ -1,8 +1,8 @@
-"""A whole cluster on this machine: real master, slaves and processes, for demos, tests, benchmarks.
+"""Complete cluster on this machine for demos, tests and benchmarks.
 
-Every part is a process of its own, started as `rosrm master` and `rosrm slave` start it, in a ROS
-domain of its own on loopback. When its block is left, also by an exception, the parts are ended,
-by pid.
+Master, slaves and processes are real. Every part is a process of its own, started as by
+`rosrm master` and `rosrm slave`, in a separate ROS domain on loopback. At the end of the `with`
+block, also after an exception, the parts are ended by pid.
 """
 
 from __future__ import annotations
@@ -33,22 +33,23 @@ from rosrm.testing.loopback import settings_on_this_machine
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-#: Seconds in which a part must have ended after SIGINT; its processes have their own grace.
+#: Seconds for a part to end after SIGINT; its processes have their own grace times.
 _END: Final = 30.0
-#: Domains that DDS maps to ports below the ephemeral range.
+#: ROS domains whose DDS ports are below the ephemeral range.
 _DOMAINS: Final = range(1, 101)
-#: Participants whose ports are looked at: the first of a cluster may have ended, and others live.
+#: Participants whose ports are checked, because the first one of a cluster may have ended before
+#: the others.
 _PARTICIPANTS: Final = range(8)
 _LOOK: Final = 0.02
-#: Seconds for a master to come up and to be found.
+#: Seconds for a master to start and to be discovered.
 _FIND: Final = 15.0
 
 
 def claim_domain() -> tuple[int, socket.socket]:
-    """A ROS domain in which nobody on this machine listens, and the claim to it.
+    """Return a ROS domain that is unused on this machine, and a socket that claims the domain.
 
-    Until DDS binds its ports nothing shows that a domain is taken: who was given it holds a name
-    among the machine's abstract sockets, which frees itself when the claim is closed or we die.
+    Until DDS binds its ports, an occupied domain looks free. So each owner binds an abstract socket
+    of this machine. The kernel releases its name when the socket is closed or its process ends.
     """
     for domain in sorted(_DOMAINS, key=lambda number: (number * 37 + os.getpid()) % 101):
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -66,10 +67,12 @@ def claim_domain() -> tuple[int, socket.socket]:
 
 @dataclass
 class Part:
-    """A master or a slave that was started.
+    """Running master or slave.
 
     Attributes:
-        log: what it writes to its standard error.
+        name: "master", or the name of the host.
+        process: of the part.
+        log: file with its standard output and standard error.
     """
 
     name: str
@@ -77,18 +80,18 @@ class Part:
     log: Path
 
     def end(self, number: int = signal.SIGINT) -> None:
-        """Send a signal, if it lives."""
+        """Send a signal if the part still runs."""
         if self.process.poll() is None:
             self.process.send_signal(number)
 
 
 @dataclass
 class LocalCluster:
-    """A master and slaves on this machine; a context manager that ends them.
+    """Master and slaves on this machine; a context manager that ends them.
 
     Attributes:
-        directory: for states and logs.
-        cluster: the master's settings; its `ros` and `state` are set here.
+        directory: for state directories and logs.
+        cluster: the master's settings; this class replaces their `ros` and `state`.
         hosts: the slaves' settings; likewise.
         domain: ROS domain; None: a free one.
     """
@@ -104,7 +107,7 @@ class LocalCluster:
 
     def __post_init__(self) -> None:
         """Choose the domain."""
-        # Processes run in directories of their own, and are given the names of files in it.
+        # An absolute path, because processes with other working directories get file names in it.
         self.directory = self.directory.absolute()
         if self.domain is None:
             self.domain, self._claim = claim_domain()
@@ -142,16 +145,16 @@ class LocalCluster:
         return Part(name, process, log)
 
     def switch_off(self, name: str) -> float:
-        """End a host as a loss of power would: slave, supervisor and processes at one moment.
+        """Simulate a power failure of a host: kill slave, supervisor and processes at once.
 
         Returns:
-            When that was, unix time.
+            Unix time of the failure.
         """
         pids = {host: part.process.pid for host, part in self.slaves.items()}
         slave = self.slaves.pop(name).process
         at = time.time()
         stopped: set[int] = set()
-        # Who is stopped starts nobody: in the end a look finds no more.
+        # A process that is stopped by a signal starts no other, so the loop ends.
         while found := _processes_of(self.directory / "hosts", name, pids) - stopped:
             _send(found, signal.SIGSTOP)
             stopped |= found
@@ -159,11 +162,11 @@ class LocalCluster:
         slave.wait(_END)
         return at
 
-    # --- looking -------------------------------------------------------------------------
+    # --- queries -------------------------------------------------------------------------
 
     @property
     def client(self) -> MasterClient:
-        """A connection to the master."""
+        """Return the connection to the master, opened on first use."""
         deadline = time.monotonic() + _FIND
         while self._client is None:
             self._check_parts()
@@ -177,11 +180,11 @@ class LocalCluster:
     def wait_until(
         self, what: str, condition: Callable[[Snapshot], bool], timeout: float = 30.0
     ) -> Snapshot:
-        """Look at hosts and processes until a condition holds.
+        """Poll hosts and processes until a condition holds; return the last listing.
 
         Raises:
-            TimeoutError: it did not hold in time; the message says what was waited for, and what
-                there was instead.
+            TimeoutError: the condition did not hold in time; the message has `what` and the last
+                states.
         """
         deadline = time.monotonic() + timeout
         while True:
@@ -203,12 +206,12 @@ class LocalCluster:
         self.wait_until(f"hosts {', '.join(self.slaves)} accepting", all_accept, timeout)
 
     def host(self, name: str) -> HostRow:
-        """A host's row now."""
+        """Return the current row of a host."""
         rows = self.client.list(hosts=True).hosts
         return next(row for row in rows if row.description.name == name)
 
     def process(self, name: str) -> ProcessRow:
-        """A process's row now."""
+        """Return the current row of a process."""
         rows = self.client.list(processes=True).processes
         return next(row for row in rows if row.name == name)
 
@@ -255,13 +258,13 @@ class LocalCluster:
 
 
 def _processes_of(hosts: Path, name: str, slaves: Mapping[str, int]) -> set[int]:
-    """Pids of a host's slave and supervisor, and of all below them; of other users none.
+    """Return the pids of a host's slave, supervisor and their descendants, of this user only.
 
-    A process whose supervisor was killed is known by its environment. One that was restored here
-    has the environment of where it began, so whom it is below comes first.
+    A process whose supervisor was killed is found by its environment. A restored process has the
+    environment of its first host, so its ancestors take precedence.
 
     Args:
-        hosts: the directory that holds those of the hosts.
+        hosts: the directory that contains the directories of the hosts.
         name: of the host.
         slaves: pid of each host's slave.
     """

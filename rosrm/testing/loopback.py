@@ -1,9 +1,9 @@
-"""ROS that does not leave this machine, for clusters of several hosts on one: demos and tests.
+"""ROS traffic confined to this machine, for clusters of several hosts on it in demos and tests.
 
-ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it here on any machine, at a price: the first 32
-participants of a domain find each other, and nodes always use shared memory, with what killed
-processes leave there (docs/decisions/0015). In a network namespace where nothing but
-loopback has an address neither holds.
+ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST confines traffic on any machine, with two drawbacks. Only
+the first 32 participants of a domain discover each other. And nodes always use shared memory, in
+which killed processes leave segments (docs/decisions/0015). A network namespace in which only
+loopback has an address has neither drawback.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ import psutil
 
 from rosrm.model.ros_settings import RosSettings
 
-#: Of linux/sched.h, linux/sockios.h and linux/if.h.
+#: Constants of linux/sched.h, linux/sockios.h and linux/if.h.
 _CLONE_NEWNET: Final = 0x40000000
 _SIOCSIFFLAGS: Final = 0x8914
 _IFF_UP: Final = 0x1
-#: Bits of CAP_SYS_ADMIN, to make a network, and of CAP_NET_ADMIN, to bring loopback up in it.
+#: Bits of CAP_SYS_ADMIN, for a new namespace, and of CAP_NET_ADMIN, to bring up its loopback.
 _NEEDED: Final = 1 << 21 | 1 << 12
 
 
 def settings_on_this_machine(domain: int | None = None) -> RosSettings:
-    """How to join ROS so that nothing leaves this machine."""
+    """Return the ROS settings that keep all traffic on this machine."""
     if _is_alone():
         return RosSettings(domain=domain, discovery_range="subnet", transports="UDPv4")
     return RosSettings(domain=domain, discovery_range="localhost")
 
 
 def enter_private_network() -> bool:
-    """Move this thread, and all that it starts from now on, into a network of loopback alone.
+    """Move this thread and its future children into a network namespace with loopback alone.
 
-    The network ends with the last process in it.
+    The namespace ends with its last process.
 
     Returns:
-        Whether it was allowed: the capabilities CAP_SYS_ADMIN and CAP_NET_ADMIN are needed.
+        True on success; False without the capabilities CAP_SYS_ADMIN and CAP_NET_ADMIN.
     """
     if _capabilities() & _NEEDED != _NEEDED:
         return False
@@ -55,14 +55,14 @@ def enter_private_network() -> bool:
 
 
 def _capabilities() -> int:
-    """The effective ones of this process, as bits."""
+    """Return the effective capabilities of this process as a bit mask."""
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
     (line,) = (line for line in status.splitlines() if line.startswith("CapEff:"))
     return int(line.split()[1], 16)
 
 
 def _is_alone() -> bool:
-    """Whether no interface but loopback has an address."""
+    """Return True if only loopback has an IPv4 address."""
     interfaces = {
         name
         for name, addresses in psutil.net_if_addrs().items()

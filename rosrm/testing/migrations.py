@@ -1,4 +1,4 @@
-"""What the master relies on in a migration strategy."""
+"""Contract of migration strategies with the master."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from rosrm.model.plan_json import checked_plan
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 from rosrm.testing.calls import ContractBroken, as_json, call, checked_options, made
 
-#: A unit of each quantity that an option may have.
+#: Unit for each kind of quantity of an option.
 _UNITS: Final = {"duration": "s", "size": "B", "cores": "cores"}
 
 
 def with_options(move: Move, offer: MigrationOffer, **cluster: Any) -> Move:
-    """Return a move with the options that the master would give it.
+    """Return a move with the merged options, as the master passes it to the strategy.
 
     Args:
         move: of a process that may have options of its own, as text or numbers.
         offer: of the strategy.
-        cluster: its options for all processes, by name, as cluster.yaml has them.
+        cluster: the strategy's options for all processes, by name, as in cluster.yaml.
     """
     migration, wanted = move.spec.migration, offer.own_options or offer.options
     own = migration.options if migration.strategy in (None, offer.name) else EMPTY
@@ -53,12 +53,12 @@ def with_options(move: Move, offer: MigrationOffer, **cluster: Any) -> Move:
 
 
 class MigrationContract:
-    """What the master relies on in a migration strategy.
+    """Contract of a migration strategy with the master.
 
     Attributes:
-        offer: what is tested.
-        options: by name, as cluster.yaml has them; the others have their defaults.
-        spec: of a process that the strategy can move.
+        offer: the tested offer.
+        options: by name, as in cluster.yaml; the others have their defaults.
+        spec: of a process that the strategy can migrate.
         not_called: executors that a test cannot call, by name, with the reason.
     """
 
@@ -68,7 +68,7 @@ class MigrationContract:
     not_called: ClassVar[Mapping[str, str]] = EMPTY
 
     def make(self) -> MigrationStrategy:
-        """A new strategy; override it where more is needed."""
+        """Return a new strategy; override this if the strategy needs more."""
         strategy: MigrationStrategy = made("migration", self.offer, self.options)
         return strategy
 
@@ -76,7 +76,7 @@ class MigrationContract:
         return _plan("propose", partial(strategy.propose, move))
 
     def moves(self) -> Sequence[Move]:
-        """The same move of a process that may overlap with itself, and of one that may not."""
+        """Return one move of a process with `overlap: true`, and one with `overlap: false`."""
         move = Move(
             spec=self.spec,
             source=InstanceId(self.spec.name, 1),
@@ -92,17 +92,20 @@ class MigrationContract:
         return [self.with_options(move) for move in moves]
 
     def with_options(self, move: Move) -> Move:
-        """Return a move with its options, as the master gives it."""
+        """Return a move with its options, as the master passes it."""
         return with_options(move, self.offer, **self.options)
 
     def test_plan_is_sound(self) -> None:
-        """One commit point, hosts of this move only, a time-out for every wait."""
+        """Each plan has one commit, uses only hosts of its move, and a time-out for every wait."""
         for move in self.moves():
             fault = fault_of(self._plan(self.make(), move), move)
             assert not fault, f"the plan is unsound: {fault}"
 
     def test_checkpoints_and_restores_are_sound(self) -> None:
-        """Of a strategy that takes images: on one host, and owned by the image in between."""
+        """Plans for checkpoint and restore use one host, and the image owns the process in between.
+
+        The test applies to strategies that implement `Imaging`.
+        """
         strategy: object = self.make()
         if not implements(strategy, Imaging):
             return
@@ -120,7 +123,10 @@ class MigrationContract:
                 assert checked_plan(plan) == plan, f"the journal changes the plan of {hook}"
 
     def test_periodic_checkpoints_are_sound(self) -> None:
-        """Of a strategy that makes them: a step on the instance's host, each time another one."""
+        """Each periodic checkpoint is a step on the instance's host, distinct for each time.
+
+        The test applies to strategies that implement `PeriodicImaging`.
+        """
         strategy: object = self.make()
         if not implements(strategy, PeriodicImaging):
             return
@@ -144,7 +150,7 @@ class MigrationContract:
             assert 0.0 < step.timeout < inf, f"the timeout of periodic is {step.timeout} s"
 
     def test_is_pure(self) -> None:
-        """The same move gives the same plan, also with another object of the strategy."""
+        """The strategy returns the same plan for the same move, also as another object."""
         strategy, twin = self.make(), self.make()
         for move in self.moves():
             plan = self._plan(strategy, move)
@@ -152,7 +158,7 @@ class MigrationContract:
                 assert self._plan(one, move) == plan, f"{whose} gave another plan for the same move"
 
     def test_can_be_undone_before_the_commit(self) -> None:
-        """A started destination would be stopped again, and a stopped source started."""
+        """Before the commit, a start of the destination and a stop of the source have an undo."""
         for move in self.moves():
             for step in before_commit(self._plan(self.make(), move)):
                 if isinstance(step, Start) and step.instance == move.destination:
@@ -161,7 +167,7 @@ class MigrationContract:
                     assert isinstance(step.undo, (Start, Execute)), "the stop has no way back"
 
     def test_numbers_are_used_once(self) -> None:
-        """A source that is started again runs under the number kept for it, not its old one."""
+        """A source that is started again has the number reserved for it, not its old one."""
         for move in self.moves():
             for step in self._plan(self.make(), move).steps:
                 if isinstance(step, Stop) and isinstance(step.undo, Start):
@@ -171,12 +177,12 @@ class MigrationContract:
                     )
 
     def test_an_overlap_is_declared(self) -> None:
-        """A destination of the same name that starts before the source has stopped says so."""
+        """A plan declares its overlap if a destination of the same name starts before the stop."""
         for move in self.moves():
             plan = self._plan(self.make(), move)
             stopped = False
             for step in plan.steps:
-                stopped = stopped or isinstance(step, Execute)  # what that does is not known here
+                stopped = stopped or isinstance(step, Execute)  # may stop the source
                 if isinstance(step, Stop) and step.instance == move.source:
                     stopped = True
                 if isinstance(step, Start) and step.instance == move.destination and not stopped:
@@ -191,15 +197,15 @@ class MigrationContract:
                     )
 
     def test_survives_the_journal(self) -> None:
-        """A master that is started anew goes on with the very same plan."""
+        """A restarted master reads the identical plan from its journal."""
         for move in self.moves():
             plan = self._plan(self.make(), move)
             assert checked_plan(plan) == plan, "the journal gives back another plan"
 
     def test_a_shadow_is_released_after_the_commit(self) -> None:
-        """Its slave restarts it as its spec says, once it owns the name and not before.
+        """A shadow gets the restart policy of its spec after the commit, and not before.
 
-        So it is with one that is restored from an image.
+        The same holds for a destination that is restored from a checkpoint image.
         """
         for move in self.moves():
             plan = self._plan(self.make(), move)
@@ -215,7 +221,7 @@ class MigrationContract:
             )
 
     def test_a_source_that_is_not_restarted_for_a_while_is_again_if_it_stays(self) -> None:
-        """What suspends its policy is undone by giving it back."""
+        """The undo of a suspended restart policy sets the policy of the spec again."""
         for move in self.moves():
             for step in before_commit(self._plan(self.make(), move)):
                 if isinstance(step, SetRestart):
@@ -226,7 +232,7 @@ class MigrationContract:
                     )
 
     def test_a_silent_source_goes_on_only_when_its_successor_has_given_up(self) -> None:
-        """SWITCH is undone by ABORT, and before that stands a SHADOW that is undone by RESUME."""
+        """The undo of SWITCH is ABORT, and an earlier SHADOW has the undo RESUME."""
         for move in self.moves():
             undone_by = {
                 step.phase: step.undo.phase
@@ -240,7 +246,7 @@ class MigrationContract:
                 ], "SWITCH needs the undo ABORT, and before it a SHADOW with the undo RESUME"
 
     def test_executors_are_its_own(self) -> None:
-        """An open step names an executor of the same offer, with arguments that are JSON."""
+        """Each open step names an executor of the same offer, with JSON arguments."""
         for move in self.moves():
             for step in self._plan(self.make(), move).steps:
                 if isinstance(step, Execute):
@@ -255,9 +261,9 @@ class MigrationContract:
         as_json(f"the step of the executor {step.executor!r} has the arguments", step.arguments)
 
     def test_executors_answer_with_json_objects(self, tmp_path: Path) -> None:
-        """Each that a plan names answers as on a slave, within the `timeout` of its step.
+        """Each executor of a plan returns a JSON object within the `timeout` of its step.
 
-        One may raise, for that is a failed step. Those in `not_called` are left out.
+        An executor may raise, which is a failed step. Executors in `not_called` are skipped.
         """
         for move in self.moves():
             results: dict[str, Any] = {}
@@ -280,12 +286,12 @@ class MigrationContract:
                     answer = call(who, step.timeout, partial(execute, told))
                 except ContractBroken:
                     raise
-                except Exception:  # noqa: BLE001, S112 - to raise is to fail the step, and allowed
+                except Exception:  # noqa: BLE001, S112 - an executor may fail its step by raising
                     continue
                 results[step.executor] = as_json(f"{who} answered", answer)
 
     def test_options_of_a_process_are_read_from_the_move(self) -> None:
-        """A work file may write the same quantities with their units: the plan stays the same.
+        """The plan is the same if a work file gives the same quantities with units.
 
         `spec.migration.options` has them as text; `move.options` has them parsed.
         """
@@ -304,7 +310,7 @@ class MigrationContract:
 
 
 def quantities_as_text(options: Any) -> Iterator[tuple[str, str]]:
-    """Return the options that are quantities, each written with its unit, as "2.0s"."""
+    """Yield the options that are quantities, each as text with its unit, e.g. "2.0s"."""
     hints = get_type_hints(type(options), include_extras=True)
     for f in fields(options):
         for mark in getattr(hints[f.name], "__metadata__", ()):
@@ -314,18 +320,18 @@ def quantities_as_text(options: Any) -> Iterator[tuple[str, str]]:
 
 
 def shadows(plan: Plan) -> Sequence[Start]:
-    """The steps that start a destination in silence."""
+    """Return the steps that start a destination without output: as a shadow, or restored."""
     starts = [step for step in plan.steps if isinstance(step, Start)]
     return [step for step in starts if step.shadow or step.restored]
 
 
 def before_commit(plan: Plan) -> Sequence[Step]:
-    """The steps of a plan that can still be undone: all, where it lacks a commit."""
+    """Return the steps before the commit; all steps if the plan has none."""
     return list(takewhile(lambda step: not isinstance(step, Commit), plan.steps))
 
 
 def _plan(hook: str, ask: Callable[[], Plan]) -> Plan:
-    """Return a plan; the limit and the checks are those of the master."""
+    """Return a plan, with the time limit and checks of the master."""
 
     def checked() -> Plan:
         plan = required(ask(), Plan)

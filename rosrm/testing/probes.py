@@ -1,4 +1,4 @@
-"""Fakes around probes, and what the slave relies on in one."""
+"""Fakes for probes, and the contract of probes with the slave."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosrm.testing.calls import call, made
 
 
 class FakeClock:
-    """A clock that stands until it is told to go on.
+    """Clock that advances only by `advance`.
 
     Attributes:
         now: monotonic seconds.
@@ -28,40 +28,40 @@ class FakeClock:
         self.now = now
 
     def __call__(self) -> float:
-        """The time."""
+        """Return the time."""
         return self.now
 
     def advance(self, seconds: float) -> float:
-        """Let time pass; returns the new time."""
+        """Advance the clock; return the new time."""
         self.now += seconds
         return self.now
 
 
 @dataclass
 class FakeSessions:
-    """Process trees as the test says; implements `rosrm.extensions.contracts.Sessions`."""
+    """Fake process trees; an implementation of `rosrm.extensions.contracts.Sessions`."""
 
     members: tuple[int, ...] = ()
     ended: float = 0.0
 
     def pids(self) -> Sequence[int]:
-        """The processes."""
+        """Return the pids of the processes."""
         return self.members
 
     def ended_cpu_time(self) -> float:
-        """Seconds of CPU of those that have ended."""
+        """Return the CPU seconds of ended processes."""
         return self.ended
 
 
 class FakeProbe:
-    """Answers as the test says.
+    """Probe with answers set by the test.
 
     Attributes:
-        answer: usage by resource, what the next reads return.
-        fault: raised by the next reads; None: they answer.
-        gate: reads wait for it; set it to let a hanging read go on.
-        reads: how many were begun.
-        closed: how often it was closed.
+        answer: usage by resource, returned by the next reads.
+        fault: raised by the next reads; None: the reads return.
+        gate: reads wait for this event; set it to continue a hanging read.
+        reads: number of reads begun.
+        closed: number of calls of `close`.
     """
 
     def __init__(self, **answer: float) -> None:
@@ -75,11 +75,11 @@ class FakeProbe:
 
     @property
     def resources(self) -> Sequence[ResourceDescription]:
-        """Those that it was made with, each of capacity 1."""
+        """Return the resources given at construction, each of capacity 1."""
         return self._resources
 
     def read(self) -> Iterable[Reading]:
-        """The answer, when the gate is open."""
+        """Return the answer when the gate is open."""
         self.reads += 1
         if not self.gate.wait(60.0):
             raise TimeoutError("the test left the gate shut")
@@ -88,12 +88,12 @@ class FakeProbe:
         return [Reading(name, usage) for name, usage in self.answer.items()]
 
     def close(self) -> None:
-        """Count."""
+        """Count the call."""
         self.closed += 1
 
 
 def made_probe(name: str, probe: Probe, *, period: float = 0.1, deadline: float = 1.0) -> MadeProbe:
-    """A probe as the registry hands it to the slave."""
+    """Return a probe as the registry passes it to the slave."""
     return MadeProbe(name, probe, tuple(probe.resources), period, deadline)
 
 
@@ -104,17 +104,17 @@ def probe_context(
     data_directory: Path = Path("/"),
     sessions: FakeSessions | None = None,
 ) -> ProbeContext:
-    """What a probe is given when it is made."""
+    """Return the context with which a probe is created."""
     return ProbeContext(scope, budget, data_directory, sessions or FakeSessions())
 
 
 class ProbeContract:
-    """What the slave relies on in a probe.
+    """Contract of a probe with the slave.
 
     Attributes:
-        offer: what is tested.
-        options: by name, as host.yaml has them; the others have their defaults.
-        context: what the probe is made with.
+        offer: the tested offer.
+        options: by name, as in host.yaml; the others have their defaults.
+        context: with which the probe is created.
     """
 
     offer: ClassVar[ProbeOffer]
@@ -122,17 +122,17 @@ class ProbeContract:
     context: ClassVar[ProbeContext] = probe_context()
 
     def make(self) -> Probe:
-        """A new probe; override it where more is needed."""
+        """Return a new probe; override this if the probe needs more."""
         probe: Probe = made("probe", self.offer, self.options, self.context)
         return probe
 
     def _read(self, probe: Probe) -> None:
-        """Read as a slave does: within the deadline, and with its checks."""
+        """Read the probe as a slave does, within the deadline and with its checks."""
         names = tuple(resource.name for resource in probe.resources)
         call("read", self.offer.deadline, lambda: read_values(probe, names))
 
     def test_resources_are_well_described(self) -> None:
-        """Each by its type, names unique and declared by the offer, capacities above 0."""
+        """Resources have valid types, unique names of the offer, and capacities above 0."""
         probe = self.make()
         resources = list(probe.resources)
         probe.close()
@@ -147,14 +147,14 @@ class ProbeContract:
         )
 
     def test_reads_each_resource_once(self) -> None:
-        """Every read brings one sane reading of each resource, and of nothing else."""
+        """Every read returns one valid reading of each resource, and no other reading."""
         probe = self.make()
         for _ in range(5):
             self._read(probe)
         probe.close()
 
     def test_resources_stay(self) -> None:
-        """What is described does not change while the slave runs."""
+        """The described resources do not change after a read."""
         probe = self.make()
         before = list(probe.resources)
         self._read(probe)
@@ -163,7 +163,7 @@ class ProbeContract:
         probe.close()
 
     def test_reads_in_another_thread(self) -> None:
-        """A read in time works in a thread that did not make the probe, as the slave does it."""
+        """A read works within its deadline in a thread that did not create the probe."""
         probe = self.make()
         answers: list[list[Reading]] = []
         thread = threading.Thread(target=lambda: answers.append(list(probe.read())), daemon=True)
@@ -173,19 +173,19 @@ class ProbeContract:
         probe.close()
 
     def test_close_releases_files(self) -> None:
-        """Made, read and closed once more, it holds no more files than before."""
+        """A probe that is created, read and closed leaves no additional file open."""
         before = 0
         for turn in range(3):
             probe = self.make()
             self._read(probe)
             probe.close()
-            if turn == 0:  # the first may load a library for good
+            if turn == 0:  # the first may load a library
                 before = _open_files()
         more = _open_files() - before
         assert more <= 0, f"a probe that was made, read and closed leaves {more} more files open"
 
     def test_offer_is_complete(self) -> None:
-        """It has a name, a line of summary, and periods above 0."""
+        """The offer has a name, a summary of one line, and a period and deadline above 0."""
         assert self.offer.name, "ProbeOffer.name is empty"
         assert self.offer.summary, "ProbeOffer.summary is empty; `rosrm plugins` shows it"
         assert self.offer.period > 0, f"ProbeOffer.period is {self.offer.period}; allowed: above 0"
@@ -195,4 +195,4 @@ class ProbeContract:
 
 
 def _open_files() -> int:
-    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - a directory that changes by being read
+    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - reading the directory changes it

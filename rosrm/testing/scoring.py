@@ -1,4 +1,4 @@
-"""Hosts and processes for scoring policies, and what the master relies on in one."""
+"""Hosts and processes for tests of scoring policies, and their contract with the master."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def host_view(
     processes: Sequence[int] = (),
     labels: Sequence[Mapping[str, str]] = (),
 ) -> HostView:
-    """Hosts h0, h1, ... for a scoring policy.
+    """Return hosts h0, h1, ... for a scoring policy.
 
     Args:
-        usage: by resource, one fraction for each host; NaN: the host has none.
+        usage: by resource, one fraction for each host; NaN: the host lacks the resource.
         limit: of every resource on every host, fraction.
-        capacity: base units, likewise.
-        processes: by host; (): none anywhere.
-        labels: by host; (): none has any.
+        capacity: of every resource on every host, base units.
+        processes: number of processes by host; (): 0 on every host.
+        labels: by host; (): no labels.
     """
-    # The core keeps one row a resource; a policy sees the transpose, as here.
+    # The core stores one row for each resource, and a policy gets the transpose, as here.
     table = np.array(list(usage.values()), np.float64).reshape(len(usage), -1)
     missing = np.isnan(table)
     hosts = table.shape[1]
@@ -66,13 +66,13 @@ def process_view(
     reads: tuple[str, ...] = SPEC_FIELDS,
     **spec: Any,
 ) -> ProcessView:
-    """A process to place, for a scoring policy.
+    """Return a process to place, for a scoring policy.
 
     Args:
-        hosts: where it could go.
+        hosts: candidates for the placement.
         needs: base units by resource.
         reads: fields of the spec that the policy's offer declares; the default is all of them.
-        spec: fields of the spec, as `name="camera_0"` or `environment={"GROUP": "camera"}`.
+        spec: fields of the spec, e.g. `name="camera_0"` or `environment={"GROUP": "camera"}`.
     """
     fields = {"name": "p", "command": ("true",), "needs": dict(needs), **spec}
     need = np.zeros(hosts.usage.shape[::-1])
@@ -83,7 +83,7 @@ def process_view(
     return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T)
 
 
-#: Specs that a policy must be able to judge, by the fields that differ.
+#: Specs that a policy must be able to score, given by their differing fields.
 _SPECS: Final[Sequence[Mapping[str, Any]]] = (
     {"needs": {"memory": 0.05, "cpu": 0.1}},
     {
@@ -98,23 +98,23 @@ _SPECS: Final[Sequence[Mapping[str, Any]]] = (
 
 
 class ScoringContract:
-    """What the master relies on in a scoring policy.
+    """Contract of a scoring policy with the master.
 
     Attributes:
-        offer: what is tested.
-        options: by name, as cluster.yaml has them; the others have their defaults.
+        offer: the tested offer.
+        options: by name, as in cluster.yaml; the others have their defaults.
     """
 
     offer: ClassVar[ScoringOffer]
     options: ClassVar[Mapping[str, Any]] = EMPTY
 
     def make(self) -> ScoringPolicy:
-        """A new policy; override it where more is needed."""
+        """Return a new policy; override this if the policy needs more."""
         policy: ScoringPolicy = made("scoring", self.offer, self.options)
         return policy
 
     def _scores(self, policy: ScoringPolicy, hosts: HostView, process: ProcessView) -> Scores:
-        """Return scores; the limit and the checks are those of the master."""
+        """Return scores, with the time limit and checks of the master."""
 
         def ask() -> Scores:
             scores = policy.score(hosts, process)
@@ -124,7 +124,7 @@ class ScoringContract:
         return call("score", CALL_LIMIT, ask)
 
     def cases(self) -> Sequence[tuple[HostView, ProcessView]]:
-        """Hosts and processes of many kinds, the same in every run."""
+        """Return hosts and processes of many kinds, the same in every run."""
         chance = np.random.default_rng(7)
         cases = []
         for count in (1, 2, 7, 100, 1000):
@@ -141,18 +141,18 @@ class ScoringContract:
         return cases
 
     def _process(self, hosts: HostView, **spec: Any) -> ProcessView:
-        """Return a process whose spec gives what the offer declares, as that of the master."""
+        """Return a process whose spec has only the declared fields, as passed by the master."""
         return process_view(hosts, reads=tuple(self.offer.reads), **spec)
 
     def test_scores_every_host(self) -> None:
-        """One number a host, finite where it is not vetoed, and never NaN."""
+        """The policy returns one number for each host, finite without a veto and never NaN."""
         for hosts, process in self.cases():
             scores = self._scores(self.make(), hosts, process)
             rows = np.flatnonzero(np.isnan(scores.value))
             assert not len(rows), f"the score of the vetoed host {hosts.names[rows[0]]} is NaN"
 
     def test_rows_are_independent(self) -> None:
-        """A host scores alike, to the last bit, alone and among others."""
+        """The score of a host alone is bit-identical to its score among other hosts."""
         policy = self.make()
         for hosts, process in self.cases():
             scores = self._scores(policy, hosts, process)
@@ -166,7 +166,7 @@ class ScoringContract:
                 )
 
     def test_is_pure(self) -> None:
-        """The same arguments give the same scores, and stay as they were."""
+        """The policy returns the same scores for the same arguments, and does not change them."""
         policy, twin = self.make(), self.make()
         for hosts, process in self.cases():
             arrays = (hosts.usage, hosts.limit, hosts.capacity, hosts.processes, process.need)
@@ -182,7 +182,7 @@ class ScoringContract:
                 assert _same(array, copy), "an argument was changed"
 
     def test_gives_reasons(self) -> None:
-        """Every score and every veto can be explained in words."""
+        """The policy gives a text for every score and a reason for every veto."""
         for hosts, process in self.cases():
             scores = self._scores(self.make(), hosts, process)
             vetoed = vetoes(scores, len(hosts.names))
@@ -195,7 +195,7 @@ class ScoringContract:
         return call(hook, CALL_LIMIT, lambda: required(ask(), str))
 
     def test_no_hosts(self) -> None:
-        """None to judge is no error."""
+        """The policy accepts an empty list of hosts."""
         hosts = host_view({"memory": [], "cpu": []})
         self._scores(self.make(), hosts, self._process(hosts))
 
@@ -205,12 +205,12 @@ def _same(array: npt.ArrayLike, other: npt.ArrayLike) -> bool:
 
 
 def vetoes(scores: Scores, count: int) -> BoolArray:
-    """(N,) the vetoes of a judgement of `count` hosts, all False where it has none."""
+    """Return (N,): the vetoes of the scores of `count` hosts; all False without vetoes."""
     return np.zeros(count, np.bool_) if scores.veto is None else np.asarray(scores.veto)
 
 
 def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, ProcessView]:
-    """The same question for one host alone."""
+    """Return the arguments of `score` for one host alone."""
     one = slice(row, row + 1)
 
     def part(array: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""`other-host`: a copy of the newest state on so many other hosts, the same ones for long."""
+"""Checkpoint policy `other-host`: replicas of the newest snapshot on a stable set of hosts."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from rosrm import (
 
 @dataclass(frozen=True)
 class OtherHostOptions:
-    """What can be set.
+    """Options of the policy `other-host`.
 
     Attributes:
         every: seconds between two transfers to a host, at least.
-        copies: hosts that keep a state, beside the process's own.
-        apart_by: label in which they are to differ from it, as far as such hosts are up; "": none.
-        away: part of its time that a process may be away for checkpoints of its memory, at most.
+        copies: number of hosts that keep a replica, beside the process's own host.
+        apart_by: label in which these hosts differ from the process's host, as far as such hosts
+            are up; "": no label.
+        away: largest fraction of its time that a process may be stopped for checkpoint images;
+            above 0, at most 1.
     """
 
     every: PositiveSeconds = 1.0
@@ -32,40 +34,40 @@ class OtherHostOptions:
     away: Fraction = 0.05
 
     def __post_init__(self) -> None:
-        """Refuse a part that leaves no time for one."""
+        """Raise `ValueError` if `away` is not above 0 and at most 1."""
         if not 0.0 < self.away <= 1.0:
             raise ValueError(f"away is {self.away:g}; allowed: more than 0, at most 1")
 
 
 class OtherHost:
-    """Keeps to the hosts that have a state already, so that it seldom travels to a new one.
+    """Policy that prefers the hosts that hold a replica already, so that transfers stay rare.
 
-    Those with the newest go first: a good copy is never left for one of a former instance.
-    Which ones those are is settled by a digest of the names: different processes go to different
-    hosts, and nothing that changes with time decides.
+    Hosts with the newest replicas come first: a good replica is never given up for one of a former
+    instance. A digest of the names of process and host orders all other hosts. So different
+    processes use different hosts, and the order does not change with time.
     """
 
     def __init__(self, options: OtherHostOptions) -> None:
         self._options = options
 
     def choose(self, process: CheckpointView) -> CheckpointChoice | None:
-        """The hosts that keep it."""
+        """Return the hosts that keep replicas of the process's snapshot."""
         others = sorted(name for name in process.hosts if name != process.host)
         others.sort(key=lambda name: self._rank(name, process))
         return CheckpointChoice(tuple(others[: self._options.copies]), self._options.every)
 
     def pace(self, process: MemoryView) -> float:
-        """As the process asks, but no faster than it can be borne."""
+        """Return the checkpoint period (s): as the process asks, but long enough for `away`."""
         return max(process.asked, process.pause / self._options.away)
 
     def _rank(self, name: str, process: CheckpointView) -> tuple[bool, int, int]:
-        """Lower goes first."""
+        """Return the sort key of a host; the lowest key is chosen first."""
         near, kept_on = self._is_near(name, process), process.kept_on
         place = kept_on.index(name) if name in kept_on else len(kept_on)
         return near, place, zlib.crc32(f"{process.spec.name}\n{name}".encode())
 
     def _is_near(self, name: str, process: CheckpointView) -> bool:
-        """Whether it may be lost together with the process's own host."""
+        """Return True if a host may be lost together with the process's own host."""
         label = self._options.apart_by
         if not label:
             return False

@@ -1,4 +1,4 @@
-"""Registers the checkpoint policies."""
+"""Plugin hook that registers the checkpoint policies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions
 
 @hookimpl
 def register_checkpoint_policies() -> Sequence[CheckpointOffer]:
-    """Offer `other-host`: the state of a process is kept on another host than its own."""
+    """Offer `other-host`: replicas of a process's snapshot on hosts other than its own."""
     return [
         CheckpointOffer(
             name="other-host",

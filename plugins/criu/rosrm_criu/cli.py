@@ -112,7 +112,7 @@ def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
 
 
 def _tried(prefix: Path) -> tuple[Criu | None, Ability]:
-    """The CRIU to use here, if there is one, and what it can do."""
+    """Return the CRIU to use on this machine, or None, and its capability."""
     from rosrm.errors import CriuError
     from rosrm_criu.engine.binary import find
     from rosrm_criu.engine.probe import Ability, probe
@@ -125,7 +125,7 @@ def _tried(prefix: Path) -> tuple[Criu | None, Ability]:
 
 
 def _lines(found: Criu | None, able: Ability) -> list[tuple[bool, str, str]]:
-    """Line by line: whether it is well, what is looked at, what is said."""
+    """Return the lines of the report: success, subject, and result."""
     if found is None:
         return [(False, "program", able.reason)]
     from rosrm_criu.engine.binary import OLDEST

@@ -1,9 +1,9 @@
-"""`handoff`: a process moves with its state, while both its instances run for a moment.
+"""Migration strategy `handoff`: both instances run for a moment, and the state is transferred.
 
-The destination is started beside the source under an alias, as in the paper (III-C2), and follows
-the source's state in silence. Then the two hand over by themselves, as in
-docs/reference/handoff-protocol.md. A node that only keeps the paper's two constraints is moved as
-the paper does (`protocol: paper`).
+The destination starts beside the source under an alias, as in the paper (III-C2). It follows the
+source's state without publishing. Then both instances switch over as described in
+docs/reference/handoff-protocol.md. A node that meets only the paper's two constraints is migrated
+as in the paper (`protocol: paper`).
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from rosrm import (
     options_of,
 )
 
-#: Name of the executor that hears when a destination of the paper's protocol speaks.
+#: Name of the executor that detects the first publication of a destination (`protocol: paper`).
 WATCH: Final = "handoff_watch"
-#: Characters of a node's name in ROS 2.
+#: Most characters of a node name in ROS 2.
 _LONGEST: Final = 255
-#: Seconds that a watch may take to come up, beyond the time for which it listens.
+#: Seconds for the watch to start, in addition to the time for which it listens.
 _WATCH_MARGIN: Final = 5.0
 _NEVER: Final = RestartPolicy("never")
 _TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -44,20 +44,22 @@ _TYPE: Final = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
 
 @dataclass(frozen=True)
 class HandoffOptions:
-    """What can be set, for all processes or for one.
+    """Options of the strategy `handoff`, for all processes or for one.
 
     Attributes:
-        start_timeout: seconds within which the destination must run, and a slave take an order.
-        ready_timeout: seconds within which the destination must have all that it needs.
-        switch_timeout: seconds from the word to switch until it is active and the source silent.
-        abort_timeout: seconds for which a destination may think about giving up, before it is
+        start_timeout: seconds within which the destination must run, and a slave must accept an
+            order.
+        ready_timeout: seconds within which the destination must have everything that it needs.
+        switch_timeout: seconds from the request to switch until the destination is active and the
+            source is silent.
+        abort_timeout: seconds within which a destination must acknowledge an abort; then it is
             stopped.
-        resume_timeout: seconds within which a source must say that it goes on.
-        release_timeout: seconds for which a silent source may see to it that its last outputs
-            arrive, before it is stopped. (It does so for 4 s at most.)
-        protocol: "rosrm", or "paper" for a node that keeps only the paper's two constraints.
-        state: the topic of its state, with "paper".
-        type: of that topic: "std_msgs/msg/Int64".
+        resume_timeout: seconds within which a source must report that it has resumed.
+        release_timeout: seconds for which a silent source may wait for the delivery of its last
+            outputs, before it is stopped. (A source waits at most 4 s.)
+        protocol: "rosrm", or "paper" for a node that meets only the paper's two constraints.
+        state: topic of the node's state, with "paper".
+        type: message type of that topic, e.g. "std_msgs/msg/Int64".
     """
 
     start_timeout: PositiveSeconds = 10.0
@@ -71,7 +73,7 @@ class HandoffOptions:
     type: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse a watch that could not begin."""
+        """Raise `ValueError` if `protocol`, `state` and `type` do not fit together."""
         if self.protocol not in ("rosrm", "paper"):
             raise ValueError(f"protocol {self.protocol!r}; allowed: rosrm, paper")
         if self.protocol == "rosrm":
@@ -97,17 +99,17 @@ def capabilities(options: HandoffOptions) -> Capabilities:
 
 
 class Handoff:
-    """Plans a stateful move."""
+    """Strategy that plans a stateful migration."""
 
     def __init__(self, options: HandoffOptions) -> None:
         self._options = options
 
     def spec_fault(self, spec: ProcessSpec) -> str:
-        """Why a process cannot be moved so; "" if it can."""
+        """Return the reason why `handoff` cannot migrate a process; "" if it can."""
         return _fault(spec, options_of(spec, self._options))
 
     def propose(self, move: Move) -> Plan:
-        """Shadow, switch, commit, stop; with the paper's protocol: listen, commit, stop."""
+        """Return the plan: shadow, switch, commit, stop; with "paper": listen, commit, stop."""
         fault = _fault(move.spec, move.options)
         if fault:
             raise ValueError(fault)
@@ -142,7 +144,10 @@ def _handing_over(move: Move, options: HandoffOptions) -> Plan:
 
 
 def _as_in_the_paper(move: Move, options: HandoffOptions) -> Plan:
-    """From the first word of the destination to the end of the source both are active."""
+    """Return the paper's plan.
+
+    Both instances are active from the first message of the destination to the end of the source.
+    """
     listen = {
         "state": options.state, "type": options.type, "timeout": options.ready_timeout,
         "source": move.source_node, "destination": alias_of(move),
@@ -171,7 +176,7 @@ def _start(move: Move, options: HandoffOptions) -> Start:
 
 
 def _own_names(spec: ProcessSpec, options: HandoffOptions) -> dict[str, str]:
-    """A state below the node's own name is found there under an alias too."""
+    """Return the remapping of a state topic below `~`, which otherwise moves with the alias."""
     namespace = spec.namespace.strip("/")
     own = f"/{namespace}/{spec.name}/" if namespace else f"/{spec.name}/"
     if not options.state.startswith(own):
@@ -180,7 +185,7 @@ def _own_names(spec: ProcessSpec, options: HandoffOptions) -> dict[str, str]:
 
 
 def _suspend(move: Move, options: HandoffOptions) -> SetRestart:
-    """A source that its slave started again by itself would be active beside its successor."""
+    """Suspend the source's restarts; a restarted source would be active beside the destination."""
     seconds = options.start_timeout
     give_back = SetRestart(move.source, move.source_host, move.spec.restart, seconds)
     return SetRestart(move.source, move.source_host, _NEVER, seconds, undo=give_back)
@@ -200,7 +205,7 @@ def _end(move: Move, options: HandoffOptions) -> tuple[Stop, Configure]:
 
 
 def alias_of(move: Move) -> str:
-    """`NAME_<unix time>`, and not the name under which the source runs."""
+    """Return `NAME_<unix time>`, different from the name under which the source runs."""
     name, at = move.spec.name, move.now
     while (alias := _suffixed(name, at)) in (name, move.source_node):
         at += 1
@@ -213,7 +218,7 @@ def _suffixed(name: str, at: int) -> str:
 
 
 def watch(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Wait on the slave of the destination until a second publisher of the state is heard."""
+    """Wait on the destination's slave until it receives a second publisher of the state."""
     from rosrm.ros.slave.publisher_watch import await_second_publisher  # noqa: PLC0415 - the master has no use
 
     return await_second_publisher(

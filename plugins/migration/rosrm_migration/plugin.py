@@ -1,4 +1,4 @@
-"""Registers the migration strategies."""
+"""Plugin hook that registers the migration strategies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm_migration.relaunch import Relaunch, RelaunchOptions
 
 @hookimpl
 def register_migration_strategies() -> Sequence[MigrationOffer]:
-    """Offer `relaunch`, for processes without a state, and `handoff` for those with one."""
+    """Offer `relaunch` for stateless processes, and `handoff` for state on topics."""
     return [
         MigrationOffer(
             name="relaunch",

@@ -1,9 +1,9 @@
-"""`relaunch`: a stateless process is started anew at its destination, under the same name.
+"""Migration strategy `relaunch`: a stateless process starts at its destination with its own name.
 
-As in the paper (III-C1) the new instance comes up first and the old one is ended then: no moment
-without one, and a moment with both. ROS 1 ended the older namesake by itself; ROS 2 only warns, so
-the plan stops it. A process that declares `overlap: false` is stopped first, and started again at
-its source where the destination fails.
+As in the paper (III-C1) the new instance starts first, and the old one is stopped afterwards. So
+there is no moment without an instance, and a moment with both. ROS 1 ended the older node of the
+same name; ROS 2 only warns, so the plan stops it. A process that declares `overlap: false` is
+stopped first, and started again at its source if the destination fails.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from rosrm import AwaitReady, Commit, Move, Plan, PositiveSeconds, Start, Stop
 
 @dataclass(frozen=True)
 class RelaunchOptions:
-    """What can be set, for all processes or for one.
+    """Options of the strategy `relaunch`, for all processes or for one.
 
     Attributes:
         start_timeout: seconds within which the new instance must run.
-        settle: seconds for which a new ROS node is ready before the old one is stopped, so that the
-            others have found it.
+        settle: seconds for which a new ROS node is ready before the old one is stopped, so that
+            other nodes discover it.
     """
 
     start_timeout: PositiveSeconds = 10.0
@@ -28,13 +28,13 @@ class RelaunchOptions:
 
 
 class Relaunch:
-    """Plans a stateless move."""
+    """Strategy that plans a stateless migration."""
 
     def __init__(self, _options: RelaunchOptions) -> None:
-        """Take nothing: each move brings its options."""
+        """Ignore the options of the cluster, because each move carries its merged options."""
 
     def propose(self, move: Move) -> Plan:
-        """Start there, be ready there, commit, stop here; or stop here first."""
+        """Return the plan: start, await ready, commit, stop the source; or with the stop first."""
         if move.spec.migration.overlap:
             return _start_first(move, move.options)
         return _stop_first(move, move.options.start_timeout)

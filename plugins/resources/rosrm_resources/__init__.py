@@ -1,1 +1,1 @@
-"""The probes that rosrm ships: cpu, memory, disk, gpu and network."""
+"""Probes of rosrm: cpu, memory, disk, gpu and network."""

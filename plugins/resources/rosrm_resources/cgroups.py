@@ -1,7 +1,7 @@
-"""Finds the control groups (version 1 and 2) that bound a process, and what bounds it there.
+"""Control groups (versions 1 and 2) of a process, and their limits.
 
-A limit may stand at the process's own group or at any group above it, so all of them are looked
-at. Inside a container the groups above its own are out of sight; what can be seen is what counts.
+A limit may be set at the process's own group or at any ancestor, so all of them are read. Inside a
+container the groups above its own are not visible; only the visible ones count.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from rosrm import ConfigError
 
 @dataclass(frozen=True)
 class Group:
-    """The control group of a process for one controller.
+    """Control group of a process for one controller.
 
     Attributes:
         version: 1 or 2.
-        mount: top of the hierarchy as it is seen from here.
-        directory: of the group; `mount` itself or below.
+        mount: root of the hierarchy as visible to this process.
+        directory: of the group; `mount` itself or a directory below it.
     """
 
     version: int
@@ -29,7 +29,7 @@ class Group:
     directory: Path
 
     def upward(self) -> Iterator[Path]:
-        """The directories of the group and of all those above it that can be seen."""
+        """Yield the directories of the group and of its visible ancestors."""
         directory = self.directory
         while True:
             yield directory
@@ -49,13 +49,13 @@ class _Mount:
 def find_group(
     controller: str, root: Path = Path("/"), pid: str = "self", path: str | None = None
 ) -> Group | None:
-    """The group of a process for a controller; None: no such hierarchy is mounted.
+    """Return the group of a process for a controller; None: no such hierarchy is mounted.
 
     Args:
         controller: "memory", "cpu", "cpuacct", "cpuset".
-        root: of the file system, for recorded trees.
-        pid: whose group; "self" for this process.
-        path: of another group, as /proc/PID/cgroup would write it; None: that of the process.
+        root: of the file system; another one for recorded trees.
+        pid: of the process; "self" for this process.
+        path: of another group, as /proc/PID/cgroup writes it; None: that of the process.
 
     Raises:
         ConfigError: there is no group at `path`.
@@ -64,7 +64,7 @@ def find_group(
     paths = _paths(root, pid)
     if path is not None:
         paths = dict.fromkeys(paths, path)
-    # A controller that is mounted as version 1 is not available to version 2 at the same time.
+    # A controller mounted as version 1 is not available to version 2 at the same time.
     for mount in sorted(mounts, key=lambda mount: mount.version):
         name = controller if mount.version == 1 else ""
         if (mount.version == 2 or controller in mount.controllers) and name in paths:
@@ -79,7 +79,7 @@ def find_group(
 
 
 def read_number(path: Path) -> float | None:
-    """A number of a control file; None: the file is not there, or says "max" (or -1): no limit."""
+    """Return the number in a control file; None: no file, or no limit ("max" or -1)."""
     try:
         word = path.read_text().split()[0]
     except (OSError, IndexError):
@@ -90,7 +90,7 @@ def read_number(path: Path) -> float | None:
 
 
 def count_cpus(text: str) -> int:
-    """How many CPUs a list such as "0-3,8" names."""
+    """Return the number of CPUs in a list such as "0-3,8"."""
     count = 0
     for part in text.strip().split(","):
         first, _, last = part.partition("-")
@@ -100,7 +100,7 @@ def count_cpus(text: str) -> int:
 
 
 def _paths(root: Path, pid: str) -> dict[str, str]:
-    """Controller to the path of the group; version 2 under ""."""
+    """Return the path of the group by controller; that of version 2 under ""."""
     paths: dict[str, str] = {}
     try:
         lines = (root / "proc" / pid / "cgroup").read_text().splitlines()
@@ -133,18 +133,18 @@ def _mounts(root: Path, pid: str) -> list[_Mount]:
 
 
 def _unescaped(path: str) -> str:
-    r"""Mountinfo writes a space as \040."""
+    r"""Replace the octal escapes of mountinfo, which writes a space as \040."""
     return re.sub(r"\\([0-7]{3})", lambda match: chr(int(match.group(1), 8)), path)
 
 
 def _below(mount: _Mount, path: str) -> Path:
-    """The directory of a group below its mount, or the nearest above it that can be seen."""
+    """Return the directory of a group below its mount, or its nearest visible ancestor."""
     if mount.root != "/":
-        # A container without a cgroup namespace: only a part of the hierarchy is mounted.
+        # In a container without a cgroup namespace only a part of the hierarchy is mounted.
         inside = path == mount.root or path.startswith(mount.root + "/")
         path = path[len(mount.root) :] if inside else "/"
     parts = [part for part in path.split("/") if part]
-    if ".." in parts:  # a group above the root of our namespace: out of sight
+    if ".." in parts:  # a group above the root of our namespace is not visible
         parts = []
     while parts and not mount.point.joinpath(*parts).is_dir():
         parts.pop()

@@ -1,4 +1,4 @@
-"""The probe `cpu`: cores in use, as a mean over the last second."""
+"""Probe `cpu`: cores in use, as a mean over the last second."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
 from rosrm_resources.rate import Rate
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
-#: Seconds by which `Sessions.pids` may be behind; so old may the CPU time of a new pid be.
+#: Seconds by which `Sessions.pids` may lag; the CPU time of a new pid may cover as much time.
 _BEHIND: Final = 1.1
-#: Position of the start time of a process among the fields of /proc/PID/stat behind its name.
+#: Index of the start time among the fields of /proc/PID/stat that follow the process name.
 _START: Final = 19
 
 
@@ -29,7 +29,7 @@ class CpuOptions:
     """Settings of the probe `cpu`.
 
     Attributes:
-        scope: what is measured; None: as the host's configuration says.
+        scope: what is measured; None: the scope of the host's configuration.
         window: seconds over which the usage is a mean.
         group: the control group to measure instead of the slave's own, as /proc/PID/cgroup writes
             it for a process in it; None: the slave's own. Sets the scope to "cgroup".
@@ -40,12 +40,12 @@ class CpuOptions:
     group: str | None = None
 
     def __post_init__(self) -> None:
-        """A group and another scope contradict each other."""
+        """Raise `ValueError` if a group is given with a scope other than "cgroup"."""
         check_group(self.group, self.scope)
 
 
 def create(options: CpuOptions, context: ProbeContext) -> GaugeProbe:
-    """Make the probe for the scope that is set."""
+    """Create the probe for the configured scope."""
     scope = "cgroup" if options.group else options.scope or context.scope
     gauge: Gauge | None = None
     if scope == "slice":
@@ -56,20 +56,20 @@ def create(options: CpuOptions, context: ProbeContext) -> GaugeProbe:
 
 
 def machine_cores(proc: Path = Path("/proc")) -> float:
-    """Cores of the machine that are switched on, whatever this process may use of them."""
+    """Return the number of online cores, including those that this process may not use."""
     lines = (proc / "stat").read_text().splitlines()
     return float(max(1, sum(line.startswith("cpu") for line in lines) - 1))
 
 
 class MachineCpu:
-    """All cores of the machine. Time stolen by a hypervisor counts as used: it cannot be had.
+    """CPU usage of all cores of the machine.
 
-    Read from /proc/stat itself, the same way as `psutil.cpu_times` does: ten times a second that
-    costs a third.
+    Time stolen by a hypervisor counts as used, because it is not available. The values come from
+    /proc/stat, as in `psutil.cpu_times`; ten reads a second of the file itself cost a third.
 
     Args:
         window: seconds.
-        proc: where the process file system is mounted.
+        proc: mount point of the process file system.
     """
 
     scope: Final = "machine"
@@ -78,14 +78,15 @@ class MachineCpu:
         self.capacity: Final = machine_cores(proc)
         self._file = KeptFile(proc / "stat", 256)
         busy, total = self._times()
-        # A busy machine must not look idle in its first reading, to which work may be sent.
+        # A busy machine must not look idle in its first reading, because the master may place work
+        # by it.
         guess = min(os.getloadavg()[0], self.capacity)
         self._rate = Rate(window, total, busy, guess)
 
     def usage(self) -> float:
-        """Fraction of all cores in use."""
+        """Return the fraction of all cores in use."""
         busy, total = self._times()
-        # Per second of total time, which passes as fast on all cores together as on the clock.
+        # Per second of total time: the total over all cores, divided by their number.
         return self._rate.update(total, busy) / self.capacity
 
     def close(self) -> None:
@@ -93,7 +94,7 @@ class MachineCpu:
         self._file.close()
 
     def _times(self) -> tuple[float, float]:
-        """Busy seconds of all cores together, and the seconds that have passed."""
+        """Return the busy seconds summed over all cores, and the elapsed seconds."""
         line = self._file.read().split(b"\n", 1)[0]
         # user nice system idle iowait irq softirq steal; guest time is part of user.
         times = [int(field) for field in line.split()[1:9]]
@@ -103,13 +104,13 @@ class MachineCpu:
 
 
 class CgroupCpu:
-    """The cores that the control group may use, by quota or by set.
+    """CPU usage against the cores that the control group may use, by quota or by CPU set.
 
-    Where several groups above each other have a limit, the one with the least room counts.
+    Where several nested groups have a limit, the one with the least room counts.
 
     Args:
-        limits: (directory of a group, cores that it may use), the smallest gives the capacity.
-        read_time: opens what gives the CPU seconds of the group in a directory.
+        limits: (directory of a group, cores that it may use); the smallest gives the capacity.
+        read_time: opens the counter of CPU seconds of the group in a directory.
         window: seconds.
         clock: monotonic seconds.
     """
@@ -139,11 +140,11 @@ class CgroupCpu:
         clock: Callable[[], float] = time.monotonic,
         path: str | None = None,
     ) -> CgroupCpu | None:
-        """For the group of this process; None: it may use the whole machine.
+        """Return the gauge for the group of this process; None: it may use the whole machine.
 
         Args:
             window: seconds.
-            root: of the file system, for recorded trees.
+            root: of the file system; another one for recorded trees.
             clock: monotonic seconds.
             path: of another group.
         """
@@ -156,7 +157,7 @@ class CgroupCpu:
         return cls(limits, lambda directory: GroupTime(group, directory, root), window, clock)
 
     def usage(self) -> float:
-        """Fraction of the capacity that is not to be had any more."""
+        """Return the fraction of the capacity that is no longer available."""
         now = self._clock()
         room = min(cores - rate.update(now, used.seconds()) for cores, used, rate in self._levels)
         return max(0.0, 1.0 - room / self.capacity)
@@ -168,12 +169,12 @@ class CgroupCpu:
 
 
 class GroupTime:
-    """CPU time that a control group and those below it have used.
+    """CPU time of a control group and its descendants.
 
     Args:
         group: of the controller "cpu".
-        directory: of that group or of one above it.
-        root: of the file system, for recorded trees.
+        directory: of that group or of an ancestor.
+        root: of the file system; another one for recorded trees.
     """
 
     def __init__(self, group: Group, directory: Path, root: Path) -> None:
@@ -181,7 +182,7 @@ class GroupTime:
         if group.version == 2:
             self._file = KeptFile(directory / "cpu.stat", 512)
             return
-        # In version 1 the time is kept by another controller, which may be mounted elsewhere.
+        # In version 1 another controller counts the time, and it may be mounted elsewhere.
         account = find_group("cpuacct", root)
         if account is not None and not (directory / "cpuacct.usage").exists():
             same = account.mount / directory.relative_to(group.mount)
@@ -189,7 +190,7 @@ class GroupTime:
         self._file = KeptFile(directory / "cpuacct.usage", 64)
 
     def seconds(self) -> float:
-        """CPU seconds so far."""
+        """Return the CPU seconds so far."""
         content = self._file.read()
         if self._version == 1:
             return int(content) * 1e-9
@@ -202,7 +203,7 @@ class GroupTime:
 
 
 def _cpu_limits(group: Group, root: Path) -> list[tuple[Path, float]]:
-    """The groups whose cores are bounded below those of the machine, and to how many."""
+    """Return the groups with fewer cores than the machine, and their number of cores."""
     machine = machine_cores(root / "proc")
     limits = []
     for directory in group.upward():
@@ -216,7 +217,7 @@ def _cpu_limits(group: Group, root: Path) -> list[tuple[Path, float]]:
 
 
 def _quota(version: int, directory: Path) -> float | None:
-    """Cores that a group may use by its quota; None: no quota."""
+    """Return the cores that a group may use by its quota; None: no quota."""
     if version == 1:
         quota = read_number(directory / "cpu.cfs_quota_us")
         period = read_number(directory / "cpu.cfs_period_us")
@@ -227,26 +228,26 @@ def _quota(version: int, directory: Path) -> float | None:
 
 
 def _set_size(root: Path) -> int | None:
-    """CPUs of the set that the group is confined to; the kernel has counted in those above it."""
+    """Return the size of the group's effective CPU set, which includes the limits of ancestors."""
     group = find_group("cpuset", root)
     if group is None:
         return None
     name = "cpuset.effective_cpus" if group.version == 1 else "cpuset.cpus.effective"
     try:
         text = (group.directory / name).read_text()
-    except OSError:  # the controller is not switched on for this group
+    except OSError:  # the controller is not enabled for this group
         return None
     return count_cpus(text) or None
 
 
 class SliceCpu:
-    """The cores that the slave's own process tree uses, against a budget.
+    """CPU usage of the slave's own process tree, against a budget.
 
     Args:
         cores: the budget.
         sessions: the process tree.
         window: seconds.
-        proc: where the process file system is mounted.
+        proc: mount point of the process file system.
         clock: monotonic seconds.
     """
 
@@ -266,7 +267,7 @@ class SliceCpu:
         self._rate = Rate(window, clock(), self._time.seconds(clock()))
 
     def usage(self) -> float:
-        """Fraction of the budget in use."""
+        """Return the fraction of the budget in use."""
         now = self._clock()
         return self._rate.update(now, self._time.seconds(now)) / self.capacity
 
@@ -276,12 +277,12 @@ class SliceCpu:
 
 
 class TreeTime:
-    """A counter of the CPU time of a changing set of processes that never falls.
+    """Non-decreasing counter of the CPU time of a changing set of processes.
 
-    A child that has ended lives on in the time of its parent, which waited for it; a leader that
-    has ended keeps its last known time until `Sessions` has taken it over as ended. What a process
-    used before it was seen counts only if it started after this one: the time of a process that an
-    earlier slave started is no load of this moment.
+    The time of an ended child is part of its parent's, which waited for it. A leader that has ended
+    keeps its last known time until `Sessions` counts it as ended. Time used before a process was
+    first seen counts only if the process started after this one, because processes of an earlier
+    slave used theirs in the past.
     """
 
     def __init__(self, sessions: Sessions, proc: Path, now: float) -> None:
@@ -304,7 +305,7 @@ class TreeTime:
         """
         total = self._sum()
         grown = total - self._before - self._taken_over
-        # Time is lost where an orphan ends, and comes at once where a walk finds a member late.
+        # Time is lost when an orphan ends, and appears at once when a walk finds a member late.
         most = self._machine * (now - self._at + _BEHIND)
         self._seconds += min(max(0.0, grown), most)
         self._before, self._at = total, now
@@ -317,7 +318,7 @@ class TreeTime:
     def _sum(self) -> float:
         ended = -1.0
         pids = self._sessions.pids()
-        # A session that ends between the two calls would count twice or not at all.
+        # Repeat, because a session that ends between the two calls counts twice or not at all.
         while ended != self._sessions.ended_cpu_time():
             ended = self._sessions.ended_cpu_time()
             pids = self._sessions.pids()
@@ -343,5 +344,5 @@ class TreeTime:
 
 
 def _stat_fields(line: bytes) -> list[bytes]:
-    """The fields of /proc/PID/stat behind the name, which may hold spaces and parentheses."""
+    """Return the fields of /proc/PID/stat after the name, which may hold spaces and parentheses."""
     return line[line.rindex(b")") + 2 :].split(None, _START + 1)

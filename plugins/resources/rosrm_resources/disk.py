@@ -1,4 +1,4 @@
-"""The probe `disk`: bytes in use on the file system that holds the slave's files."""
+"""Probe `disk`: bytes in use on the file system that holds the slave's files."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from annotated_types import Gt
 from rosrm import ProbeContext
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget
 
-#: A walk through the directory takes at most this fraction of the time.
+#: Largest fraction of the time that walks through the directory may take.
 _WALK_SHARE: Final = 0.01
-#: `st_blocks` counts these, whatever the file system's own block.
+#: Bytes of a unit of `st_blocks`, independent of the block size of the file system.
 _BLOCK: Final = 512
 
 
@@ -25,8 +25,8 @@ class DiskOptions:
     """Settings of the probe `disk`.
 
     Attributes:
-        scope: what is measured; None: as the host's configuration says. A control group has no
-            disk of its own: it counts as the machine, and so does a slice without a disk budget.
+        scope: what is measured; None: the scope of the host's configuration. A control group has
+            no disk of its own, so it counts as the machine, like a slice without a disk budget.
         path: a file or directory on the disk that counts; None: the slave's data directory.
         walk_period: seconds between two walks through the directory of a slice.
     """
@@ -37,7 +37,7 @@ class DiskOptions:
 
 
 def create(options: DiskOptions, context: ProbeContext) -> GaugeProbe:
-    """Make the probe for the scope that is set."""
+    """Create the probe for the configured scope."""
     path = Path(options.path) if options.path is not None else context.data_directory
     gauge: Gauge
     if (options.scope or context.scope) == "slice" and "disk" in context.budget:
@@ -48,12 +48,12 @@ def create(options: DiskOptions, context: ProbeContext) -> GaugeProbe:
 
 
 class FileSystem:
-    """The file system that a path is on; what is reserved for root is neither used nor free.
+    """Usage of the file system of a path; space reserved for root is neither used nor free.
 
-    The same figures as `psutil.disk_usage`.
+    The figures are those of `psutil.disk_usage`.
 
     Args:
-        path: need not exist yet: the nearest directory above it then tells the file system.
+        path: need not exist yet; then its nearest existing ancestor determines the file system.
     """
 
     scope: Final = "machine"
@@ -67,15 +67,15 @@ class FileSystem:
         self.capacity: Final = float(max(1, used + free))
 
     def usage(self) -> float:
-        """Fraction of the file system in use."""
+        """Return the fraction of the file system in use."""
         used, free = self._bytes()
         return used / (used + free) if used + free else 1.0
 
     def close(self) -> None:
-        """Nothing is kept."""
+        """Do nothing, because no file is open."""
 
     def _bytes(self) -> tuple[int, int]:
-        """Used, and free for anyone."""
+        """Return the bytes in use and the bytes free for every user."""
         status = os.statvfs(self._path)
         return (
             (status.f_blocks - status.f_bfree) * status.f_frsize,
@@ -84,12 +84,12 @@ class FileSystem:
 
 
 class DirectoryTree:
-    """What lies below a directory, against a budget; walked seldom.
+    """Disk usage of a directory tree against a budget, measured by infrequent walks.
 
     Args:
-        path: of the directory; one that is not there is empty.
-        size: bytes, the budget.
-        period: seconds between two walks, more where a walk is long.
+        path: of the directory; a missing one counts as empty.
+        size: the budget, bytes.
+        period: seconds between two walks; longer if a walk takes long.
         clock: monotonic seconds.
     """
 
@@ -110,7 +110,7 @@ class DirectoryTree:
         self._usage = 0.0
 
     def usage(self) -> float:
-        """Fraction of the budget in use at the last walk."""
+        """Return the fraction of the budget in use at the last walk."""
         started = self._clock()
         if started >= self._due:
             self._usage = tree_bytes(self._path) / self.capacity
@@ -119,17 +119,17 @@ class DirectoryTree:
         return self._usage
 
     def close(self) -> None:
-        """Nothing is kept."""
+        """Do nothing, because no file is open."""
 
 
 def tree_bytes(path: str) -> int:
-    """Bytes on the disk of all files below a directory; links are not followed."""
+    """Return the bytes on disk of all files below a directory, without following links."""
     total = 0
     waiting = [path]
     while waiting:
         try:
             entries = os.scandir(waiting.pop())
-        except OSError:  # it is gone meanwhile, or not ours to see
+        except OSError:  # deleted since, or not readable for this user
             continue
         with entries:
             for entry in entries:
@@ -137,6 +137,6 @@ def tree_bytes(path: str) -> int:
                     total += entry.stat(follow_symlinks=False).st_blocks * _BLOCK
                     if entry.is_dir(follow_symlinks=False):
                         waiting.append(entry.path)
-                except FileNotFoundError:  # deleted meanwhile, as a rotated log is
+                except FileNotFoundError:  # deleted since, e.g. a rotated log
                     continue
     return total

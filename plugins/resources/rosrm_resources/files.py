@@ -1,4 +1,4 @@
-"""Small kernel files that are read ten times a second, so they are kept open."""
+"""Kernel files that stay open, because they are read ten times a second."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-#: Processes whose files are kept open; those beyond are opened anew, to stay far from the usual
-#: bound of 1,024 descriptors.
+#: Most processes whose files stay open. Files of further processes are opened for each read, to
+#: stay far below the usual limit of 1,024 descriptors.
 _KEPT_PROCESSES: Final = 128
 
 
 class KeptFile:
-    """A file of /proc or /sys that each read gives anew from its beginning.
+    """Open file of /proc or /sys; each read returns the current content from its beginning.
 
     Args:
         path: of the file.
@@ -25,19 +25,19 @@ class KeptFile:
         self._size = size
 
     def read(self) -> bytes:
-        """Its content now."""
+        """Return the current content."""
         return os.pread(self._descriptor, self._size, 0)
 
     def close(self) -> None:
-        """Close it; no read may follow."""
+        """Close the file; no read may follow."""
         os.close(self._descriptor)
 
 
 class ProcessFiles:
-    """One file of /proc/PID for each of some processes that come and go.
+    """One file of /proc/PID for each process of a changing set.
 
     Args:
-        proc: where the process file system is mounted.
+        proc: mount point of the process file system.
         name: of the file below /proc/PID.
     """
 
@@ -48,7 +48,7 @@ class ProcessFiles:
         self._pids: Sequence[int] = ()
 
     def read(self, pids: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """Each process that still lives, with the content of its file."""
+        """Yield each live process with the content of its file."""
         if pids != self._pids:
             self._pids = pids
             self._drop(set(self._kept) - set(pids))
@@ -58,17 +58,17 @@ class ProcessFiles:
                 yield pid, content
 
     def close(self) -> None:
-        """Close all that is kept."""
+        """Close all open files."""
         self._drop(set(self._kept))
 
     def _read_one(self, pid: int) -> bytes:
-        """The content; nothing where the process has ended."""
+        """Return the content of one file; b"" if the process has ended."""
         descriptor = self._kept.get(pid)
         if descriptor is not None:
             try:
                 return os.pread(descriptor, 1024, 0)
             except ProcessLookupError:
-                # That process has ended; its number may already be another's.
+                # That process has ended, and the kernel may have reused its pid.
                 self._drop({pid})
         try:
             descriptor = os.open(f"{self._proc}/{pid}/{self._name}", os.O_RDONLY | os.O_CLOEXEC)

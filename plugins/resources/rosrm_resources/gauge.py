@@ -1,4 +1,4 @@
-"""What the probes of one resource have in common: a gauge, chosen by the scope."""
+"""Gauges of one resource by scope, and the probe that reads a gauge."""
 
 from __future__ import annotations
 
@@ -7,39 +7,40 @@ from typing import Final, Literal, Protocol
 
 from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription
 
-#: What is measured: the whole machine; the control group the slave runs in (what a container
-#: needs); or the slave's own process tree against a budget.
+#: Scope of a measurement: the whole machine; the control group of the slave (for containers); or
+#: the slave's own process tree against a budget.
 Scope = Literal["machine", "cgroup", "slice"]
 
-#: A small budget can be exceeded a hundred times over; above this the number tells no more.
+#: Largest reported usage. A small budget can be exceeded a hundredfold, and a larger number would
+#: add no information.
 OVERFULL: Final = 10.0
 
 
 class Gauge(Protocol):
-    """Measures one resource in one scope."""
+    """Measurement of one resource in one scope."""
 
     @property
     def scope(self) -> str:
-        """What is measured in the end: an unlimited cgroup counts as the machine."""
+        """Return the effective scope: an unlimited cgroup counts as the machine."""
 
     @property
     def capacity(self) -> float:
-        """Base units that usage 1.0 stands for."""
+        """Return the base units that correspond to usage 1.0."""
 
     def usage(self) -> float:
-        """Fraction of the capacity in use now."""
+        """Return the fraction of the capacity in use now."""
 
     def close(self) -> None:
-        """Release the files."""
+        """Close the files."""
 
 
 class GaugeProbe:
-    """A probe of one resource.
+    """Probe of one resource.
 
     Args:
         name: of the resource.
         unit: base unit of the capacity.
-        gauge: what measures it.
+        gauge: measures the resource.
     """
 
     def __init__(self, name: str, unit: str, gauge: Gauge) -> None:
@@ -49,20 +50,20 @@ class GaugeProbe:
 
     @property
     def resources(self) -> Sequence[ResourceDescription]:
-        """The one resource."""
+        """Return the only resource."""
         return self._resources
 
     def read(self) -> Sequence[Reading]:
-        """Its usage now."""
+        """Return the current usage."""
         return (Reading(self._name, min(self._gauge.usage(), OVERFULL)),)
 
     def close(self) -> None:
-        """Release the gauge's files."""
+        """Close the gauge's files."""
         self._gauge.close()
 
 
 def check_group(group: str | None, scope: Scope | None) -> None:
-    """Raise `ValueError` where the option `group` of a probe does not go with its `scope`."""
+    """Raise `ValueError` if the option `group` of a probe does not fit its `scope`."""
     if group is not None and scope not in (None, "cgroup"):
         raise ValueError(f"group: goes with the scope 'cgroup', not with {scope!r}")
     if group is not None and not group.startswith("/"):
@@ -70,10 +71,10 @@ def check_group(group: str | None, scope: Scope | None) -> None:
 
 
 def budget(context: ProbeContext, resource: str, unit: str) -> float:
-    """What the host's slice may use of a resource.
+    """Return the budget of the host's slice for a resource.
 
     Raises:
-        ConfigError: it is not set, or not above 0.
+        ConfigError: the budget is not set, or not above 0.
     """
     amount = context.budget.get(resource)
     if amount is None:

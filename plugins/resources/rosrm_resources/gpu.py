@@ -1,4 +1,4 @@
-"""The probe `gpu`: how busy NVIDIA GPUs are (`gpu`), and how full their memory (`gpu_memory`)."""
+"""Probe `gpu`: utilisation (`gpu`) and memory usage (`gpu_memory`) of NVIDIA GPUs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ class GpuOptions:
     """Settings of the probe `gpu`.
 
     Attributes:
-        devices: numbers of the GPUs that count, as `nvidia-smi` gives them; (): all.
-        combine: how several GPUs make one reading. "max": the fullest counts, and the capacity is
-            that of the smallest; a process that takes the first GPU it finds is then safe
-            wherever it lands. "mean": for processes that spread over all of them by themselves;
-            the capacity is the sum.
+        devices: indices of the GPUs that count, as `nvidia-smi` lists them; (): all.
+        combine: how several GPUs give one reading. "max": the fullest counts, and the capacity is
+            that of the smallest; so a process that takes the first GPU it finds fits on any of
+            them. "mean": for processes that use all GPUs; the capacity is the sum.
     """
 
     devices: tuple[Annotated[int, Ge(0)], ...] = ()
@@ -32,26 +31,26 @@ class GpuOptions:
 
 
 def create(options: GpuOptions, _context: ProbeContext) -> GpuProbe:
-    """Make the probe.
+    """Create the probe.
 
     Raises:
-        SkipPlugin: no NVIDIA driver or GPU is here.
+        SkipPlugin: this host has no NVIDIA driver or GPU.
     """
     nvml = load_nvml()
     try:
         return GpuProbe(options, nvml)
-    except BaseException:  # whatever it was: who has no probe cannot close the driver
+    except BaseException:  # any error: without a probe nothing else closes the driver
         nvml.nvmlShutdown()
         raise
 
 
 def load_nvml() -> Any:
-    """The module `pynvml`, initialised.
+    """Return the initialised module `pynvml`.
 
     Raises:
-        SkipPlugin: the driver is not here or not running.
+        SkipPlugin: the driver is not installed or not running.
     """
-    # Looked for first: where there is no driver the module would only take 3 MiB.
+    # Look for the driver first: without one, the module would take 3 MiB for nothing.
     try:
         ctypes.CDLL(_LIBRARY)
     except OSError:
@@ -66,10 +65,10 @@ def load_nvml() -> Any:
 
 
 class GpuProbe:
-    """Reads GPUs through NVML.
+    """Probe that reads GPUs through NVML.
 
     Args:
-        options: which GPUs, and how they make one reading.
+        options: selects the GPUs and combines them into one reading.
         nvml: the module `pynvml`, initialised; the probe shuts it down.
     """
 
@@ -79,7 +78,7 @@ class GpuProbe:
         self._handles = _handles(nvml, options.devices)
         self._usages: list[tuple[str, Callable[[Any], float]]] = []
         self._resources: list[ResourceDescription] = []
-        # A GPU that is cut into instances tells no utilisation, one built into a SoC no memory.
+        # A GPU in MIG mode reports no utilisation, and one that is part of a SoC reports no memory.
         if self._can(self._busy):
             count = 1.0 if options.combine == "max" else float(len(self._handles))
             self._offer("gpu", "1", count, self._busy)
@@ -92,18 +91,18 @@ class GpuProbe:
 
     @property
     def resources(self) -> Sequence[ResourceDescription]:
-        """`gpu` and `gpu_memory`, those that the GPUs tell."""
+        """Return those of `gpu` and `gpu_memory` that the GPUs report."""
         return self._resources
 
     def read(self) -> Sequence[Reading]:
-        """Utilisation over the driver's last sampling period, and memory in use."""
+        """Return the utilisation over the driver's last sampling period, and the memory in use."""
         return [
             Reading(name, self._combine([usage(handle) for handle in self._handles]))
             for name, usage in self._usages
         ]
 
     def close(self) -> None:
-        """Let go of the driver."""
+        """Shut down the connection to the driver."""
         self._nvml.nvmlShutdown()
 
     def _offer(self, name: str, unit: str, capacity: float, usage: Callable[[Any], float]) -> None:

@@ -1,4 +1,4 @@
-"""The probe `memory`: bytes that cannot be had by another process."""
+"""Probe `memory`: bytes that are not available to another process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class MemoryOptions:
     """Settings of the probe `memory`.
 
     Attributes:
-        scope: what is measured; None: as the host's configuration says.
+        scope: what is measured; None: the scope of the host's configuration.
         group: the control group to measure instead of the slave's own, as /proc/PID/cgroup writes
             it for a process in it; None: the slave's own. Sets the scope to "cgroup".
     """
@@ -29,12 +29,12 @@ class MemoryOptions:
     group: str | None = None
 
     def __post_init__(self) -> None:
-        """A group and another scope contradict each other."""
+        """Raise `ValueError` if a group is given with a scope other than "cgroup"."""
         check_group(self.group, self.scope)
 
 
 def create(options: MemoryOptions, context: ProbeContext) -> GaugeProbe:
-    """Make the probe for the scope that is set."""
+    """Create the probe for the configured scope."""
     scope = "cgroup" if options.group else options.scope or context.scope
     gauge: Gauge | None = None
     if scope == "slice":
@@ -45,13 +45,13 @@ def create(options: MemoryOptions, context: ProbeContext) -> GaugeProbe:
 
 
 class MachineMemory:
-    """What the kernel cannot give without swapping: cache that can be dropped is not usage.
+    """Memory that the kernel cannot give without swapping; reclaimable cache is not usage.
 
-    Read from /proc/meminfo itself, the same way as `psutil.virtual_memory` does: ten times a
-    second that costs a third.
+    The values come from /proc/meminfo, as in `psutil.virtual_memory`; ten reads a second of the
+    file itself cost a third.
 
     Args:
-        proc: where the process file system is mounted.
+        proc: mount point of the process file system.
     """
 
     scope: Final = "machine"
@@ -61,7 +61,7 @@ class MachineMemory:
         self.capacity: Final = self._bytes(b"MemTotal:")
 
     def usage(self) -> float:
-        """Fraction of the machine's memory."""
+        """Return the fraction of the machine's memory in use."""
         return 1.0 - self._bytes(b"MemAvailable:") / self.capacity
 
     def close(self) -> None:
@@ -74,12 +74,12 @@ class MachineMemory:
 
 
 class CgroupMemory:
-    """The memory that the control group may use.
+    """Memory usage against the limit of the control group.
 
-    Where several groups above each other have a limit, the one with the least room counts.
+    Where several nested groups have a limit, the one with the least room counts.
 
     Args:
-        limits: (directory of a group, bytes that it may use), the smallest gives the capacity.
+        limits: (directory of a group, bytes that it may use); the smallest gives the capacity.
         version: of the control groups, 1 or 2.
     """
 
@@ -91,10 +91,10 @@ class CgroupMemory:
 
     @classmethod
     def find(cls, root: Path = Path("/"), path: str | None = None) -> CgroupMemory | None:
-        """For the group of this process; None: it may use the whole machine.
+        """Return the gauge for the group of this process; None: it may use the whole machine.
 
         Args:
-            root: of the file system, for recorded trees.
+            root: of the file system; another one for recorded trees.
             path: of another group.
         """
         group = find_group("memory", root, path=path)
@@ -106,7 +106,7 @@ class CgroupMemory:
         return cls(limits, group.version) if limits else None
 
     def usage(self) -> float:
-        """Fraction of the capacity that is not to be had any more."""
+        """Return the fraction of the capacity that is no longer available."""
         room = min(limit - used.read() for limit, used in self._levels)
         return max(0.0, 1.0 - room / self.capacity)
 
@@ -117,11 +117,11 @@ class CgroupMemory:
 
 
 class _GroupBytes:
-    """The bytes of a control group that are in use: inactive page cache can be dropped at once."""
+    """Bytes in use of a control group, without inactive page cache, which is reclaimed at once."""
 
     def __init__(self, directory: Path, version: int) -> None:
         current = "memory.usage_in_bytes" if version == 1 else "memory.current"
-        # In version 1 only the totals count in the groups below, as the usage does.
+        # In version 1 only the totals include the groups below, as the usage does.
         self._key = b"\ntotal_inactive_file " if version == 1 else b"\ninactive_file "
         self._current = KeptFile(directory / current, 64)
         self._stat = KeptFile(directory / "memory.stat")
@@ -130,7 +130,7 @@ class _GroupBytes:
         current = int(self._current.read())
         _, key, after = self._stat.read().partition(self._key)
         inactive = int(after.split(None, 1)[0]) if key else 0
-        # The two files are not of one instant.
+        # The difference can be negative, because the two files are read at different times.
         return float(max(0, current - inactive))
 
     def close(self) -> None:
@@ -139,8 +139,8 @@ class _GroupBytes:
 
 
 def _memory_limits(group: Group, machine: float) -> list[tuple[Path, float]]:
-    """The groups whose memory is bounded below that of the machine, and to how many bytes."""
-    # Above memory.high a group is not killed but slowed to a crawl: no room either.
+    """Return the groups with less memory than the machine, and their limits in bytes."""
+    # Above memory.high the kernel throttles a group heavily, so that is no usable room either.
     names = ("memory.limit_in_bytes",) if group.version == 1 else ("memory.max", "memory.high")
     limits = []
     for directory in group.upward():
@@ -152,15 +152,15 @@ def _memory_limits(group: Group, machine: float) -> list[tuple[Path, float]]:
 
 
 class SliceMemory:
-    """The resident memory of the slave's own process tree, against a budget.
+    """Resident memory of the slave's own process tree, against a budget.
 
-    Pages that processes share count in each of them: more than what they take, never less. What
-    each has to itself would cost the kernel a walk over all its pages.
+    Shared pages count in each process, so the sum is too high rather than too low. For the private
+    part of each process the kernel would walk over all its pages.
 
     Args:
-        size: bytes, the budget.
+        size: the budget, bytes.
         sessions: the process tree.
-        proc: where the process file system is mounted.
+        proc: mount point of the process file system.
     """
 
     scope: Final = "slice"
@@ -171,7 +171,7 @@ class SliceMemory:
         self._files = ProcessFiles(proc, "statm")
 
     def usage(self) -> float:
-        """Fraction of the budget in use."""
+        """Return the fraction of the budget in use."""
         pages = 0
         for _, line in self._files.read(self._sessions.pids()):
             pages += int(line.split(None, 2)[1])

@@ -1,4 +1,4 @@
-"""The probe `network`: how full the busiest link is, in its busier direction."""
+"""Probe `network`: usage of the busiest link, in its busier direction."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class NetworkOptions:
     """Settings of the probe `network`.
 
     Attributes:
-        interfaces: names of those that count; (): every physical one whose speed is known.
-        capacity: bytes a second that each of them carries in one direction; None: as the link
-            says (a wireless one does not).
+        interfaces: names of the interfaces that count; (): every physical one of known speed.
+        capacity: bytes a second of each interface in one direction; None: as the link reports
+            (a wireless link reports none).
         window: seconds over which the usage is a mean.
     """
 
@@ -33,7 +33,7 @@ class NetworkOptions:
 
 
 def create(options: NetworkOptions, _context: ProbeContext) -> NetworkProbe:
-    """Make the probe.
+    """Create the probe.
 
     Raises:
         SkipPlugin: no physical interface with a known speed is up.
@@ -43,13 +43,13 @@ def create(options: NetworkOptions, _context: ProbeContext) -> NetworkProbe:
 
 
 class NetworkProbe:
-    """Reads the counters of some links.
+    """Probe that reads the counters of network links.
 
-    The usage is that of the busiest link, the capacity that of the slowest: what fits then fits
-    on whichever link it goes.
+    The usage is that of the busiest link, and the capacity that of the slowest. So traffic that
+    fits by these numbers fits on every link.
 
     Args:
-        links: bytes a second by interface.
+        links: capacity in bytes a second by interface.
         window: seconds.
         clock: monotonic seconds.
     """
@@ -71,11 +71,11 @@ class NetworkProbe:
 
     @property
     def resources(self) -> Sequence[ResourceDescription]:
-        """The one resource `network`."""
+        """Return the only resource, `network`."""
         return self._resources
 
     def read(self) -> Sequence[Reading]:
-        """Usage of the busiest link; raises where one has gone."""
+        """Return the usage of the busiest link; raises `OSError` if an interface is gone."""
         now, counters = self._clock(), _counters()
         usage = 0.0
         for name, (received, sent) in self._rates.items():
@@ -87,15 +87,15 @@ class NetworkProbe:
         return (Reading("network", usage),)
 
     def close(self) -> None:
-        """Nothing is kept."""
+        """Do nothing, because no file is open."""
 
 
 def links(options: NetworkOptions, classes: Path = Path("/sys/class/net")) -> dict[str, float]:
-    """The interfaces that count, and the bytes a second that each carries.
+    """Return the capacity in bytes a second of each interface that counts.
 
     Args:
         options: of the probe.
-        classes: where the kernel lists the interfaces.
+        classes: directory in which the kernel lists the interfaces.
     """
     statistics = _psutil().net_if_stats()
     unknown = [name for name in options.interfaces if name not in statistics]
@@ -129,8 +129,8 @@ def links(options: NetworkOptions, classes: Path = Path("/sys/class/net")) -> di
 
 
 def _counters() -> dict[str, tuple[float, float]]:
-    """Bytes received and sent by interface, since it came up."""
-    # A counter that wraps round is begun anew by `Rate`; psutil need not remember it too.
+    """Return the bytes received and sent by interface, since it came up."""
+    # `Rate` handles a counter that wraps around, so psutil need not (`nowrap=False`).
     counters = _psutil().net_io_counters(pernic=True, nowrap=False)
     return {
         name: (float(counter.bytes_recv), float(counter.bytes_sent))

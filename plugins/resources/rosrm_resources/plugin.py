@@ -1,4 +1,4 @@
-"""Registers the probes."""
+"""Plugin hook that registers the probes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rosrm_resources import cpu, disk, gpu, memory, network
 
 @hookimpl
 def register_probes() -> Sequence[ProbeOffer]:
-    """Offer cpu, memory, disk and gpu, which are read by default, and network."""
+    """Offer `cpu`, `memory`, `disk` and `gpu`, which are read by default, and `network`."""
     return [
         ProbeOffer(
             name="cpu",

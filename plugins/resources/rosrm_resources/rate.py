@@ -1,4 +1,4 @@
-"""The rate of a counter over a sliding window."""
+"""Rate of a counter over a sliding window."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ import math
 from collections import deque
 from typing import Final
 
-#: The kernel counts CPU time in steps of 10 ms: over less than this a rate is noise.
+#: Shortest interval in seconds. The kernel counts CPU time in steps of 10 ms, so a rate over less
+#: time is noise.
 _SHORTEST: Final = 0.02
 
 
 class Rate:
-    """How fast a counter grew over the last `window` seconds.
+    """Growth of a counter over the last `window` seconds.
 
-    Over one cycle of 0.1 s the CPU time of two cores has 20 steps, so that a reading would jump by
-    5 % on its own; over a second it is steady, and still tells of a new load at once.
+    In one cycle of 0.1 s the CPU time of two cores has 20 steps, so a reading would jump by 5 %
+    without any change of load. Over a second the rate is steady and still shows a new load at once.
 
     Args:
         window: seconds.
-        at: seconds, of the first count.
-        count: of the counter then.
-        guess: the rate to report until there is a second count.
+        at: time of the first count, seconds.
+        count: value of the counter at that time.
+        guess: rate to return until there is a second count.
     """
 
     def __init__(self, window: float, at: float, count: float, guess: float = 0.0) -> None:
@@ -29,11 +30,11 @@ class Rate:
         self._rate = guess
 
     def update(self, at: float, count: float) -> float:
-        """The rate up to now, counts a second, >= 0.
+        """Return the rate up to now, counts a second, >= 0; raises `ValueError` if not finite.
 
         Args:
-            at: seconds by any steady clock.
-            count: of the counter now; one that has fallen was begun anew.
+            at: time by any steady clock, seconds.
+            count: value of the counter now; a smaller one than before means a reset.
         """
         if not math.isfinite(count):
             raise ValueError(f"a counter says {count}")

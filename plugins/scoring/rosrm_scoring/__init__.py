@@ -1,1 +1,1 @@
-"""The scoring policies that rosrm ships: weighted (Eq. 1 of the paper) and threshold."""
+"""Scoring policies of rosrm: weighted (Eq. 1 of the paper) and threshold."""

@@ -1,4 +1,4 @@
-"""Registers the scoring policies."""
+"""Plugin hook that registers the scoring policies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm_scoring.weighted import Weighted, WeightedOptions
 
 @hookimpl
 def register_scoring_policies() -> Sequence[ScoringOffer]:
-    """Offer `weighted`, which is the paper's, and `threshold`, which keeps off the limits."""
+    """Offer `weighted`, the paper's policy, and `threshold`, which avoids hosts near a limit."""
     return [
         ScoringOffer(
             name="weighted",

@@ -1,12 +1,14 @@
-"""Eq. 1 of the paper: score = w_mem * memusage + w_cpu * cpuusage + w_disk * diskusage.
+"""Scoring policy `weighted`, Eq. 1 of the paper.
+
+score = w_mem * memusage + w_cpu * cpuusage + w_disk * diskusage
 
 The administrator chooses the weights, each from 0 to 1. By default memory weighs 1, cpu 0.5 and
-disk 0: memory that runs out kills processes, so it counts most; cpu that runs out only slows them,
-and its reading swings, so it counts half, which is enough to keep jobs that compute off a host that
-computes already; how full a disk is says little about what one more process would find there. The
-limits hold whatever the weights are.
+disk 0. Memory counts most, because exhausted memory kills processes. Exhausted cpu only slows them,
+and its reading fluctuates, so it counts half; that is enough to keep computing jobs off a host that
+computes already. Disk usage says little about the performance of one more process. The limits
+apply independently of the weights.
 
-A host that does not measure a resource that weighs counts as full of it (`missing: worst`):
+A host that does not measure a weighted resource counts as full of it (`missing: worst`), because
 otherwise a host without the probe would look emptier than every host that has it.
 """
 
@@ -25,7 +27,7 @@ from rosrm import FloatArray, HostView, ProcessView, ResourceName, Scores
 Weight = Annotated[float, Ge(0), Le(1)]
 Missing = Literal["worst", "ignore"]
 
-#: The usage that counts where a host does not measure a resource.
+#: Usage that counts if a host does not measure a resource.
 _COUNTS_AS: Final[Mapping[Missing, float]] = {"worst": 1.0, "ignore": 0.0}
 
 DEFAULT_WEIGHTS: Final[Mapping[str, Weight]] = MappingProxyType(
@@ -38,10 +40,10 @@ class WeightedOptions:
     """Settings of the policy `weighted`.
 
     Attributes:
-        weights: by resource, 0..1; a resource that is not named weighs 0, so what is given here
+        weights: by resource, 0..1; a resource that is not named weighs 0, so the given mapping
             replaces the defaults as a whole.
-        missing: how a resource counts that a host does not measure: "worst", as if it were full, or
-            "ignore", as if it were empty, for what some hosts do not have by design.
+        missing: usage of a resource that a host does not measure: "worst" counts it as full;
+            "ignore" counts it as empty, for resources that some hosts lack by design.
     """
 
     weights: Mapping[ResourceName, Weight] = field(default_factory=lambda: DEFAULT_WEIGHTS)
@@ -49,7 +51,7 @@ class WeightedOptions:
 
 
 class Weighted:
-    """Implements `rosrm.extensions.contracts.ScoringPolicy` by Eq. 1.
+    """Implementation of `rosrm.extensions.contracts.ScoringPolicy` by Eq. 1.
 
     Args:
         options: the weights.
@@ -59,12 +61,12 @@ class Weighted:
         self._sum = WeightedSum(options.weights, options.missing)
 
     def score(self, hosts: HostView, process: ProcessView) -> Scores:  # noqa: ARG002 - by usage alone
-        """The weighted sum of the usages; the host with the most room has the lowest."""
+        """Return the weighted sum of the usages; the host with the most room has the lowest."""
         return Scores(self._sum.of(hosts), reason=lambda row: self._sum.reason(hosts, row))
 
 
 class WeightedSum:
-    """Eq. 1 for any number of hosts at once.
+    """Weighted sum of Eq. 1 for any number of hosts at once.
 
     Args:
         weights: by resource, 0..1.
@@ -77,10 +79,10 @@ class WeightedSum:
         self.largest: Final = sum(self._weights.values())
 
     def of(self, hosts: HostView) -> FloatArray:
-        """(N,) the sum for each host; what no host measures makes no difference.
+        """Return (N,): the sum for each host; a resource that no host measures is left out.
 
-        One column after another, never as a matrix product: its rounding depends on the number of
-        rows, and a host must score alike alone and among others.
+        The columns are added one by one. The rounding of a matrix product depends on the number of
+        rows, but the score of a host must not depend on the other hosts.
         """
         total: FloatArray | None = None
         for name, weight in self._weights.items():
@@ -92,7 +94,7 @@ class WeightedSum:
         return np.zeros(len(hosts.usage)) if total is None else total
 
     def reason(self, hosts: HostView, row: int) -> str:
-        """The sum of one host, written out."""
+        """Return the terms of one host's sum as text."""
         terms = []
         for name, weight in self._weights.items():
             if name in hosts.resources:

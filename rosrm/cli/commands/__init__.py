@@ -1,4 +1,4 @@
-"""The tree of commands, and how errors become messages and exit codes.
+"""Tree of commands, and conversion of errors into messages and exit codes.
 
 ======  ===========================================================
 exit    when
@@ -30,11 +30,11 @@ from rosrm.version import PROTOCOL_VERSION, __version__
 
 
 class Guarded(PlainGroup):
-    """Says what a user did wrong without a traceback; has the commands of other distributions."""
+    """Root group: reports user errors without a traceback, and includes installed commands."""
 
     @cached_property
     def _installed(self) -> dict[str, list[PluginAddress]]:
-        """The commands of other distributions; the names of rosrm's own are not theirs."""
+        """Return the commands of other distributions, except those with a name of rosrm's own."""
         return {name: one for name, one in find_commands().items() if name not in self.commands}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -42,14 +42,14 @@ class Guarded(PlainGroup):
         return [*super().list_commands(ctx), *self._installed]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, that of another distribution imported now; None if there is none."""
+        """Return a command, imported now if it is of another distribution; None if unknown."""
         own = super().get_command(ctx, cmd_name)
         if own is None and cmd_name in self._installed:
             return load_command(cmd_name, self._installed[cmd_name])
         return own
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command; for an unknown one name the command that is meant."""
+        """Find the command; for an unknown one suggest a similar command."""
         word = args[0]
         if not (word in self.commands or word in self._installed or ctx.resilient_parsing):
             if word in DISTRIBUTIONS:
@@ -108,7 +108,7 @@ def common(
     ] = False,
 ) -> None:
     """Decides on which host each process of a ROS 2 application runs, and keeps it running."""
-    del version  # its callback has done all
+    del version  # handled by its callback
     ctx.obj = Common(domain, cluster)
 
 

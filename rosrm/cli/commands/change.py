@@ -1,4 +1,4 @@
-"""Commands that change something, from `submit` to `drain`."""
+"""Commands that change processes or hosts, from `submit` to `prune`."""
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
@@ -28,7 +28,8 @@ Timeout = Annotated[
         "--timeout", metavar="TIME", help="With --wait: maximum wait, e.g. 5min; default: no limit."
     ),
 ]
-#: A process has a name without a slash, and a name that ends like this is rather a file's.
+#: Endings of file names. A process name has no slash, and a name with such an ending is taken
+#: for a file.
 _FILE_ENDINGS: Final = (".yaml", ".yml")
 
 
@@ -102,7 +103,7 @@ def cancel(
             return
         outcome = client.cancel(names)
         typer.echo(outcome)
-        # The reply of the master has the end of each already, where all of them waited.
+        # If all processes were still queued, the master's reply reports their end already.
         if wait and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
             with interruptible("the processes are still being cancelled (`rosrm ps`)"):
                 show_processes(
@@ -183,7 +184,7 @@ def _with_ending(
     ctx: typer.Context, name: str, ask: Callable[[Client], str], domain: int | None,
     wait: bool, timeout: str,
 ) -> None:  # fmt: skip
-    """Send a request whose end is an event; wait for the event if asked to."""
+    """Send a request whose completion is an event; with `wait`, wait for the event."""
     from rosrm.cli.waiting import interruptible, longest, show_change, show_end
 
     limit = longest(timeout)

@@ -1,4 +1,4 @@
-"""`rosrm config check`: is this file right, before it is used?"""
+"""Command `rosrm config check`: validation of configuration files before use."""
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig, HostConfig
     from rosrm.extensions.registry import Registry
 
-#: Least likeness of two words that are taken for one misspelt; gpu_memory and memory have less.
+#: Lowest similarity of a misspelt word; gpu_memory and memory are less similar.
 _NEAR: Final = 0.8
 
 config = typer.Typer(no_args_is_help=True, help="Check configuration files.")
 
 
 class KindOfFile(str, Enum):
-    """What a file configures."""
+    """Kinds of configuration files."""
 
     CLUSTER = "cluster"
     HOST = "host"
@@ -72,7 +72,7 @@ def check(
 
 
 def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
-    """Make the plugins that a master would make; raises `ConfigError` with all that fail."""
+    """Create the plugins that a master would create; raises `ConfigError` with all failures."""
     from rosrm.errors import ConfigError, PluginError
 
     wrong = []
@@ -93,9 +93,9 @@ def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
 
 
 def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
-    """Make the probes that a slave would make; raises `ConfigError` with all that fail.
+    """Create the probes that a slave would create; raises `ConfigError` with all failures.
 
-    One that says that it is absent here is none of them: the file may be for another host.
+    A probe that reports itself absent is no failure, because the file may be for another host.
     """
     from rosrm.errors import ConfigError
     from rosrm.extensions.contracts import ProbeContext
@@ -116,7 +116,7 @@ def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
 
 
 def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
-    """A summary of a file; raises `ConfigError`."""
+    """Return a summary of a file; raises `ConfigError`."""
     from rosrm.config import load_cluster, load_host, load_work
     from rosrm.config.documents import read
     from rosrm.config.kinds import kind_of
@@ -140,7 +140,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
         case "simulation":
             return _check_of_simulations(file)(file, registry)
         case _:
-            for warning in _misspelt_needs(root, registry):  # a wrong file has them too
+            for warning in _misspelt_needs(root, registry):  # also for a wrong file
                 typer.echo(warning, err=True)
             specs = load_work(file, registry)
             for warning in shared_nodes(specs):
@@ -152,11 +152,11 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
 
 
 def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
-    """Return the check that the distribution of the simulator brings.
+    """Return the check of simulation files from the simulator's distribution.
 
     Raises:
-        ConfigError: it is not installed.
-        PluginError: it does not import.
+        ConfigError: the distribution is not installed.
+        PluginError: the check cannot be imported.
     """
     from pkgutil import resolve_name
 
@@ -178,9 +178,9 @@ def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
 
 
 def _misspelt_needs(root: Node, registry: Registry) -> Iterator[str]:
-    """Warn of resources in `needs` that are nearly named as one that a probe installed here reads.
+    """Yield warnings about resources in `needs` that may be misspelt names of known resources.
 
-    Only a warning: another host may have a probe that this machine lacks.
+    These are only warnings, because another host may have a probe that this machine lacks.
     """
     read = registry.resources()
     listed_there = root.get("processes")

@@ -1,4 +1,4 @@
-"""Commands that may run until Ctrl-C: events, logs, top."""
+"""Commands that can run until Ctrl-C: events, logs, top."""
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415

@@ -1,4 +1,4 @@
-"""Commands that show something once: status, ps, hosts, plugins, explain."""
+"""Commands that print once: status, ps, hosts, plugins, explain."""
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415

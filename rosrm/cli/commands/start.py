@@ -1,7 +1,7 @@
-"""`rosrm master` and `rosrm slave`: check everything, say what starts, and become the runtime.
+"""Commands `rosrm master` and `rosrm slave`: check all settings, then execute the runtime.
 
-The runtime takes this process's place and starts without pydantic, typer and rich, which it has no
-use for; it reads the settings that were checked from an inherited file.
+The runtime replaces this process and starts without pydantic, typer and rich, which it does not
+need. It reads the checked settings from an inherited file.
 """
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
@@ -100,7 +100,7 @@ def slave(
         become("rosrm.slave.stop_all", settings.to_json())
         return
     if settings.probes is None:
-        registry.default_probes()  # raises where there is none
+        registry.default_probes()  # raises if there is none
     remedy = "another `host:` and `state:`"
     with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
         typer.echo(_says_of_host(settings), err=True)
@@ -108,7 +108,7 @@ def slave(
 
 
 def become(module: str, settings: str) -> None:
-    """Put a runtime in this process's place."""
+    """Replace this process by a runtime."""
     descriptor = hand_over(settings)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -120,7 +120,10 @@ def become(module: str, settings: str) -> None:
 
 
 def _without_this_folder() -> list[str]:
-    """`-m` looks for modules in the working directory first: not wanted, save in a checkout."""
+    """Return the option that stops `-m` from searching the working directory first.
+
+    In a checkout that search is wanted, so there the list is empty.
+    """
     in_checkout = Path(__file__).is_relative_to(Path.cwd())
     return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
 

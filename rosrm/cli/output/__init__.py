@@ -1,1 +1,1 @@
-"""What commands print: tables, pictures, JSON, log lines."""
+"""Output of the commands: tables, live views, JSON, log lines."""

@@ -1,4 +1,4 @@
-"""`rosrm explain`: why a process is where it is, host by host."""
+"""Output of `rosrm explain`: the placement of a process, host by host."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.text import Text
 from rosrm.cli.output import formats, tables
 from rosrm.wording import counted, listed
 
-#: What the master decided about a process.
+#: Wording of each decision of the master about a process.
 _DECIDED: Final = {
     "assigned": "The master assigned {process} to {host}{ago}",
     "migrated": "The master chose {host} as the destination of a move of {process}{ago}",
@@ -24,7 +24,7 @@ _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 
 
 def render(story: Mapping[str, Any]) -> RenderableType:
-    """The master's explanation of one process."""
+    """Return the master's explanation of one process for a rich console."""
     return Group(*_parts(story))
 
 
@@ -64,7 +64,7 @@ def _headline(story: Mapping[str, Any]) -> Text:
 
 
 def _kept(kept: list[Mapping[str, Any]]) -> Text:
-    """The hosts with a snapshot of the state, and the cycle of each."""
+    """Return the hosts with a replica of the snapshot, and the cycle of each."""
     places = [
         f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
         f"{formats.duration(one['elapsed'])} ago)"
@@ -74,7 +74,7 @@ def _kept(kept: list[Mapping[str, Any]]) -> Text:
 
 
 def _checkpoint(told: Mapping[str, Any]) -> Text:
-    """The newest periodic checkpoint, and what is wrong with the next."""
+    """Return the newest periodic checkpoint, and the failure of the next one, if any."""
     if told["elapsed"] is None:
         text = "No periodic checkpoint of its memory exists yet"
     else:

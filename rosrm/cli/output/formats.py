@@ -1,4 +1,4 @@
-"""Numbers for people."""
+"""Human-readable formats of numbers, times and states."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ __all__ = ["amount", "clock", "duration", "percent", "size", "words"]
 
 
 def percent(fraction: float) -> str:
-    """A fraction as whole percent, without the sign; "?" where it is not known."""
+    """Return a fraction in whole percent without the sign; "?" if it is unknown."""
     return f"{fraction * 100:.0f}" if math.isfinite(fraction) else "?"
 
 
 def clock(wall_time: float) -> str:
-    """A time of day here."""
+    """Return a time of day in the local time zone."""
     return time.strftime("%H:%M:%S", time.localtime(wall_time))
 
 
 def words(state: str) -> str:
-    """A state without its underscore."""
+    """Return the name of a state without underscores."""
     return state.replace("_", " ")

@@ -1,4 +1,4 @@
-"""What `--json` prints: the views as they are, a host with its description in one object."""
+"""Output of `--json`: the views unchanged, except a host with its description in one object."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, Snapshot
 
 
 def host_form(row: HostRow) -> dict[str, Any]:
-    """A host: what it is and how it is."""
+    """Return a host as one object: its description and its state."""
     plain = to_plain(row)
     made: dict[str, Any] = _finite({**plain.pop("description"), **plain})
     return made
 
 
 def form(row: ProcessRow | EventRow | PluginRow) -> dict[str, Any]:
-    """Any other row."""
+    """Return any other row as an object."""
     made: dict[str, Any] = _finite(to_plain(row))
     return made
 
 
 def forms(rows: Sequence[Any]) -> list[dict[str, Any]]:
-    """A listing."""
+    """Return the rows of a listing as objects."""
     return [host_form(row) if isinstance(row, HostRow) else form(row) for row in rows]
 
 
 def status_form(snapshot: Snapshot) -> dict[str, Any]:
-    """The overview."""
+    """Return the overview of `rosrm status` as an object."""
     return {
         "master": snapshot.master,
         "uptime": snapshot.uptime,
@@ -62,7 +62,7 @@ def _counts(states: Iterable[str]) -> dict[str, int]:
 
 
 def _finite(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null stands for what is not known."""
+    """Replace NaN and infinity, which JSON lacks, by null for an unknown value."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):

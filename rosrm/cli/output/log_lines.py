@@ -1,4 +1,4 @@
-"""The output of `rosrm logs`: the bytes of one process, with times and its name on demand.
+"""Output of `rosrm logs`: the bytes of one process, optionally with times and its name.
 
 Lines of rosrm's own begin with `---`: where a program starts another time, and what is missing.
 With several processes each start has such a line.
@@ -28,7 +28,7 @@ def show(pieces: Iterable[Piece]) -> None:
 
 @dataclass
 class Stream:
-    """The output for one process, to be taken piece by piece.
+    """Output of one process in pieces.
 
     Attributes:
         name: of the process.
@@ -117,7 +117,7 @@ class Stream:
 
 
 def _stamp(when: float) -> str:
-    """Return a time of this host's zone: a log from before there were times has "?"."""
+    """Return a time in the local time zone; "?" for a log that was written without times."""
     if when <= 0.0:
         return "?"
     return time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(when)) + f".{int(when * 10) % 10}"

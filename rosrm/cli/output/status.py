@@ -1,4 +1,4 @@
-"""`rosrm status`: the cluster on half a page."""
+"""Output of `rosrm status`: the cluster on half a page."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from rich.text import Text
 from rosrm.cli.output import formats, tables
 from rosrm.model.rows import HostRow, PluginRow, ProcessRow, Snapshot
 
-#: States of a process that somebody should look at.
+#: States of a process that need an operator's attention.
 _TROUBLE = ("stuck", "unreachable", "unknown", "failed", "set_aside", "backoff")
 _MOST_NAMED = 5
 
 
 def render(snapshot: Snapshot) -> RenderableType:
-    """The overview of a snapshot with hosts, processes and the newest events."""
+    """Return the overview of a listing with hosts, processes and the newest events."""
     return Group(*_lines(snapshot))
 
 

@@ -1,4 +1,4 @@
-"""Listings as tables that read at 80 columns."""
+"""Listings as tables that fit in 80 columns."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from rosrm.cli.output import formats
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.wording import counted, standing
 
-#: Width of tables that go into a file or pipe: no line there is cut or wrapped.
+#: Width of tables in a file or pipe, large enough that no line is cut or wrapped.
 _PIPE_WIDTH: Final = 100_000
 
-#: How a state looks; others are plain.
+#: Style of each state; other states are plain.
 STYLES: Final = {
     "running": "green",
     "finished": "green",
@@ -43,7 +43,7 @@ STYLES: Final = {
 
 
 def console() -> Console:
-    """Where tables go: as wide as the terminal or COLUMNS says, else wide enough not to be cut."""
+    """Return the console for tables, as wide as the terminal or COLUMNS; else without a limit."""
     output = Console(highlight=False)
     if output.is_terminal or os.environ.get("COLUMNS", "").strip("0").isdigit():
         return output
@@ -51,7 +51,7 @@ def console() -> Console:
 
 
 def table(*columns: str, right: Sequence[str] = ()) -> Table:
-    """An empty table; the columns named in `right` hold numbers."""
+    """Return an empty table; the columns in `right` hold numbers, aligned at the right."""
     made = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", show_edge=False)
     for column in columns:
         number = column in right
@@ -62,7 +62,7 @@ def table(*columns: str, right: Sequence[str] = ()) -> Table:
 
 
 def show(renderable: RenderableType) -> None:
-    """Print; into a file or pipe without the blanks that fill the last column."""
+    """Print a table; into a file or pipe without trailing blanks."""
     output = console()
     if output.is_terminal:
         output.print(renderable)
@@ -74,18 +74,18 @@ def show(renderable: RenderableType) -> None:
 
 
 def state(word: str) -> Text:
-    """A state in its colour."""
+    """Return a state in its colour."""
     return Text(formats.words(word), style=STYLES.get(word, ""))
 
 
 def sentence(name: str, word: str) -> Text:
-    """A process and its state as the beginning of a sentence, the state in its colour."""
+    """Return a process and its coloured state as the beginning of a sentence."""
     verb, _, rest = standing(word).partition(" ")
     return Text(f"{name} {verb} ").append(rest, STYLES.get(word, ""))
 
 
 def processes(rows: Iterable[ProcessRow]) -> Table:
-    """For `rosrm ps`."""
+    """Return the table of `rosrm ps`."""
     numbers = ("SINCE", "CPU", "MEMORY")
     made = table("NAME", "STATE", "HOST", *numbers, "WHY", right=numbers)
     for row in rows:
@@ -103,12 +103,12 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
 
 
 def age(row: ProcessRow, reading: str) -> Text:
-    """Return a reading of a process; `?` stands before an old one."""
+    """Return a reading of a process; an old one begins with `?`."""
     return Text(f"?{reading}", "dim") if row.stale and reading else Text(reading)
 
 
 def why(row: ProcessRow) -> str:
-    """Say in one line why a process is in its state, and what it went through."""
+    """Return one line with the reason for a process's state and its history."""
     parts = [f"no. {row.queue_position} in the queue"] if row.queue_position else []
     if row.reason:
         parts.append(row.reason)
@@ -122,7 +122,7 @@ def why(row: ProcessRow) -> str:
 
 
 def hosts(rows: Sequence[HostRow]) -> Table:
-    """For `rosrm hosts`: usage against limit, in percent of the capacity."""
+    """Return the table of `rosrm hosts`: usage and limit, in percent of the capacity."""
     resources = list(dict.fromkeys(r.name for row in rows for r in row.resources))
     numbers = ("RUNS", *(f"{name} %" for name in resources))
     made = table("HOST", "STATE", *numbers, right=numbers)
@@ -134,7 +134,7 @@ def hosts(rows: Sequence[HostRow]) -> Table:
 
 
 def host_state(row: HostRow) -> Text:
-    """The state of a host and what an operator did to it."""
+    """Return the state of a host and the operator's requests (cordon, drain)."""
     text = state(row.state)
     if row.draining:
         text.append(", drained" if row.drained else ", draining", "yellow")
@@ -144,7 +144,7 @@ def host_state(row: HostRow) -> Text:
 
 
 def usage(resource: ResourceRow) -> Text:
-    """`34/80`: used and limit, percent."""
+    """Return usage and limit in percent, e.g. `34/80`."""
     text = f"{formats.percent(resource.usage)}/{formats.percent(resource.limit)}"
     if resource.stale:
         return Text(f"?{text}", "dim")
@@ -152,7 +152,7 @@ def usage(resource: ResourceRow) -> Text:
 
 
 def plugins(rows: Iterable[PluginRow]) -> Table:
-    """For `rosrm plugins`."""
+    """Return the table of `rosrm plugins`."""
     made = table("KIND", "NAME", "STATE", "HOST", "FROM", "ABOUT")
     for row in rows:
         cells = (row.kind, row.name, row.host, row.distribution, row.reason)
@@ -162,17 +162,17 @@ def plugins(rows: Iterable[PluginRow]) -> Table:
 
 
 def event_line(row: EventRow) -> str:
-    """One line of the event record."""
+    """Return one line of the event record."""
     return f"{formats.clock(row.wall_time)}  {formats.words(row.kind):<18} {row.message}"
 
 
 def event(row: EventRow) -> Table:
-    """One event for a terminal: a long message is wrapped below itself."""
+    """Return one event for a terminal; a long message wraps with a hanging indent."""
     return entry(formats.clock(row.wall_time), row.kind, row.message)
 
 
 def entry(when: str, kind: str, message: str) -> Table:
-    """Time, kind and message of an event; a long message is wrapped below itself."""
+    """Return time, kind and message of an event; a long message wraps with a hanging indent."""
     made = Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
     made.add_row(Text(f"{when} "), Text(f"{formats.words(kind):<18}"), Text(message))
     return made

@@ -1,8 +1,8 @@
-"""The live table: hosts with their usage against their limits, processes, queue, newest events.
+"""Live view: hosts with usage and limits, processes, queue, newest events.
 
-A pure function of a `Snapshot` and the width: `rosrm top` and `make demo` show it. Where room is
-short, the reasons shrink first, then bars, then columns leave; names stay whole. A reason that is
-too long loses the beginning that others share, and then its end.
+The view is a pure function of a `Snapshot` and the width; `rosrm top` and `make demo` show it. If
+room is short, reasons shrink first, then bars, and then columns are hidden; names stay whole. A
+reason that is too long loses the beginning that it shares with others, and then its end.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from rich.text import Text
 from rosrm.cli.output import formats, tables
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow, Snapshot
 
-#: Most processes in a picture, if the height of the terminal does not say so.
+#: Most processes in a view, if the height of the terminal is unknown.
 ROWS: Final = 18
 _BAR: Final = 14
 _LEAST_BAR: Final = 4
 #: Width of the percentage beside a bar: " 100%".
 _NUMBER: Final = 5
 _MOST_RESOURCES: Final = 3
-#: Near its limit: from this part of it on.
+#: Fraction of the limit from which a usage counts as near the limit.
 _NEAR: Final = 0.9
 _GAP: Final = 2
-#: A reason that is shorter than this says nothing: a column makes room for it.
+#: Least useful width of a reason; a column is hidden to make room for it.
 _LEAST_REASON: Final = 20
 
-#: Before all others where there is too little room.
+#: Resources that are shown first if there is too little room.
 _FIRST: Final = ("memory", "cpu", "gpu", "disk")
-#: States in the order of interest; those that are over come last.
+#: States in the order of interest; terminal ones come last.
 _ORDER: Final = (
     "stuck",
     "unreachable",
@@ -54,10 +54,10 @@ _ORDER: Final = (
     "cancelled",
     "finished",
 )
-#: How the reason for a state always begins: the state has said so.
+#: Beginnings of reasons that repeat the state.
 _BEGINNINGS: Final = {"set_aside": "no host may take it: "}
 _OVER: Final = ("failed", "cancelled", "finished")
-#: Columns of the processes that leave where room is short, the first one first.
+#: Columns of the processes that are hidden if room is short, in this order.
 _LEAVE: Final = ("MEMORY", "CPU", "SINCE", "HOST")
 #: Columns of numbers.
 _RIGHT: Final = ("SINCE", "CPU", "MEMORY")
@@ -65,7 +65,7 @@ _RIGHT: Final = ("SINCE", "CPU", "MEMORY")
 
 @dataclass(frozen=True)
 class Picture:
-    """The table of a snapshot, for a rich console of any width."""
+    """View of a listing, for a rich console of any width."""
 
     snapshot: Snapshot
     rows: int
@@ -75,7 +75,7 @@ class Picture:
     foot: str
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Draw the parts below one another."""
+        """Yield the parts from top to bottom."""
         width, snapshot = options.max_width, self.snapshot
         yield from _title(snapshot, self.note, width)
         yield Text()
@@ -95,13 +95,13 @@ def render(
     snapshot: Snapshot, *, rows: int = ROWS, events: int = 4, note: str = "", sort: str = "state",
     foot: str = "",
 ) -> RenderableType:  # fmt: skip
-    """Return the picture of a snapshot.
+    """Return the view of a listing.
 
     Args:
-        snapshot: with hosts and processes; events are shown where it has any.
+        snapshot: listing with hosts and processes; its events are shown, if any.
         rows: most processes shown.
         events: most events shown.
-        note: goes beside the title.
+        note: text beside the title.
         sort: order of the processes, a key of `SORTS`.
         foot: the last line.
     """
@@ -109,7 +109,7 @@ def render(
 
 
 def _title(snapshot: Snapshot, note: str, width: int) -> Iterator[Text]:
-    """Yield the title; where it exceeds the width, a number and its state stay together."""
+    """Yield the title; if it wraps, a number and its state stay on one line."""
     counts = Counter(row.state for row in snapshot.processes)
     states = sorted(counts, key=_rank)
     parts = [
@@ -164,7 +164,7 @@ def _host(row: HostRow) -> Text:
 
 
 def bar(resource: ResourceRow, width: int = _BAR) -> Text:
-    """`████▒▒░░░│░░ 42%`: used, promised, and the limit as a stroke."""
+    """Return a bar of usage, reservations and limit, e.g. `████▒▒░░░│░░ 42%`."""
     used, promised = _cells(resource.usage, width), _cells(resource.in_flight, width)
     limit = min(_cells(resource.limit, width), width - 1)
     style = _style(resource)
@@ -201,7 +201,7 @@ def _rank(word: str) -> int:
 
 
 def _recency(row: ProcessRow) -> float:
-    """In the queue its order; of those that are over, the newest first."""
+    """Return the sort key: queued processes in queue order, terminal ones newest first."""
     if row.queue_position:
         return row.queue_position
     return row.since if row.state in _OVER else 0.0
@@ -248,7 +248,7 @@ def _why(row: ProcessRow) -> str:
 
 
 def _reasons(rows: Sequence[ProcessRow], room: int) -> list[str]:
-    """Return why each process is in its state, in what differs where a reason exceeds the room."""
+    """Return the reason of each process's state; too long ones begin where they differ."""
     known = {row.reason for row in rows if cell_len(_why(row)) > room}
     return [
         _why(replace(row, reason=_without_beginning(row, known, room)))
@@ -259,18 +259,18 @@ def _reasons(rows: Sequence[ProcessRow], room: int) -> list[str]:
 
 
 def _without_beginning(row: ProcessRow, reasons: set[str], room: int) -> str:
-    """Return a reason from a word on that is in sight where it differs from the other reasons."""
+    """Return a reason from the word on at which it differs visibly from the other reasons."""
     shared = max((_alike(row.reason, other) for other in reasons - {row.reason}), default=0)
     said = _BEGINNINGS.get(row.state, "")
     begin = len(said) if said and row.reason.startswith(said) else 0
     if shared > max(begin, room // 2):
-        enough = max(0, len(row.reason) - room)  # from there on all of the rest has room
+        enough = max(0, len(row.reason) - room)  # from there on the rest fits
         begin = max(begin, row.reason.find(" ", min(shared - 1, enough)) + 1)
     return f"…{row.reason[begin:]}" if begin else row.reason
 
 
 def _alike(one: str, other: str) -> int:
-    """Return the length of the words with which two texts begin."""
+    """Return the length of the common leading words of two texts."""
     letters = takewhile(bool, map(str.__eq__, one, other))
     return one.rfind(" ", 0, len(list(letters))) + 1
 
@@ -283,14 +283,14 @@ def _width(head: str, cells: Sequence[Text]) -> int:
 
 
 def _total(columns: Mapping[str, Sequence[Text]]) -> int:
-    """Width of columns with the gaps between them."""
+    """Return the width of columns with the gaps between them."""
     return sum(_width(*column) + _GAP for column in columns.items()) - _GAP
 
 
 def _lines(
     columns: Mapping[str, Sequence[Text]], width: int, right: Sequence[str]
 ) -> Iterator[Text]:
-    """Lay out columns below their heads; what is too long for the width is cut at its right end."""
+    """Lay out columns below their heads; too long cells are cut at the right end."""
     widths = {head: _width(head, cells) for head, cells in columns.items()}
     heads = {head: Text(head, "bold") for head in columns}
     count = len(next(iter(columns.values())))

@@ -1,4 +1,4 @@
-"""`rosrm top`: pictures of the cluster one after the other, and the keys that a user presses."""
+"""Screen of `rosrm top`: repeated views of the cluster, and keyboard input."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from rosrm.errors import ConfigError, NoMaster
 from rosrm.extensions.units import Quantity
 from rosrm.model.rows import Snapshot
 
-#: The least time between two pictures, in seconds.
+#: Least seconds between two views.
 LEAST_PERIOD: Final = 0.1
-#: What a key does: sort by this.
+#: Sort order of each key.
 KEYS: Final = {"s": "state", "c": "cpu", "m": "memory", "n": "name"}
 _QUIT: Final = "q"
 _HINT: Final = "q quits; sort: s state, c CPU, m memory, n name"
-#: Lines beside those of hosts and processes: title (two), heads, events, hint and gaps.
+#: Lines that are not of hosts and processes: title (two), heads, events, hint and gaps.
 _OTHER_LINES: Final = 13
 _LEAST_ROWS: Final = 5
 
@@ -48,12 +48,12 @@ def sort_of(text: str) -> str:
 
 
 def show(look: Callable[[], Snapshot], period: float, count: int, sort: str) -> None:
-    """Show pictures until q or Ctrl-C, or until there were `count`; 0: no bound.
+    """Show views until q or Ctrl-C, or until `count` of them; 0: no limit.
 
     Args:
         look: asks the master; raises `NoMaster`.
-        period: seconds between two pictures.
-        count: of pictures.
+        period: seconds between two views.
+        count: of views.
         sort: order of the processes.
     """
     console = tables.console()
@@ -73,7 +73,7 @@ def show(look: Callable[[], Snapshot], period: float, count: int, sort: str) -> 
 def _keep_up_to_date(
     console: Console, look: Callable[[], Snapshot], period: float, count: int, sort: str
 ) -> None:
-    """Draw each picture over the one before."""
+    """Draw each view over the one before."""
     snapshot, note = look(), ""
     with _keyboard() as key, Live(console=console, auto_refresh=False) as screen:
         for shown in itertools.count(1):
@@ -98,7 +98,7 @@ def _look_again(look: Callable[[], Snapshot], before: Snapshot) -> tuple[Snapsho
 
 @contextlib.contextmanager
 def _keyboard() -> Iterator[Callable[[float], str]]:
-    """Deliver keys one by one, unseen; yields a function that waits so many seconds for one."""
+    """Read keys without echo; yield a function that waits so many seconds for a key."""
     if not sys.stdin.isatty():
         yield _no_key
         return
@@ -117,6 +117,6 @@ def _no_key(seconds: float) -> str:
 
 
 def _key(terminal: int, seconds: float) -> str:
-    """Return the key that is pressed within so many seconds; "" for none."""
+    """Return the key that is pressed within so many seconds; "" if none is."""
     ready, _, _ = select.select([terminal], [], [], seconds)
     return os.read(terminal, 1).decode(errors="replace") if ready else ""

@@ -1,1 +1,1 @@
-"""From an assignment to a command line with its environment."""
+"""Launch of assignments: command line, environment and start."""

@@ -1,8 +1,8 @@
-"""Finds the executable of a ROS package, by the files of the ament index.
+"""Lookup of executables of ROS packages in the ament index.
 
-The index is a folder of marker files, so it is read here directly: `ament_index_python` knows only
-this process's AMENT_PREFIX_PATH, while a process may be given one of its own, and the ROS wheels
-set none at all (their packages lie in the prefix of their Python).
+The index is a folder of marker files, which this module reads directly. `ament_index_python` uses
+only the AMENT_PREFIX_PATH of the current process, but an instance may have its own. The ROS wheels
+set none at all (their packages are in the prefix of their Python).
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from rosrm.errors import LaunchError
 from rosrm.wording import get_close_matches, listed
 
 _PACKAGES = "share/ament_index/resource_index/packages"
-#: As many names are listed where none is similar.
+#: Most names that are listed if none is similar.
 _FEW: Final = 8
 
 
 def search_path(environment: Mapping[str, str], python: str) -> list[Path]:
-    """Prefixes to search: AMENT_PREFIX_PATH, then the prefix of this Python."""
+    """Return the prefixes to search: AMENT_PREFIX_PATH, then the prefix of this Python."""
     named = [Path(part) for part in environment.get("AMENT_PREFIX_PATH", "").split(":") if part]
     own = Path(python).absolute().parent.parent  # not resolved: a venv's python is a link
     return named if own in named else [*named, own]
 
 
 def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> Path:
-    """The file PREFIX/lib/PACKAGE/EXECUTABLE.
+    """Return the file PREFIX/lib/PACKAGE/EXECUTABLE.
 
     Raises:
-        LaunchError: naming what was looked for, where, and what is there with a similar name.
+        LaunchError: not found; the message has the searched places and similar names.
     """
     prefix = _find_package(package, prefixes)
     path = prefix / "lib" / package / executable
@@ -68,7 +68,7 @@ def _listed(folder: Path) -> list[str]:
 
 
 def _near(name: str, known: Sequence[str]) -> str:
-    """What the user may have meant; "" where nothing is known."""
+    """Return a hint with similar names or the existing ones; "" if there are no names."""
     if not known:
         return ""
     close = get_close_matches(name, known, n=3, cutoff=0.5)

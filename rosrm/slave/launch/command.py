@@ -1,4 +1,7 @@
-"""From an assignment to an order for the supervisor: command line, environment, parameters."""
+"""Conversion of an assignment into an order for the supervisor.
+
+The order consists of command line, environment and parameters.
+"""
 
 from __future__ import annotations
 
@@ -25,19 +28,20 @@ def launch_order(
     launchers: Launchers,
     heard: float = 0.0,
 ) -> LaunchOrder:
-    """What the supervisor is to start for an assignment; its parameters are written to a file.
+    """Return the supervisor's order for an assignment, and write its parameters to a file.
 
     Args:
-        assignment: what is to run.
-        base_environment: the slave's own, its ROS settings included.
+        assignment: to start.
+        base_environment: environment of the slave, with its ROS settings.
         python: the interpreter for modules.
-        where: it will run.
-        state_directory: of this host's supervisor; the parameters lie beside the instance's log.
+        where: host and cluster of the instance.
+        state_directory: of this host's supervisor; the parameters are beside the instance's log.
         launchers: of this host.
-        heard: when the master last heard this host, monotonic; 0.0: just now.
+        heard: monotonic time of the master's last contact with this host, seconds; 0.0: now.
 
     Raises:
-        LaunchError: what was looked for, and where.
+        LaunchError: the program was not found, with the searched places; or another error of the
+            spec on this host.
     """
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
@@ -55,7 +59,8 @@ def launch_order(
         argv=launch.argv,
         environment=launch.environment,
         working_directory=_working_directory(spec),
-        # One that ended in a move is never started again: the source is there, and may go on.
+        # A destination that ends during a migration is not restarted, because the source still
+        # exists and may continue.
         restart=RestartPolicy("never") if assignment.on_trial else spec.restart,
         stop=spec.stop,
         fence=assignment.fence,
@@ -71,7 +76,7 @@ def _working_directory(spec: ProcessSpec) -> str | None:
 
 
 def _at_home(path: str, where: str) -> str:
-    """Replace a leading `~` by the home of the slave's user on this host."""
+    """Return a path with a leading `~` replaced by the home of the slave's user."""
     if not path.startswith("~"):
         return path
     try:
@@ -81,7 +86,7 @@ def _at_home(path: str, where: str) -> str:
 
 
 def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> tuple[str, ...]:
-    """What comes before the arguments."""
+    """Return the part of the command line before the arguments."""
     if spec.package is not None:
         if spec.executable is None:
             raise LaunchError(f"{spec.name!r} names the package {spec.package!r}, no executable")
@@ -96,7 +101,10 @@ def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> 
 
 
 def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:
-    """Beside the instance's log, to be pruned with it."""
+    """Write the parameters beside the instance's log and return their path; pruned with the log.
+
+    None: there are no parameters.
+    """
     text = parameters_text(assignment.spec.parameters)
     if not text:
         return None

@@ -1,4 +1,4 @@
-"""The environment of a process: the slave's own, without what the ROS wheels' bootstrapper did."""
+"""Environment of a process: the slave's, without the changes of the ROS wheels' bootstrapper."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
 from rosrm.runtime.ros_wheels import without_bootstrapper
 
-#: Set where an instance starts as the destination of a handoff.
+#: Variable that is set if an instance starts as the destination of a handoff.
 SHADOW: Final = "ROSRM_SHADOW"
-#: Where its node keeps its state for the next start, and how far behind it may be, seconds.
+#: Variables with the directory of the node's snapshots, and the seconds by which they may lag.
 KEEP: Final = "ROSRM_KEEP"
 KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
-#: What tells a process who it is. A slave that was itself started by rosrm hands none of it on.
+#: Variables that identify a process. A slave that was itself started by rosrm passes none of them
+#: on.
 _IDENTITY: Final = (
     "ROSRM_PROCESS",
     "ROSRM_INSTANCE",
@@ -35,14 +36,14 @@ _IDENTITY: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Whereabouts:
-    """What a process is told of the cluster that it runs in.
+    """Host and cluster of a process, as passed in its environment.
 
     Attributes:
         host: name of the host in rosrm.
-        cluster: name of the master that gives the orders.
-        state_config: topic on which the master speaks of handoffs.
-        kept: directory of the kept states of all processes; None: none are kept.
-        keep_every: seconds by which a kept state may be behind.
+        cluster: name of the master.
+        state_config: topic on which the master publishes handoffs.
+        kept: directory of the snapshots of all processes; None: no snapshots.
+        keep_every: seconds by which a snapshot may be behind the state.
     """
 
     host: str
@@ -53,7 +54,7 @@ class Whereabouts:
 
 
 def kept_directory(kept: Path, process: str) -> Path:
-    """Where the state of one process is kept."""
+    """Return the directory of the snapshots of one process."""
     return kept / token(process)
 
 
@@ -63,13 +64,13 @@ def process_environment(
     where: Whereabouts,
     not_inherited: Sequence[str] = (),
 ) -> dict[str, str]:
-    """All variables of an instance; what its spec says goes last.
+    """Return all variables of an instance; those of its spec take precedence.
 
     Args:
-        assignment: whose instance it is for.
-        base: the slave's own environment, its ROS settings (ROS_DOMAIN_ID, ...) included.
-        where: it will run.
-        not_inherited: variables that launchers set: those of the slave are its own.
+        assignment: of the instance.
+        base: environment of the slave, with its ROS settings (ROS_DOMAIN_ID, ...).
+        where: host and cluster of the instance.
+        not_inherited: variables that launchers set, so those of the slave do not count.
     """
     spec = assignment.spec
     environment = without_bootstrapper(base)
@@ -81,7 +82,7 @@ def process_environment(
     environment["ROSRM_STATE_CONFIG"] = where.state_config
     environment["ROSRM_MASTER"] = where.cluster
     environment["ROSRM_EPOCH"] = str(assignment.epoch)
-    if spec.ros_node:  # under an alias too it is known by this name
+    if spec.ros_node:  # the name without the alias
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:
         environment[SHADOW] = "1"
@@ -90,6 +91,6 @@ def process_environment(
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
-    if assignment.shadow:  # a move waits until it has found everybody
+    if assignment.shadow:  # a migration waits for the end of its discovery
         environment.update(announcements(environment, "steady", udp=False))
     return environment

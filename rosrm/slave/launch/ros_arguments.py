@@ -1,4 +1,4 @@
-"""The arguments that make a program a certain ROS node, and the file with its parameters. Pure."""
+"""Command line arguments and parameters file of a ROS node; pure functions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosrm.model.values import ProcessSpec
 
 _BEGIN: Final = "--ros-args"
 _END: Final = "--"
-#: Characters that YAML wants escaped and JSON leaves as they are.
+#: Escapes of characters that YAML requires escaped and JSON does not escape.
 _UNPRINTABLE: Final = {
     code: f"\\u{code:04x}" for code in (*range(0x7F, 0xA0), 0x2028, 0x2029, 0xFEFF, 0xFFFE, 0xFFFF)
 }
@@ -20,7 +20,7 @@ _LARGEST: Final = 2**63
 
 
 def ros_arguments(spec: ProcessSpec, node_name: str, parameters_file: str | None) -> list[str]:
-    """Name, namespace, remappings and parameters; they go behind the user's arguments."""
+    """Return name, namespace, remappings and parameters, to append to the user's arguments."""
     arguments = [_BEGIN, "-r", f"__node:={node_name}"]
     if spec.namespace:
         namespace = spec.namespace if spec.namespace.startswith("/") else f"/{spec.namespace}"
@@ -33,7 +33,7 @@ def ros_arguments(spec: ProcessSpec, node_name: str, parameters_file: str | None
 
 
 def join_arguments(arguments: Sequence[str], ros: Sequence[str]) -> list[str]:
-    """The user's arguments, then ours; ROS arguments that the user left open are closed first."""
+    """Return the user's arguments and then ours; close ROS arguments that are still open."""
     is_open = False
     for argument in arguments:
         if argument == _BEGIN:
@@ -44,12 +44,12 @@ def join_arguments(arguments: Sequence[str], ros: Sequence[str]) -> list[str]:
 
 
 def parameters_text(parameters: Mapping[str, Any]) -> str:
-    """A parameters file (YAML) that holds for the one node of the process, whatever its name.
+    """Return a parameters file (YAML) for the only node of the process, with any name.
 
-    "" where there is no value at all, which ROS 2 takes for an error.
+    Without values the result is "", because ROS 2 rejects an empty file.
 
     Raises:
-        LaunchError: a value that no ROS parameter can hold.
+        LaunchError: a ROS parameter cannot hold a value.
     """
     lines = _mapping(parameters, "", 2)
     return "\n".join(['"/**":', "  ros__parameters:", *lines, ""]) if lines else ""
@@ -71,7 +71,7 @@ def _mapping(parameters: Mapping[str, Any], path: str, depth: int) -> list[str]:
 
 
 def _sequence(values: Sequence[Any], path: str) -> str:
-    """A ROS array has one type: whole numbers among fractions become fractions."""
+    """Return a ROS array of one type; integers among floats become floats."""
     if not values:
         raise LaunchError(
             f"the parameter {path!r} is an empty list: a parameters file of ROS 2 cannot say of "
@@ -114,5 +114,5 @@ def _fraction(value: float) -> str:
 
 
 def _text(value: str) -> str:
-    """A text in double quotes: never taken for a number or a bool."""
+    """Return a text in double quotes, so that YAML reads no number or bool."""
     return json.dumps(value, ensure_ascii=False).translate(_UNPRINTABLE)

@@ -1,4 +1,4 @@
-"""Starts what a slave has taken on: its kept state comes first, then it, then its node."""
+"""Start of accepted assignments: fetch the snapshot, start the process, await its node."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from rosrm.wording import one_line
 
 @dataclass
 class Starter:
-    """From assignments to orders for the supervisor.
+    """Conversion of assignments into orders for the supervisor, after their snapshots arrived.
 
     Attributes:
         config: of the host.
-        kept: directory of the kept states.
-        state: what the slave holds; it is only looked at here.
-        supervisor: carries the orders out.
-        endpoint: tells the master.
-        keeping: has the kept states.
-        graph: where nodes are seen.
-        sessions: which processes an instance has.
+        kept: directory of the snapshots.
+        state: instances of the slave; read-only here.
+        supervisor: executes the orders.
+        endpoint: reports to the master.
+        keeping: fetches snapshots.
+        graph: shows the nodes of the ROS graph.
+        sessions: process tree of each instance.
         launchers: of this host.
-        take: is told what has happened.
-        say: tells the user.
+        take: takes events for the core.
+        say: logs a message for the user.
     """
 
     config: HostConfig
@@ -62,14 +62,14 @@ class Starter:
         self._environment = {**os.environ, **self.config.ros.environment()}
 
     def launch(self, assignments: Sequence[Assignment]) -> None:
-        """Start them, each as soon as its kept state is here."""
-        # Of several events at once the last may have been that its supervisor is gone.
+        """Start assignments, each as soon as its snapshot is on this host."""
+        # A later event of the same batch may have removed an instance, as its supervisor is gone.
         wanted = [one for one in assignments if one.instance in self.state.held]
         ready = [one for one in wanted if self.keeping.prepare(one, self._prepared)]
         if ready:
             self._start(ready)
-        # A state may take its time to come. Until it runs nobody else says so, and the master would
-        # take it back.
+        # Fetching a snapshot may take long, and the supervisor reports nothing before the start.
+        # Without this report the master would withdraw the assignment.
         waiting = [
             self.state.held[one.instance].status
             for one in wanted if one not in ready and one.kept_on
@@ -78,27 +78,34 @@ class Starter:
             self.endpoint.publish_statuses(waiting, complete=False)
 
     def call_off(self, command: core.Command) -> bool:
-        """Do not begin what still waits for its state; False: that is not what is to be done."""
+        """Apply a command to an instance that still waits for its snapshot.
+
+        Stop and fence cancel the start; a restart has no effect, because the start follows anyway.
+
+        Returns:
+            False if the command is another one, or the instance does not wait; then the supervisor
+            has to execute the command.
+        """
         if not isinstance(command, core.Stop | core.Fence | core.Restart):
             return False
         if not self.keeping.is_preparing(command.instance):
             return False
-        if not isinstance(command, core.Restart):  # what that wants comes with the start
+        if not isinstance(command, core.Restart):  # a restart needs nothing: the start follows
             self.keeping.forget(command.instance)
             refusal = "it was stopped before it was started"
             self.take(core.LaunchRefused(command.instance, refusal))
         return True
 
     def close(self) -> None:
-        """Nothing more is started."""
+        """Start no further instances."""
         self._closed = True
 
     def has_begun(self, instance: InstanceId) -> bool:
-        """Return True if the supervisor has the instance, or had it."""
+        """Return True if the supervisor has or had the instance."""
         return instance not in self.state.waiting and not self.keeping.is_preparing(instance)
 
     def look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
-        """See whether nodes that were started have come up."""
+        """Report the awaited nodes that are in the ROS graph now."""
         for instance, held in awaited.items():
             before = self._graph_before.get(instance, frozenset())
             pids = self.sessions.known_as(held.status.pid)
@@ -106,7 +113,7 @@ class Starter:
                 self.take(core.SeenInGraph(instance))
 
     def ended(self, instance: InstanceId) -> None:
-        """It is awaited no more."""
+        """Stop awaiting the node of an instance."""
         self._graph_before.pop(instance, None)
 
     def _prepared(self, assignment: Assignment) -> None:

@@ -1,4 +1,4 @@
-"""Fetches the kept state of a process from where it lies, before an instance of it starts here."""
+"""Fetch of a process's snapshot from another host, before an instance starts on this host."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from rosrm.model.values import Assignment
 from rosrm.ros.slave.replication import KeptEndpoint
 from rosrm.snapshots import Head, Part
 
-#: Seconds in which a slave must be found, or answer; then the next host is asked.
+#: Seconds for the discovery of a slave, or its answer; then the next host is asked.
 PATIENCE: Final = 3.0
-#: Seconds after which a process starts from what is here by then, whatever is still on its way.
+#: Seconds after which a process starts from the newest local snapshot, even if a fetch is running.
 LONGEST: Final = 60.0
 
 
 class Fetch:
-    """One state on its way to here.
+    """Transfer of one snapshot to this host.
 
     Args:
-        assignment: that waits for it.
-        hosts: that keep a state, the newest first.
-        endpoint: speaks with their slaves.
-        here: the newest state that is here already; None: there is none.
+        assignment: that waits for the snapshot.
+        hosts: that hold a replica, the newest first.
+        endpoint: sends requests to their slaves.
+        here: the newest snapshot on this host; None: there is none.
         take: writes a part, and calls back with a code and a message.
-        ended: called once, with a word for the user.
+        ended: called once, with a message for the user.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Fetch:
         self._deadline, self._host_by = now + LONGEST, now + PATIENCE
 
     def go_on(self, now: float) -> None:
-        """Ask for the next part, or give up who does not answer."""
+        """Ask for the next part, or try the next host if this one does not answer."""
         if self._over:
             return
         if now >= self._deadline:

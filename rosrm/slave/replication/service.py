@@ -1,7 +1,7 @@
-"""Kept states of this host: reported to the master, shipped to other hosts, fetched for a start.
+"""Snapshots on this host: reported to the master, sent to other hosts, fetched for a start.
 
-The loop calls it; what touches files runs in a thread of its own, and what comes of it is given
-back to the loop. So a slow disk, or a state of many megabytes, keeps no beat from going out.
+The slave's loop calls this module. File operations run in a thread of their own, which returns
+their results to the loop. So a slow disk, or a snapshot of many megabytes, delays no beat.
 """
 
 from __future__ import annotations
@@ -23,30 +23,31 @@ from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import KeptStore
 from rosrm.snapshots import Head, Part
 
-#: Seconds between two looks at what is kept here.
+#: Seconds between two scans of the snapshots on this host.
 _SCAN_EVERY: Final = 1.0
-#: Seconds after which the master is told again, though nothing has changed.
+#: Seconds after which the report to the master is repeated without a change.
 _SAY_EVERY: Final = 10.0
-#: Seconds for one part to be taken. A slave that was just found may not be able to answer yet.
+#: Seconds for the acknowledgement of one part. A slave that was just discovered may not be able to
+#: answer yet.
 _PART_TIMEOUT: Final = 1.0
-#: Seconds after which a host that refuses a state is tried again.
+#: Seconds after which a transfer to a host that refused a snapshot is retried.
 _AGAIN: Final = 3.0
-#: Why a part was not taken, where nothing but the wire is to blame.
+#: Codes of failures of the network alone.
 _LOST_WORDS: Final = frozenset({"timeout", "order"})
 
 
-#: What is answered where a part could not be taken for a reason that nobody thought of.
+#: Answer for a part that could not be written because of an unexpected error.
 _FAILED: Final = ("full", "the slave failed to store it; its log has the reason")
 
 
 @dataclass(slots=True)
 class _Shipment:
-    """Where the state of an instance goes.
+    """Replication of an instance's snapshots to other hosts.
 
     Attributes:
-        sent: newest state that a host has taken.
-        due: when a host gets the next one.
-        said: why a host did not take the last one.
+        sent: age of the newest snapshot that each host accepted.
+        due: monotonic time of the next transfer to each host, seconds.
+        said: code with which each host refused the last snapshot.
     """
 
     instance: InstanceId
@@ -59,11 +60,11 @@ class _Shipment:
 
 @dataclass(slots=True)
 class _Transfer:
-    """One state on its way to one host.
+    """Transfer of one snapshot to one host.
 
     Attributes:
-        content: None until it was read.
-        waits: the answer to a part is awaited.
+        content: of the snapshot; b"" until it was read.
+        waits: True while the snapshot is being read, or an answer to a part is awaited.
     """
 
     shipment: _Shipment
@@ -76,16 +77,16 @@ class _Transfer:
 
 
 class Keeping:
-    """The kept states of one host.
+    """Snapshots and replicas of one host.
 
     Args:
-        root: directory of all of them.
+        root: directory of all snapshots.
         host: name of this host.
-        settings: bounds.
-        endpoint: speaks with other slaves.
-        post: has something called in the loop; may be called from any thread.
-        say: tells the user.
-        publish: tells the master what is kept here; False: there is none.
+        settings: limits.
+        endpoint: exchanges messages with other slaves.
+        post: schedules a call in the loop; may be called from any thread.
+        say: logs a message for the user.
+        publish: reports the snapshots to the master; returns False if there is no master.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class Keeping:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._shipments: dict[str, _Shipment] = {}
         self._transfers: dict[str, _Transfer] = {}
-        #: Instances that wait for a state; None: it is being looked for here.
+        #: Instances that wait for a snapshot; None: the local search is running.
         self._preparing: dict[InstanceId, Fetch | None] = {}
         self._kept = self._store.scan()
         self._told: tuple[KeptState, ...] | None = None
@@ -121,12 +122,12 @@ class Keeping:
     def _in_thread(
         self, work: Callable[[], Any], then: Callable[[Any], None], otherwise: Any = None
     ) -> None:
-        """Have something done by the thread.
+        """Run a call in the thread.
 
         Args:
-            work: done there.
-            then: called in the loop with what it returned.
-            otherwise: what `then` is called with if the work raised; that is said.
+            work: called in the thread.
+            then: called in the loop with the result.
+            otherwise: result if `work` raised; the exception is logged.
         """
 
         def job() -> None:
@@ -139,10 +140,10 @@ class Keeping:
 
         self._jobs.put(job)
 
-    # --- the master's word ---------------------------------------------------------------
+    # --- requests of the master ----------------------------------------------------------
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
-        """Ship the state of an instance to these hosts from now on."""
+        """Replicate the snapshots of an instance to these hosts from now on."""
         wanted = tuple(name for name in hosts if name != self._host)
         known = self._shipments.get(instance.process)
         if known is not None and known.instance.number > instance.number:
@@ -153,7 +154,7 @@ class Keeping:
         self._shipments[instance.process] = new
 
     def drop(self, instance: InstanceId, *, lives: bool) -> None:
-        """Delete the states of instances up to this one, unless one of them lives here."""
+        """Delete the snapshots of instances up to this one, unless one of them runs here."""
         if lives:
             return
         known = self._shipments.get(instance.process)
@@ -164,14 +165,14 @@ class Keeping:
         self._next_scan = 0.0
 
     def say_again(self) -> None:
-        """A master has taken this host in: it knows nothing yet."""
+        """Report all snapshots to a master that has just registered this host."""
         self._told = None
         self._tell(time.monotonic())
 
     # --- the loop ------------------------------------------------------------------------
 
     def tick(self, now: float) -> None:
-        """Do what is due; called some times a second."""
+        """Continue all work that is due; called several times a second."""
         self._endpoint.expire(now)
         rate = float(self._settings.max_rate)
         self._budget = min(rate, self._budget + rate * (now - self._budget_at))
@@ -189,7 +190,7 @@ class Keeping:
                 fetch.go_on(now)
 
     def states(self) -> tuple[KeptState, ...]:
-        """What is kept here, as of the newest look."""
+        """Return the snapshots on this host, as of the last scan."""
         return self._kept
 
     def _scanned(self, states: tuple[KeptState, ...] | None) -> None:
@@ -210,7 +211,7 @@ class Keeping:
         process = shipment.instance.process
         if process in self._transfers:
             return
-        # Who has waited longest goes first: one that does not answer holds up nobody.
+        # The host that waits longest comes first, so a host without an answer delays no other.
         for host in sorted(shipment.hosts, key=lambda name: shipment.due.get(name, 0.0)):
             if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_keeper(host, now):
                 shipment.due[host] = now + shipment.every
@@ -223,7 +224,7 @@ class Keeping:
     def _begin(self, transfer: _Transfer, found: tuple[Head, bytes, int] | None) -> None:
         shipment = transfer.shipment
         if found is not None and found[0].instance > shipment.instance.number:
-            # Its successor runs elsewhere, and what came here came from there.
+            # A successor runs elsewhere, and this newer snapshot is a replica from its host.
             self._shipments.pop(shipment.instance.process, None)
             found = None
         if found is None:
@@ -234,7 +235,7 @@ class Keeping:
         self._go_on(transfer, time.monotonic())
 
     def _go_on(self, transfer: _Transfer, now: float) -> None:
-        """Give the next part, as soon as the bounds of this host's network allow it."""
+        """Send the next part, as soon as the limit of the sending rate allows it."""
         head = transfer.head
         if transfer.waits or head is None or self._budget <= 0.0:
             return
@@ -267,8 +268,8 @@ class Keeping:
     def _not_taken(
         self, shipment: _Shipment, host: str, head: Head, now: float, code: str, message: str
     ) -> None:
-        """Give it again, at once where only a word was lost."""
-        if code == "newer":  # the answer to the last part was lost, perhaps
+        """Schedule another transfer, at once if only a message was lost."""
+        if code == "newer":  # the acknowledgement of the last part may be lost
             shipment.sent[host] = head.age
             return
         if code in _LOST_WORDS:
@@ -287,11 +288,11 @@ class Keeping:
     # --- from other hosts ----------------------------------------------------------------
 
     def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
-        """A part of a state came from another host."""
+        """Store a part of a snapshot from another host."""
 
         def taken(outcome: tuple[str, str]) -> None:
             if part.is_last and not outcome[0]:
-                self._next_scan = 0.0  # the master may need it in the next moment
+                self._next_scan = 0.0  # the master may need the new replica at once
             answer(*outcome)
 
         self._in_thread(partial(self._store.take, part, bounded=True), taken, _FAILED)
@@ -300,18 +301,18 @@ class Keeping:
         self, process: str, age: tuple[int, int], offset: int, size: int,
         answer: Callable[[Part | None], None],
     ) -> None:  # fmt: skip
-        """Another host wants a part of a state."""
+        """Answer another host's request for a part of a snapshot."""
         read = partial(self._store.read, process, age, offset, size, time.monotonic())
         self._in_thread(read, answer)
 
     # --- for a start ---------------------------------------------------------------------
 
     def prepare(self, assignment: Assignment, done: Callable[[Assignment], None]) -> bool:
-        """See to it that the newest state is here before an instance starts.
+        """Fetch the newest snapshot before an instance starts.
 
         Returns:
-            True: it may start now; else `done` is called when the state is here, or does not come
-            in time.
+            True if the instance may start now. Otherwise `done` is called when the snapshot has
+            arrived, or does not arrive in time.
         """
         if not assignment.has_snapshots:
             return True
@@ -323,8 +324,8 @@ class Keeping:
         return False
 
     def _look_for(self, assignment: Assignment) -> Head | None:
-        """Runs in the thread: the newest state that is here and of use."""
-        self._store.make()  # its node makes its own directory below it
+        """Return the newest usable local snapshot, in the thread; delete unusable older ones."""
+        self._store.make()  # the node creates its own directory below
         directory = self._store.directory(assignment.spec.name)
         if not assignment.shadow and any(
             head.instance < assignment.kept_from for _, head in snapshots.files(directory)
@@ -335,7 +336,7 @@ class Keeping:
     def _looked(
         self, assignment: Assignment, here: Head | None, done: Callable[[Assignment], None]
     ) -> None:
-        """Fetch what another host has newer, if anything."""
+        """Fetch a newer snapshot from another host, if there is one."""
         instance, hosts = assignment.instance, assignment.kept_on
         if instance not in self._preparing:
             return
@@ -359,11 +360,11 @@ class Keeping:
         self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)
 
     def is_preparing(self, instance: InstanceId) -> bool:
-        """Its start waits for a state."""
+        """Return True if the start of an instance waits for a snapshot."""
         return instance in self._preparing
 
     def forget(self, instance: InstanceId) -> bool:
-        """It is not to start any more; False: nothing was prepared for it."""
+        """Cancel the preparation of an instance's start; return False if there is none."""
         if instance not in self._preparing:
             return False
         del self._preparing[instance]

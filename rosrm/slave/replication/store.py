@@ -1,4 +1,4 @@
-"""The kept states of a host, on its disk. What reads and writes files runs in one thread."""
+"""Snapshots and replicas on the disk of a host; one thread reads and writes the files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosrm.model.values import InstanceId, KeptState
 from rosrm.ros.names import token
 from rosrm.snapshots import Part
 
-#: Seconds for which a state that is being read stays in memory.
+#: Seconds for which a snapshot stays in memory between reads of its parts.
 _READ_FOR: Final = 10.0
 
 
@@ -34,11 +34,11 @@ class _BeingRead:
 
 
 class KeptStore:
-    """Files of all processes below one directory.
+    """Snapshot files of all processes below one directory.
 
     Args:
-        root: it is made when the first state is kept.
-        max_bytes: of states of other hosts' processes, all together.
+        root: the directory, created with the first snapshot.
+        max_bytes: most bytes of all replicas of other hosts' processes.
     """
 
     def __init__(self, root: Path, max_bytes: int) -> None:
@@ -48,20 +48,23 @@ class KeptStore:
         self._being_read: dict[str, _BeingRead] = {}
 
     def directory(self, process: str) -> Path:
-        """Where the state of a process is kept."""
+        """Return the directory of the snapshots of a process."""
         return self._root / token(process)
 
     def make(self) -> None:
-        """Make the directory of all states, for the owner alone; that it fails is said later."""
+        """Create the directory of all snapshots for the owner alone; ignore a failure.
+
+        Later writes report the failure.
+        """
         with contextlib.suppress(OSError):
             self._root.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def is_used(self) -> bool:
-        """Whether anything was ever kept here."""
+        """Return True if this host ever stored a snapshot."""
         return self._root.exists()
 
     def scan(self) -> tuple[KeptState, ...]:
-        """The newest state of each process."""
+        """Return the newest snapshot of each process."""
         try:
             directories = sorted(path for path in self._root.iterdir() if path.is_dir())
         except OSError:
@@ -75,7 +78,7 @@ class KeptStore:
     def newer_than(
         self, process: str, age: tuple[int, int]
     ) -> tuple[snapshots.Head, bytes, int] | None:
-        """The newest whole state with its CRC-32; None: there is none that is newer."""
+        """Return the newest complete snapshot with its CRC-32; None if none is newer than `age`."""
         head = snapshots.newest_head(self.directory(process))
         if head is None or head.age <= age:
             return None
@@ -85,19 +88,20 @@ class KeptStore:
         return (*found, zlib.crc32(found[1]))
 
     def drop(self, process: str, up_to: int) -> None:
-        """Delete the states of instances up to a number."""
+        """Delete the snapshots of instances up to a number."""
         snapshots.drop(self.directory(process), up_to)
 
-    # --- what comes ----------------------------------------------------------------------
+    # --- incoming snapshots --------------------------------------------------------------
 
     def take(self, part: Part, *, bounded: bool) -> tuple[str, str]:
-        """Take a part of a state; with the last one it is kept.
+        """Write a part of a snapshot; the last part completes the replica.
 
         Args:
-            bounded: it is of another host's process, for which there is so much room and no more.
+            part: of the snapshot.
+            bounded: True for a process of another host, whose replicas are limited by `max_bytes`.
 
         Returns:
-            Why it was not taken: a code and a message; ("", ""): it was.
+            Code and message of a refusal; ("", ""): the part was written.
         """
         if part.offset == 0:
             refusal = self._begin(part, bounded=bounded)
@@ -137,7 +141,7 @@ class KeptStore:
         return "", ""
 
     def _has_room(self, part: Part) -> bool:
-        """Whether it fits beside the copies of other processes, and those that are coming."""
+        """Return True if a snapshot fits beside other replicas and running transfers."""
         own = self.directory(part.process)
         used = sum(one.total for one in self._coming.values())
         with contextlib.suppress(OSError):
@@ -162,15 +166,19 @@ class KeptStore:
         if coming is not None:
             coming.writer.abandon()
 
-    # --- what is read --------------------------------------------------------------------
+    # --- outgoing snapshots --------------------------------------------------------------
 
     def read(
         self, process: str, age: tuple[int, int], offset: int, size: int, now: float
     ) -> Part | None:
-        """A part of a state; None: it is not here (any more).
+        """Return a part of a snapshot; None: this host does not hold the snapshot (any more).
 
         Args:
-            age: of the state that is being read; (0, 0): the newest.
+            process: name of the process.
+            age: of the requested snapshot; (0, 0): the newest.
+            offset: of the part, bytes.
+            size: of the part, bytes.
+            now: monotonic seconds.
         """
         for name in [name for name, one in self._being_read.items() if now >= one.until]:
             del self._being_read[name]
