@@ -22,7 +22,8 @@ COUNTER = """
 import os, sys, rclpy
 from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Int64, String
-from rosrm.node import Node, source
+from rosrm.node import Node
+from rosrm.node.handoff import source
 
 class Counter(Node):
     def __init__(self):
