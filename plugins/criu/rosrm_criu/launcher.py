@@ -26,7 +26,7 @@ _RESTORE: Final = 600.0
 
 
 class CriuLauncher:
-    """Implements the contract of a launcher and all optional ones."""
+    """Implementation of the launcher contract and of all its optional parts."""
 
     def __init__(self, context: LauncherContext) -> None:
         self._state, self._python, self._slave = context.state, context.python, context.slave
@@ -76,15 +76,15 @@ class CriuLauncher:
         slots.begin_anew(paths.periodic(self._state, instance.number))
 
     def leads(self, leader: int) -> bool | None:
-        """Return True if it holds a restored process."""
+        """Return True if the leader is a shim; None: not yet, but it may become one."""
         return process_tree.leads(leader)
 
     def members(self, leader: int) -> Sequence[int]:
-        """Return the holding program and all that descends from it."""
+        """Return the shim and all its descendants."""
         return process_tree.tree(leader)
 
     def root(self, leader: int) -> int:
-        """Return the restored process; while it is being restored, CRIU."""
+        """Return the restored process; while the restore runs, CRIU."""
         return process_tree.root_of(leader)
 
     def has_departed(self, leader: int) -> bool:

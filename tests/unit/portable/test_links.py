@@ -117,7 +117,7 @@ def test_a_directory_is_removed_through_no_link(tmp_path, directory, precious) -
 
 
 def test_a_node_makes_its_directory_as_carefully(tmp_path, precious) -> None:
-    """A listener refuses a directory that all can write to, or a link: a writer can move it."""
+    """A listener refuses a link, and a directory in which others could make its node leave."""
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
     with pytest.raises(PortableError, match="open to all"):

@@ -88,7 +88,7 @@ def _go_or_make(way: contextlib.ExitStack, name: str, above: int, owner: int) ->
 
 
 def _check(path: Path, descriptor: int, owner: int) -> None:
-    """Raise `PortableError` unless only owner and root can write; a writer can move the node."""
+    """Raise `PortableError` unless only owner and root can write: writers can make a node leave."""
     state = os.fstat(descriptor)
     open_to_all = state.st_mode & stat.S_IWOTH and not state.st_mode & stat.S_ISVTX
     if state.st_uid not in {0, owner, os.geteuid()} or open_to_all:

@@ -180,7 +180,7 @@ def write(directory: Path, manifest: Manifest) -> None:
 
 
 def read(directory: Path) -> Manifest:
-    """Return the manifest of an image, after a check that all files exist in their sizes.
+    """Return the manifest of an image, after a check that all files exist with their sizes.
 
     Raises:
         CriuError: it is no image, is incomplete or damaged, or has another format.

@@ -1,6 +1,6 @@
 """Restore of an image on this host: a check of its requirements, then CRIU.
 
-This module runs only in the shim (`shim`).
+This module runs only in the shim (`rosrm_criu.engine.shim`).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _check_file(file: HeldFile | MappedFile, here: str, holds: str) -> None:
 
 
 def prepare(directory: Path, manifest: Manifest) -> None:
-    """Put back the files that follow the process; create append-only files and LTTng's files.
+    """Put back the files that follow the process; create missing append-only and LTTng files.
 
     The checksums of the whole image are compared before the first change. Otherwise a damaged file
     could replace an intact one, and CRIU would restore damaged memory without an error.

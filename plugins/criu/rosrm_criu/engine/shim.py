@@ -153,7 +153,7 @@ class _Restore:
         return pid
 
     def tell(self, pid: int, *, namespace: bool) -> None:
-        """Report success; write the result first, durably visible to all, then remove the image."""
+        """Report success: first write the result, for all later readers; then remove the image."""
         seconds = round(time.monotonic() - self.began, 3)
         told = Outcome(pid=pid, inner_pid=self.manifest.pid, namespace=namespace, seconds=seconds)
         try:
@@ -188,7 +188,7 @@ def _fail(directory: Path, reason: str) -> NoReturn:
 
 
 def _hold_namespace(task: _Restore) -> NoReturn:
-    """Fork the init of the new pid namespace, and hold it from outside."""
+    """Fork the init of the new pid namespace, and represent it to the supervisor."""
     living, end_of_life = os.pipe()
     hearing, saying = os.pipe()
     init = os.fork()
