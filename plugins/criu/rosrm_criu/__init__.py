@@ -1,1 +1,1 @@
-"""CRIU for rosrm: a process moves with its whole memory, and is restored from images of it."""
+"""CRIU plugin of rosrm: moves processes with their whole memory, and restores them from images."""

@@ -1,6 +1,6 @@
-"""`rosrm criu`: the program that dumps and restores processes, for the strategy `criu`."""
+"""`rosrm criu`: installation and check of CRIU, which the strategy `criu` uses."""
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""CRIU's launcher: starts portable nodes, and what is restored from an image.
+"""CRIU's launcher: starts portable nodes, and restores processes from images.
 
-A portable node is told in which directory it is asked to leave the ROS graph. What has an image, or
-will have one, is started by a program that restores the process and stays its parent.
+A portable node gets the path of its control directory. A process with a present or future image is
+started by a program that restores it and stays its parent.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from rosrm_criu.engine import paths, process_tree, restart_from_image, restore_r
 from rosrm_criu.engine.binary import find
 from rosrm_criu.options import NAME, CriuOptions, OwnCriuOptions
 
-#: Seconds for a restore, at most: the master gives up sooner.
+#: Most seconds for a restore; the master gives up sooner.
 _RESTORE: Final = 600.0
 
 
 class CriuLauncher:
-    """Implements the contract of a launcher and all optional ones."""
+    """Implementation of the launcher contract and of all its optional parts."""
 
     def __init__(self, context: LauncherContext) -> None:
         self._state, self._python, self._slave = context.state, context.python, context.slave
@@ -40,11 +40,11 @@ class CriuLauncher:
             return None
         environment, argv = dict(launch.environment), launch.argv
         if portable and VARIABLE not in spec.environment:
-            # Of another cluster of the same name, which may share that directory, it differs.
+            # The token differs for another cluster of the same name that shares this directory.
             own = token(f"{instance} {launch.cluster} {self._slave:x}")
             environment[VARIABLE] = str(control_root(os.geteuid()) / own)
         again_from_image = _is_periodic(spec)
-        if again_from_image:  # else the program that restores it would start, and then fail
+        if again_from_image:  # otherwise the restoring program would start, and fail only later
             _check_program(argv[0], environment)
         if again_from_image or restored:
             criu = self._criu(instance, restored)
@@ -76,15 +76,15 @@ class CriuLauncher:
         slots.begin_anew(paths.periodic(self._state, instance.number))
 
     def leads(self, leader: int) -> bool | None:
-        """Return True if it holds a restored process."""
+        """Return True if the leader is a shim; None: not yet, but it may become one."""
         return process_tree.leads(leader)
 
     def members(self, leader: int) -> Sequence[int]:
-        """Return the holding program and all that descends from it."""
+        """Return the shim and all its descendants."""
         return process_tree.tree(leader)
 
     def root(self, leader: int) -> int:
-        """Return the restored process; while it is being restored, CRIU."""
+        """Return the restored process; while the restore runs, CRIU."""
         return process_tree.root_of(leader)
 
     def has_departed(self, leader: int) -> bool:
@@ -92,7 +92,7 @@ class CriuLauncher:
         try:
             control = directory_of(process_tree.root_of(leader))
             status = None if control is None else status_of(control)
-        except (OSError, PortableError):  # it has ended, or cannot be read: judge it as any other
+        except (OSError, PortableError):  # it has ended, or cannot be read: treat it like any other
             return False
         return status is not None and status.state in (State.LEAVING, State.LEFT, State.JOINING)
 

@@ -1,4 +1,4 @@
-"""Options of `criu`, and what the strategy can do with them."""
+"""Options of `criu`, and the capabilities that follow from them."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ NAME: Final = "criu"
 
 @dataclass(frozen=True)
 class CriuOptions:
-    """What can be set, for all processes or for one.
+    """Options for all processes or for one process.
 
     Attributes:
-        start_timeout: seconds within which a slave must take an order or start what it needs, and
-            the destination start.
-        leave_timeout: seconds within which the node must have left the ROS graph: a callback of its
-            author is finished first.
-        dump_timeout: seconds for dumping its memory.
-        transfer_timeout: seconds for the image to get to the destination.
-        restore_timeout: seconds for restoring it there.
-        join_timeout: seconds within which the node must have joined the ROS graph again.
-        max_rate: bytes a second that the image may take of the network; 0: all that there is. The
-            default leaves something of a gigabit to others.
-        reserve: bytes that stay free where the image goes to.
+        start_timeout: seconds for a slave to accept a command or start a helper process, and for
+            the destination to start.
+        leave_timeout: seconds for the node to leave the ROS graph; a running callback of its
+            author ends first.
+        dump_timeout: seconds for the dump of its memory.
+        transfer_timeout: seconds for the transfer of the image to the destination.
+        restore_timeout: seconds for the restore there.
+        join_timeout: seconds for the node to rejoin the ROS graph.
+        max_rate: most bytes per second on the network for the image; 0: no bound. The default
+            leaves part of a gigabit to others.
+        reserve: bytes that must stay free on the image's file system at the destination.
     """
 
     start_timeout: PositiveSeconds = 10.0
@@ -40,7 +40,7 @@ class CriuOptions:
     reserve: Bytes = 256 << 20
 
     def __post_init__(self) -> None:
-        """Refuse a rate that is none."""
+        """Raise `ValueError` for a negative rate or reserve."""
         if self.max_rate < 0:
             raise ValueError(f"max_rate is {self.max_rate} bytes/s; allowed: 0 (no bound) or more")
         if self.reserve < 0:
@@ -49,17 +49,17 @@ class CriuOptions:
 
 @dataclass(frozen=True)
 class OwnCriuOptions(CriuOptions):
-    """What can be set for one process.
+    """Options for one process.
 
     Attributes:
-        checkpoint_every: seconds from one periodic checkpoint to the next; 0: none. Not for all
-            processes at once: each stands still for it.
+        checkpoint_every: seconds from one periodic checkpoint to the next; 0: none. There is no
+            such option for all processes, because each checkpoint freezes its process.
     """
 
     checkpoint_every: Seconds = 0.0
 
     def __post_init__(self) -> None:
-        """As those of all processes, and a pace that is one."""
+        """Raise `ValueError` for an invalid option of all processes or an invalid period."""
         super().__post_init__()
         if not 0.0 <= self.checkpoint_every < inf:
             raise ValueError(
@@ -68,6 +68,6 @@ class OwnCriuOptions(CriuOptions):
 
 
 def capabilities(options: OwnCriuOptions) -> Capabilities:
-    """Return what the strategy can do for a process with these options."""
+    """Return the strategy's capabilities for a process with these options."""
     periodic = options.checkpoint_every > 0.0
     return Capabilities(state="memory", restart_from_image=periodic, launcher=NAME)

@@ -1,9 +1,9 @@
-"""The plans of checkpoints and restores, and what all plans of `criu` are made of.
+"""Plans of checkpoints and restores, and common steps of all plans of `criu`.
 
-A checkpoint stays on its host, and the process keeps its DDS participant: its address and ports are
-the same. A periodic one is of a portable node that goes on. Its part in the ROS graph is made anew
-after each, so an image may be used while the process that it is of has been heard since: its peers
-take what it says for a new node's.
+A checkpoint stays on its host, and the process keeps its DDS participant, so its address and ports
+stay the same. A periodic checkpoint is one of a portable node that continues to run. The node
+rejoins the ROS graph as a new participant after each. So its image can be used even if the process
+has published since: peers treat the restored node's messages as those of a new node.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rosrm import (
 if TYPE_CHECKING:
     from rosrm_criu.options import CriuOptions
 
-#: Executors of a move; `executors/move.py` has them.
+#: Executors of a migration; see `executors/move.py`.
 ABILITY: Final = "criu_ability"
 INTRODUCE: Final = "criu_introduce"
 CHECKPOINT: Final = "criu_checkpoint"
@@ -36,7 +36,7 @@ FETCH: Final = "criu_fetch"
 AWAIT_RESTORED: Final = "criu_await_restored"
 JOIN: Final = "criu_join"
 END: Final = "criu_end"
-#: Executors of a checkpoint and of its restore; `executors/checkpoint.py` has them.
+#: Executors of a checkpoint and its restore; see `executors/checkpoint.py`.
 KEEP: Final = "criu_keep"
 RUN_ON: Final = "criu_run_on"
 KILL: Final = "criu_kill"
@@ -44,27 +44,27 @@ TAKE: Final = "criu_take"
 PUT_BACK: Final = "criu_put_back"
 AWAIT_KEPT: Final = "criu_await_kept"
 DROP: Final = "criu_drop"
-#: Executors of periodic checkpoints; `executors/periodic.py` has them.
+#: Executors of periodic checkpoints; see `executors/periodic.py`.
 DUMP: Final = "criu_dump"
 SWEEP: Final = "criu_sweep"
 
-#: Seconds that the master waits longer than an executor, which knows what it waited for.
+#: Seconds that the master waits longer than an executor, whose own error names the cause.
 LONGER: Final = 5.0
 
 
 def execute(
     move: Move, host: str, name: str, timeout: float, undo: Step | None = None, **arguments: Any
 ) -> Execute:
-    """A step by an executor of `criu`.
+    """Return a step by an executor of `criu`.
 
     Args:
-        move: that it is of. An attempt is known by its instances and its time: a master without
-            its former journal gives the same numbers once more.
-        host: where it is done.
+        move: the step's migration. Its attempt is identified by instances and time, because a
+            master without its former journal assigns the same numbers again.
+        host: where the step runs.
         name: of the executor.
-        timeout: seconds that it has.
-        undo: the way back.
-        arguments: beside those that each executor gets.
+        timeout: seconds for the executor.
+        undo: the step that undoes this one.
+        arguments: passed in addition to the common ones.
     """
     told = {
         "process": move.spec.name,
@@ -78,7 +78,7 @@ def execute(
 
 
 def suspend(move: Move, seconds: float) -> SetRestart:
-    """A source that its slave started again by itself would be active beside its successor."""
+    """Return a step that disables the source's restarts; else it could run beside its successor."""
     give_back = SetRestart(move.source, move.source_host, move.spec.restart, seconds)
     return SetRestart(
         move.source, move.source_host, RestartPolicy("never"), seconds, undo=give_back
@@ -86,9 +86,9 @@ def suspend(move: Move, seconds: float) -> SetRestart:
 
 
 def checkpoint_plan(move: Move, options: CriuOptions) -> Plan:
-    """Dump it where it runs, and end it once its image owns the name."""
+    """Return a plan to dump the process on its host, and to end it once its image owns the name."""
     here, seconds = move.source_host, options.start_timeout
-    # What it waits for: a dump under way has to end first.
+    # Its timeout is the dump's, because it waits for a dump that is under way.
     run_on = execute(move, here, RUN_ON, options.dump_timeout)
     return Plan(
         (
@@ -102,14 +102,14 @@ def checkpoint_plan(move: Move, options: CriuOptions) -> Plan:
 
 
 def restore_plan(move: Move, options: CriuOptions) -> Plan:
-    """Restore it; its image stays until it is a process again, and then there is no way back."""
+    """Return a plan to restore the process; its image stays until that succeeds, which is final."""
     here = move.destination_host
     alias = "" if move.source_node == move.spec.name else move.source_node
     put_back = execute(move, here, PUT_BACK, options.restore_timeout)
     return Plan(
         (
             execute(move, here, TAKE, options.start_timeout, undo=put_back),
-            # Nor does its undo stop it: that would end what has no image any more.
+            # No undo, because a stop would end a process that may no longer have an image.
             Start(move.destination, here, options.start_timeout, alias, restored=True),
             execute(move, here, AWAIT_KEPT, options.restore_timeout),
             Commit(),
@@ -121,14 +121,14 @@ def restore_plan(move: Move, options: CriuOptions) -> Plan:
 def periodic_step(
     spec: ProcessSpec, instance: InstanceId, host: str, now: int, options: CriuOptions
 ) -> Execute:
-    """One checkpoint of an instance.
+    """Return the step of one periodic checkpoint.
 
     Args:
-        spec: of its process.
+        spec: of the process.
         instance: of a portable node.
         host: where it runs.
-        now: unix time, whole seconds: each asking is another absence of the node.
-        options: that hold for it.
+        now: unix time in whole seconds, so that each request is a new absence of the node.
+        options: of this process.
     """
     seconds = {
         "leave": options.leave_timeout, "dump": options.dump_timeout, "join": options.join_timeout,

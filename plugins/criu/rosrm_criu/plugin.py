@@ -1,4 +1,4 @@
-"""Registers the strategy `criu` with its executors, and its launcher."""
+"""Registration of the strategy `criu` with its executors, and of its launcher."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rosrm_criu.strategy import Criu
 
 @hookimpl
 def register_migration_strategies() -> Sequence[MigrationOffer]:
-    """Offer `criu`, for processes whose state is in memory alone."""
+    """Offer `criu`, for processes with all their state in memory."""
     return [
         MigrationOffer(
             name=NAME,
@@ -49,7 +49,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
 
 @hookimpl
 def register_launchers() -> Sequence[LauncherOffer]:
-    """Offer the launcher of the processes that move by `criu`, and of all that it restores."""
+    """Offer the launcher of the processes that migrate by `criu`, and of all restored ones."""
     return [
         LauncherOffer(
             name=NAME,
@@ -61,14 +61,14 @@ def register_launchers() -> Sequence[LauncherOffer]:
 
 
 def _launcher(context: LauncherContext) -> Launcher:
-    """Load the launcher in slaves alone."""
+    """Load the launcher, in slaves only."""
     module = import_module("rosrm_criu.launcher")
     launcher: Launcher = module.CriuLauncher(context)
     return launcher
 
 
 def _when_asked(module: str, step: str) -> Callable[[Mapping[str, Any]], Mapping[str, Any]]:
-    """Return an executor; a slave that has no such moves never loads what it needs."""
+    """Return an executor that loads its module at the first call, as most slaves never need it."""
 
     def execute(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         executors = import_module(f"rosrm_criu.executors.{module}")

@@ -1,9 +1,8 @@
-"""`criu`: a node moves with its whole memory, for what its state is on no topic.
+"""`criu`: migration of a node with its whole memory, for state that is on no topic.
 
-The node leaves the ROS graph by itself (`rosrm_criu.node.PortableNode`), stands still, and is
-dumped by CRIU. Its image is fetched by the destination and restored there, and the node joins the
-graph anew.
-The source stands still, and can go on, until the destination owns the name.
+The node itself leaves the ROS graph (`rosrm_criu.node.PortableNode`), is frozen, and is dumped by
+CRIU. The destination fetches the image and restores it, and the node rejoins the graph. Until the
+destination owns the name, the source stays frozen and can continue.
 """
 
 from __future__ import annotations
@@ -44,18 +43,18 @@ from rosrm_criu.plans import (
 
 
 class Criu:
-    """Plans a move of the whole memory."""
+    """The strategy that migrates the whole memory."""
 
     def __init__(self, options: CriuOptions) -> None:
         self._options = options
 
     @property
     def ability(self) -> str:
-        """The executor that tries CRIU on a host."""
+        """Name the executor that tests CRIU on a host."""
         return ABILITY
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
-        """Why an image of one host cannot be restored on another one; "": it can."""
+        """Return the reason why an image of one host cannot be restored on another; "": it can."""
         if source.get("host") != destination.get("host"):
             for one in (source, destination):
                 if one.get("no_transfer"):
@@ -63,7 +62,7 @@ class Criu:
         return mismatch(source, destination)
 
     def spec_fault(self, spec: ProcessSpec) -> str:
-        """Why a process cannot be moved so; "" if it can."""
+        """Return the reason why a process cannot migrate this way; "": it can."""
         if not spec.ros_node:
             return (
                 "it moves only ROS nodes that can leave and rejoin (rosrm_criu.node.PortableNode), "
@@ -72,9 +71,9 @@ class Criu:
         return ""
 
     def propose(self, move: Move) -> Plan:
-        """Stand still, dump, fetch, restore, commit, join, end the source.
+        """Return a plan: freeze, dump, fetch, restore, commit, join, end the source.
 
-        Before the node is asked to leave, the destination says that it is ready.
+        The destination reports that it is ready before the node is asked to leave.
         """
         fault = self.spec_fault(move.spec)
         if fault:
@@ -82,24 +81,24 @@ class Criu:
         return _Draft(move, move.options).plan()
 
     def checkpoint(self, move: Move) -> Plan:
-        """Dump it where it runs, ROS node or not, and end it; no node is asked to leave."""
+        """Return a plan to dump and end the process, ROS node or not; no node leaves the graph."""
         return checkpoint_plan(move, move.options)
 
     def restore(self, move: Move) -> Plan:
-        """Restore it where its image lies."""
+        """Return a plan to restore the process on the host of its image."""
         return restore_plan(move, move.options)
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
-        """As its own options say."""
+        """Return the seconds between periodic checkpoints from the process's options; 0: none."""
         return self._own(spec).checkpoint_every if spec.ros_node else 0.0
 
     def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
-        """Have the node leave, dump it, and have it join again."""
+        """Return a step in which the node leaves, is dumped, and rejoins."""
         return periodic_step(spec, instance, host, now, self._own(spec))
 
     @property
     def discard(self) -> str:
-        """The executor that removes what has no use any more."""
+        """Name the executor that removes unneeded images."""
         return SWEEP
 
     def _own(self, spec: ProcessSpec) -> OwnCriuOptions:
@@ -107,7 +106,7 @@ class Criu:
 
 
 class _Draft:
-    """One plan in the making."""
+    """Builder of one plan."""
 
     def __init__(self, move: Move, options: CriuOptions) -> None:
         self._move = move
@@ -138,8 +137,8 @@ class _Draft:
             )
         )  # fmt: skip
 
-    # What is got ready at the destination, and what is fetched, has no undo: that would wait for a
-    # host that may be lost, and the source with it. Both go by themselves after a while.
+    # The preparation of the destination and the fetch have no undo, because an undo would wait for
+    # a host that may be lost, and the source would wait too. Both are cleaned up after a timeout.
 
     def _introduce(self) -> Execute:
         options = self._options

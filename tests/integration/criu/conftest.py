@@ -1,4 +1,4 @@
-"""The CRIU of these tests, older ones beside it, and a user who may do nothing."""
+"""Fixtures of the CRIU tests: CRIU, older versions of it, and a user without rights."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from rosrm_criu.engine.binary import Criu, default_prefix, find, opened
 from rosrm_criu.engine.probe import probe
 
 ROOT = Path(__file__).parents[3]
-#: Older ones are fetched once, beside the environment's own.
+#: Older versions are downloaded once, into the virtual environment.
 OLDER = ROOT / ".venv" / "criu-older"
 
-#: A user who owns nothing.
+#: Uid of a user who owns nothing.
 NOBODY = 65534
 
 
 @pytest.fixture(scope="session")
 def criu() -> Criu:
-    """The one of `make setup`, which works."""
+    """Return the working CRIU that `make setup` installs."""
     try:
         found = find()
     except CriuError as error:
@@ -42,7 +42,7 @@ def criu() -> Criu:
 
 @pytest.fixture(scope="session")
 def cached() -> Path:
-    """The package files of `make setup`'s CRIU."""
+    """Return the package files of the CRIU that `make setup` installs."""
     folder = default_prefix() / "packages"
     if not any(folder.glob("*.deb")):
         pytest.skip(f"no packages of CRIU in {folder}: `make setup` had none to fetch")
@@ -51,13 +51,13 @@ def cached() -> Path:
 
 @pytest.fixture(scope="session")
 def older() -> Callable[[str], Path]:
-    """The folder of a Debian release's own CRIU, in `tree`, and of its packages."""
+    """Return a function for the folder of a Debian release's own CRIU (in `tree`) and packages."""
 
     def of(suite: str) -> Path:
         place = OLDER / suite
         OLDER.mkdir(parents=True, exist_ok=True)
         with (OLDER / "lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be fetching it
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be downloading it
             if not (place / "tree").is_dir():
                 with tempfile.TemporaryDirectory(dir=OLDER) as new:
                     _fetch(suite, Path(new))
@@ -88,13 +88,13 @@ def _fetch(suite: str, new: Path) -> None:
 
 @pytest.fixture(scope="session")
 def old(older) -> Callable[[str], Criu]:
-    """A Debian release's own CRIU: Debian 12 has 3.17, Debian 13 has 4.1."""
+    """Return a function for a Debian release's own CRIU: Debian 12 has 3.17, Debian 13 has 4.1."""
     return lambda suite: opened(older(suite) / "tree/usr/sbin/criu")
 
 
 @pytest.fixture
 def public() -> Iterator[Path]:
-    """A folder in which every user may write."""
+    """Yield a folder in which every user may write."""
     with tempfile.TemporaryDirectory(prefix="rosrm-test-") as folder:
         Path(folder).chmod(0o777)
         yield Path(folder)
@@ -102,11 +102,11 @@ def public() -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
-    """Runs `python ...` as a user without any rights, who has nothing but the standard library."""
+    """Return a function that runs `python ...` as a user without rights or installed packages."""
     if os.geteuid() != 0:
         pytest.skip("only root may act as another user")
     user = {"user": NOBODY, "group": NOBODY, "extra_groups": [], "cwd": "/"}
-    # The interpreter of the environment may lie where nobody else may look.
+    # Other users may be unable to read the interpreter of the virtual environment.
     seen = subprocess.run(
         ["/usr/bin/env", "-i", sys.executable, "-c", "import rosrm_criu.engine.probe"],
         capture_output=True,

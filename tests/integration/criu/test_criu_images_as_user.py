@@ -1,4 +1,4 @@
-"""An ordinary user's processes are dumped and restored too, without a namespace of their own."""
+"""Dump and restore of an ordinary user's processes, without a pid namespace."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-#: Runs as the user: a counter goes through two images, and is ended through its hold.
+#: Runs as the user: a counter goes through two images, and ends through its shim.
 HOPS = """
 import json, os, subprocess, sys, time
 from pathlib import Path
@@ -65,7 +65,7 @@ print(json.dumps([code, restored.namespace, "".join(log.read_text() for log in l
 
 @pytest.mark.timeout(240)
 def test_an_ordinary_users_process_goes_on(criu, as_nobody, public):
-    """With the capabilities on the program alone: twice in a row, no number lost, end and all."""
+    """CRIU with capabilities alone restores twice in a row, without a lost number or exit code."""
     program = public / "criu"
     shutil.copy(Path(criu.command[0]).resolve(), program)
     if program.read_bytes()[:4] != b"\x7fELF":

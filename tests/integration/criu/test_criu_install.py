@@ -1,4 +1,4 @@
-"""CRIU in a prefix of its own: from packages that are there, with bad ones, and interrupted."""
+"""Installation of CRIU into a prefix: from local packages, bad packages, and interrupted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def quiet(step: str) -> None:
 
 @pytest.fixture(scope="module")
 def installed(cached, tmp_path_factory) -> Path:
-    """A prefix with CRIU in it, for tests that leave one there, though it may be another one."""
+    """Return a prefix with CRIU, for tests that leave a working one there, even another one."""
     prefix = tmp_path_factory.mktemp("criu")
     install(prefix, quiet, given=cached)
     return prefix
@@ -37,7 +37,7 @@ def test_what_is_installed_works(installed, criu):
 
 
 def test_it_needs_nothing_outside_its_prefix_but_the_kernel(installed):
-    """Not even the system's C library: a host may have an older one."""
+    """The installed CRIU does not load even the system's C library, which may be older."""
     program = installed / "bin/criu"
     used = subprocess.run(
         [program, "--version"],
@@ -61,7 +61,7 @@ def test_a_second_installation_changes_nothing(installed):
 
 
 def test_a_broken_one_is_made_anew_from_the_packages_that_were_kept(installed):
-    """Without network: the mirror that is named does not exist."""
+    """A broken installation is repaired from the stored packages, without a reachable mirror."""
     (installed / "bin/criu").resolve().unlink()
     assert install(installed, quiet, mirrors=["http://127.0.0.1:9/none"]).version
     assert len(list((installed / "trees").iterdir())) == 1
@@ -101,7 +101,7 @@ def test_killed_in_between_the_old_one_is_in_use_and_the_next_one_clears_up(cach
     assert len(list((installed / "trees").iterdir())) == 1
 
 
-@pytest.mark.slow  # they are fetched once
+@pytest.mark.slow  # the packages are downloaded once
 def test_one_that_is_too_old_is_refused_and_the_present_one_stays(installed, older):
     kept = sorted(path.name for path in (installed / "packages").iterdir())
     with pytest.raises(CriuError, match=r"^this is CRIU 4\.1.*rosrm needs 4\.2 or newer"):
@@ -111,12 +111,12 @@ def test_one_that_is_too_old_is_refused_and_the_present_one_stays(installed, old
     assert len(list((installed / "trees").iterdir())) == 1
 
 
-# --- what hinders ------------------------------------------------------------------------------
+# --- obstacles ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def archive():
-    """This system's, if it is one that has one of ours."""
+    """Return the archive of this system, or skip the test if it has none that is supported."""
     if shutil.which("apt-get") is None:
         pytest.skip("no apt here")
     try:

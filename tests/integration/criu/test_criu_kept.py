@@ -1,4 +1,4 @@
-"""What a slave does for a checkpoint and a restore, with real processes and a CRIU that works."""
+"""Executors of checkpoints and restores, with real processes and a working CRIU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.criu_kit import TIMEOUT, eventually
 
 pytestmark = pytest.mark.timeout(240)
 
-#: Writes one number after the other, and holds a UDP port, which it tells first.
+#: Prints a UDP port that it holds, then consecutive numbers.
 COUNTER = """
 import socket, time
 one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -36,7 +36,7 @@ while True:
 
 
 class Slave:
-    """Asks the executors as the slave of a host does.
+    """Caller of the executors, in the role of a host's slave.
 
     Args:
         theatre: starts and restores the processes.
@@ -64,7 +64,7 @@ class Slave:
         return answer
 
     def hold(self, number: int = 2) -> Any:
-        """What the supervisor starts for an instance that is to be restored."""
+        """Start the shim of an instance like the supervisor does."""
         actor = self.theatre.hold(incoming(self.state, number), remove=True)
         self.pids[f"p#{number}"] = actor.pid
         return actor
@@ -76,7 +76,7 @@ class Slave:
 
 @pytest.fixture
 def slave(theatre, tmp_path):
-    """A slave that was just started: it has no attempt in mind."""
+    """Return a slave that was just started and remembers no attempt."""
     artifacts._flights.clear()
     request._turned_back.clear()
     return Slave(theatre, tmp_path / "state")
@@ -84,7 +84,7 @@ def slave(theatre, tmp_path):
 
 @pytest.fixture
 def counter(slave, theatre):
-    """Counts, as instance p#1."""
+    """Return a running counter, as instance p#1."""
     actor = theatre.start(COUNTER)
     actor.counts()
     slave.pids["p#1"] = actor.pid
@@ -105,7 +105,7 @@ def is_free(port: int) -> bool:
 
 
 def checkpointed(slave: Slave, counter: Any) -> list[int]:
-    """All that it counted before."""
+    """Checkpoint the counter; return all numbers that it printed before."""
     slave.ask("keep")
     slave.ask("kill")
     counter.process.wait(TIMEOUT)
@@ -119,7 +119,7 @@ def nothing_left(slave: Slave) -> None:
 
 
 def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
-    """No number is missing or written twice; its port was nobody else's meanwhile."""
+    """A restored process loses and repeats no number, and its port stays reserved until then."""
     before, port = checkpointed(slave, counter), port_of(counter)
     assert kept_numbers(slave.state) == [1]
     assert not is_free(port)
@@ -130,11 +130,11 @@ def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
     assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
     nothing_left(slave)
     slave.end(restored)
-    eventually(lambda: is_free(port), "the port free")  # what it held ends with its hold
+    eventually(lambda: is_free(port), "the port free")  # the restored process ends with its shim
 
 
 def test_it_can_be_checkpointed_again(slave, counter):
-    """The image of what was restored is one of the instance that holds it."""
+    """A restored process can be checkpointed as the instance of its shim."""
     before = checkpointed(slave, counter)
     slave.ask("take", destination=3)
     restored = slave.hold(3)
@@ -153,7 +153,7 @@ def test_it_can_be_checkpointed_again(slave, counter):
 
 
 def test_a_checkpoint_that_is_undone_lets_it_run_on(slave, counter):
-    """It stood still; nothing of the image is left. A second asking does it no harm."""
+    """An undo continues the stopped process and removes the image, and can be repeated."""
     slave.ask("keep")
     assert slave.ask("keep") == slave.results["criu_keep"]
     assert process_tree.is_stopped(counter.pid)
@@ -164,7 +164,7 @@ def test_a_checkpoint_that_is_undone_lets_it_run_on(slave, counter):
 
 
 def test_a_dump_that_comes_after_its_undo_is_none(slave, counter):
-    """The order was late."""
+    """A dump command that arrives after its undo fails, and the process runs on."""
     slave.ask("run_on", destination=30)
     with pytest.raises(CriuError, match="was undone"):
         slave.ask("keep", destination=30)
@@ -172,7 +172,7 @@ def test_a_dump_that_comes_after_its_undo_is_none(slave, counter):
 
 
 def test_an_undo_after_its_end_only_removes_the_image(slave, counter):
-    """There is nobody to go on."""
+    """An undo after the end of the process only removes the image."""
     slave.ask("keep", destination=31)
     slave.end(counter)
     assert slave.ask("run_on", destination=31) == {}
@@ -180,7 +180,7 @@ def test_an_undo_after_its_end_only_removes_the_image(slave, counter):
 
 
 def test_what_cannot_be_dumped_runs_on(slave, theatre):
-    """The reason names the file descriptor."""
+    """A process with an external pipe runs on, and the error names the file descriptor."""
     reading, writing = os.pipe()
     actor = theatre.start(COUNTER, pass_fds=(writing,))
     actor.counts()
@@ -194,14 +194,14 @@ def test_what_cannot_be_dumped_runs_on(slave, theatre):
 
 
 def test_an_undone_restore_leaves_the_image_as_it_was(slave, counter):
-    """Before it was begun, and after it failed; then it can be restored."""
+    """An undo before the restore, or after its failure, keeps the image restorable."""
     before = checkpointed(slave, counter)
     slave.ask("take")
     assert slave.ask("put_back") == {}
     assert not incoming(slave.state, 2).exists()
     slave.ask("take")
     page = next((incoming(slave.state, 2) / image.PAGES).glob("core-*"))
-    page.unlink()  # of the second name alone
+    page.unlink()  # only the hard link
     failed = slave.hold()
     with pytest.raises(CriuError, match="damaged"):
         slave.ask("await_kept")
@@ -216,7 +216,7 @@ def test_an_undone_restore_leaves_the_image_as_it_was(slave, counter):
 
 
 def test_an_image_that_changed_on_the_disk_is_not_restored(slave, counter):
-    """One flipped bit in the memory of the process: it says what to do, and touches nothing."""
+    """A flipped bit in an image fails the restore with advice, and the image stays."""
     checkpointed(slave, counter)
     pages = kept(slave.state, 1) / image.PAGES / "pages-1.img"
     content = bytearray(pages.read_bytes())
@@ -233,7 +233,7 @@ def test_an_image_that_changed_on_the_disk_is_not_restored(slave, counter):
 
 
 def test_a_restored_process_is_not_put_back(slave, counter):
-    """There is no way back from it, whether that was heard or not, and also once it has ended."""
+    """A successful restore is never undone, even if unreported or if the process has ended."""
     checkpointed(slave, counter)
     slave.ask("take")
     restored = slave.hold()
@@ -248,7 +248,7 @@ def test_a_restored_process_is_not_put_back(slave, counter):
 
 
 def test_a_restored_process_that_ended_at_once_is_not_put_back(slave, counter):
-    """Its image was used up, however short its life was: it is not restored a second time."""
+    """A process that ends right after its restore is not restored a second time."""
     checkpointed(slave, counter)
     slave.ask("take")
     restored = slave.hold()
@@ -260,7 +260,7 @@ def test_a_restored_process_that_ended_at_once_is_not_put_back(slave, counter):
 
 
 def test_that_it_was_restored_is_known_as_long_as_its_image_is_kept(slave, counter):
-    """A slave clears up meanwhile, and a late word to lay the image out does it no second time."""
+    """A sweep keeps the result of a used image, so that a late `take` does not copy it again."""
     checkpointed(slave, counter)
     slave.ask("take")
     restored = slave.hold()
@@ -275,7 +275,7 @@ def test_that_it_was_restored_is_known_as_long_as_its_image_is_kept(slave, count
 
 
 def test_a_slave_that_was_started_again_keeps_the_ports(slave, counter):
-    """Of each process that waits in an image here; a dropped one's are anybody's."""
+    """A restarted slave reserves the ports of checkpointed processes; a drop releases them."""
     checkpointed(slave, counter)
     port = port_of(counter)
     for one in steps._reserved.pop(1):
@@ -289,7 +289,7 @@ def test_a_slave_that_was_started_again_keeps_the_ports(slave, counter):
 
 
 def test_without_an_image_nothing_is_restored(slave, counter):
-    """It says so, and the undo has nothing to put back."""
+    """A missing image fails the restore, and its undo has no effect."""
     checkpointed(slave, counter)
     shutil.rmtree(kept(slave.state, 1))
     with pytest.raises(CriuError, match="holds no complete image"):
@@ -300,7 +300,7 @@ def test_without_an_image_nothing_is_restored(slave, counter):
 
 
 def test_shared_memory_of_fast_dds_is_refused(slave, theatre):
-    """Its peers would clear it away; what to set is said."""
+    """Shared memory of Fast DDS, which peers would remove, is refused; the error has a remedy."""
     path = Path("/dev/shm/fastrtps_rosrm_test")
     path.write_bytes(b"\0" * 4096)
     code = (

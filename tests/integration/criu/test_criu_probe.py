@@ -1,4 +1,4 @@
-"""What the probe says of CRIUs that work, and of those that do not."""
+"""Probe results for working and failing versions of CRIU."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def test_as_a_program_it_says_so_in_one_line(criu):
 @pytest.mark.parametrize(
     ("suite", "version"), [("bookworm", "3.17"), ("trixie", "4.1")], ids=["3.17", "4.1"]
 )
-@pytest.mark.slow  # they are fetched once
+@pytest.mark.slow  # the packages are downloaded once
 def test_too_old_ones_are_told_apart(old, suite, version):
-    """Debian 12's own fails on present kernels, Debian 13's only on a process with a socket."""
+    """The probe rejects Debian 12's CRIU on current kernels, and Debian 13's at the socket."""
     found = old(suite)
     assert found.version.startswith(version)
     able = probe(found)
@@ -119,7 +119,7 @@ def test_root_of_a_container_reads_which_capability_is_missing(criu, added):
 
 @pytest.mark.parametrize("moment", ["folder", "dump.log", "restore.log"])
 def test_a_killed_probe_leaves_nothing_behind(criu, tmp_path, moment):
-    """Killed as soon as it has its folder, in the dump, and in the restore."""
+    """A probe killed after the folder's creation, in the dump or in the restore leaves nothing."""
     asking = subprocess.Popen(
         [sys.executable, "-m", "rosrm_criu.engine.probe"],
         env={**os.environ, "TMPDIR": str(tmp_path)},
@@ -128,7 +128,7 @@ def test_a_killed_probe_leaves_nothing_behind(criu, tmp_path, moment):
     try:
         pattern = "rosrm-criu-*" if moment == "folder" else f"rosrm-criu-*/{moment}"
         until = time.monotonic() + 60
-        while not any(tmp_path.glob(pattern)):  # without a pause: the moment is short
+        while not any(tmp_path.glob(pattern)):  # without a pause, because the moment is short
             assert asking.poll() is None, f"it ended before there was a {moment}"
             assert time.monotonic() < until, f"no {moment} within 60 s"
     finally:
@@ -151,7 +151,7 @@ def test_one_that_hangs_is_given_up_in_time_and_leaves_nothing_behind(tmp_path, 
 
 
 def test_one_that_only_claims_to_have_restored_does_not_work(tmp_path):
-    """`criu check` would be content with it, and so would an exit code."""
+    """A CRIU that only claims success fails; `criu check` and an exit code would accept it."""
     lying = tmp_path / "criu"
     lying.write_text('#!/bin/sh\nif [ "$1" = dump ]; then kill -9 "$3"; fi\n')
     lying.chmod(0o755)
@@ -160,7 +160,7 @@ def test_one_that_only_claims_to_have_restored_does_not_work(tmp_path):
 
 
 def reachable(criu: Criu, public: Path) -> Path:
-    """A copy of the program in a folder that everybody can look into."""
+    """Copy the program into a folder that every user can read."""
     copy = Path(shutil.copy(os.path.realpath(criu.command[0]), public / "criu"))
     copy.chmod(0o755)
     return copy
@@ -171,8 +171,8 @@ def left_in(folder: Path, *expected: Path) -> list[str]:
 
 
 def assert_all_gone(folder: Path) -> None:
-    """No file in the folder, and no process that was started with it."""
-    until = time.monotonic() + 15  # less than the child lives by itself
+    """Check that no file is in the folder, and that no process of it is left."""
+    until = time.monotonic() + 15  # less than the lifetime of the child
     while left_in(folder) or processes_of(folder):
         told = f"{left_in(folder)}, {processes_of(folder)}"
         assert time.monotonic() < until, f"15 s after its end there is still: {told}"

@@ -1,4 +1,4 @@
-"""What stays of an image once it was restored below the program that holds the process."""
+"""Rest of an image after its restore by the shim."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.criu_kit import TIMEOUT, eventually
 
 pytestmark = pytest.mark.timeout(240)
 
-#: Writes one number after the other.
+#: Prints consecutive numbers.
 COUNTER = """
 import time
 count = 0
@@ -25,7 +25,7 @@ while True:
 
 @pytest.fixture
 def directory(theatre):
-    """The image of a counter that has counted."""
+    """Return the image of a counter that has counted."""
     counter = theatre.start(COUNTER)
     counter.counts()
     return theatre.dump(counter)
@@ -33,7 +33,7 @@ def directory(theatre):
 
 @pytest.mark.parametrize("victim", ["the process", "its hold"])
 def test_that_it_was_restored_is_known_after_its_end(theatre, directory, victim):
-    """However it ended and however soon; of its memory nothing is left."""
+    """The result of a restore survives any early end of the process; its memory is removed."""
     restored = theatre.restore(directory, remove=True)
     told = restored.outcome
     eventually(
@@ -47,7 +47,7 @@ def test_that_it_was_restored_is_known_after_its_end(theatre, directory, victim)
 
 
 def test_its_program_begins_anew_after_its_end(theatre, directory):
-    """As the supervisor starts the same command line again, as often as it crashes."""
+    """Each restart of the shim's command line after the restore runs the program itself."""
     restored = theatre.restore(directory, remove=True)
     restored.process.kill()
     restored.process.wait(TIMEOUT)

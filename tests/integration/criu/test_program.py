@@ -1,4 +1,4 @@
-"""Which CRIU is used, and what is told when it fails: with real programs that play one."""
+"""Choice of the CRIU program, and its error messages, with scripts in place of CRIU."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def script(path: Path, body: str = "", version: str = "4.2.1") -> Path:
 
 @pytest.fixture(autouse=True)
 def nothing_else(tmp_path, monkeypatch):
-    """No other CRIU of this machine is found, and a folder in PATH is ours."""
+    """Hide every other CRIU of this machine, and put a test folder into PATH."""
     monkeypatch.delenv("ROSRM_CRIU", raising=False)
     monkeypatch.setattr("rosrm_criu.engine.binary._PLACES", str(tmp_path / "sbin"))
     monkeypatch.setenv("PATH", str(tmp_path / "path"))
@@ -65,7 +65,7 @@ def test_where_none_starts_each_one_is_told(tmp_path):
 
 @pytest.mark.parametrize("kind", ["missing", "folder", "other"])
 def test_what_the_variable_names_has_to_be_one(kind, tmp_path, monkeypatch):
-    """Even where another one would do: whoever sets it does not mean that one."""
+    """An invalid ROSRM_CRIU fails, although another CRIU works, which the user did not name."""
     script(tmp_path / "path/criu")
     named = tmp_path / "named"
     if kind == "folder":
@@ -89,9 +89,9 @@ def test_the_prefix_is_below_the_users_data_or_where_a_variable_says(monkeypatch
     assert default_prefix() == Path("/opt/criu")
 
 
-# --- how it is run -----------------------------------------------------------------------------
+# --- execution ---------------------------------------------------------------------------------
 
-#: Finds the path after --log-file and writes to it.
+#: Part of a script: finds the path after --log-file and writes to that file.
 FAILS = """
 while [ "$1" != --log-file ]; do shift; done
 echo '(00.1) Error (criu/sk-unix.c:874): unix: External socket is used.' >"$2"
@@ -140,7 +140,7 @@ def test_one_that_hangs_is_ended_with_its_children(tmp_path):
 
 
 def members(group: int) -> list[int]:
-    """Processes of a group, but those whose end nobody has taken note of yet."""
+    """Return the processes of a group, without zombies."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -166,7 +166,7 @@ def test_it_gets_the_files_that_it_is_given_and_no_input(tmp_path):
 
 
 def test_it_asks_for_all_rights_only_where_it_has_them(tmp_path):
-    """Root in a container may lack them, so it is the capability that counts."""
+    """`--unprivileged` depends on the capability, because root in a container may lack it."""
     told = tmp_path / "told"
     program = script(tmp_path / "criu", f'echo "$@" >{told}')
     code = (

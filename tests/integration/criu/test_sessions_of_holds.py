@@ -1,4 +1,4 @@
-"""What the table of sessions knows of programs that hold a restored process; no CRIU is needed."""
+"""Shims in the table of sessions; no CRIU is needed."""
 
 import os
 import sys
@@ -13,7 +13,7 @@ from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 from rosrm_criu.launcher import CriuLauncher
 
-#: It has a child in a session of its own, and waits for it.
+#: Starts a child in another session, and waits for it.
 PROGRAM = """
 import subprocess
 subprocess.run(["sleep", "60"], start_new_session=True)
@@ -26,7 +26,7 @@ PATIENCE = 30.0
 
 @pytest.fixture
 def spawn(tmp_path):
-    """Starts the program under a name, and ends it and its child afterwards."""
+    """Return a function that starts the program under a name; end it and its child later."""
     pids = []
 
     def start(name):
@@ -57,7 +57,7 @@ def child_of(pid):
 
 
 def test_a_hold_is_known_as_one_however_early_it_was_added(spawn):
-    """A process that was spawned just now has no command line yet, for most of the tries."""
+    """A shim is recognised even if it was added before its execve set the command line."""
     table = SessionTable(launchers=BY_CRIU)
     for _ in range(ROUNDS):
         hold = spawn("plugins/criu/rosrm_criu/engine/shim.py")
@@ -69,7 +69,7 @@ def test_a_hold_is_known_as_one_however_early_it_was_added(spawn):
 
 
 def test_of_any_other_program_a_daemon_is_no_member(spawn):
-    """However early it was added, too."""
+    """A daemon of any other program is no member, even if the program was added as early."""
     table = SessionTable(launchers=BY_CRIU)
     for _ in range(ROUNDS):
         other = spawn("other.py")

@@ -1,4 +1,4 @@
-"""What is moved, from where, and where to."""
+"""Fixtures of transfers: source, target, and both ends."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.integration.transfer.trees import Destination, fill
 
 @pytest.fixture
 def source(tmp_path):
-    """Some files of 4 MB in all, which no compression makes smaller."""
+    """Return a directory with 4 MB of incompressible files."""
     directory = tmp_path / "source"
     fill(directory, megabytes=4)
     return directory

@@ -1,4 +1,4 @@
-"""What can come between two ends: wires, disks, and a source that is not what it should be."""
+"""Transfers with faults of the network, the disk and the source."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from tests.integration.transfer.trees import (
 )
 from tests.integration.transfer.wires import Fault, wire
 
-# --- what comes between ----------------------------------------------------------------------
+# --- faults of the network -------------------------------------------------------------------
 
 
 def test_a_connection_that_was_cut_is_gone_on_with(source, target, sender, destination):
-    """What has come is not sent again, but for what was on the way."""
+    """A resumed transfer repeats only the bytes that were in flight."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with wire(offer.port, Fault(after=1_000_000), Fault(after=2_000_000)) as cut:
         fetched = destination.fetch(through(offer, cut.port), target)
@@ -51,7 +51,7 @@ def test_a_connection_that_was_cut_is_gone_on_with(source, target, sender, desti
 
 
 def test_a_source_goes_on_from_where_it_has_marked_its_checksum(source, target, monkeypatch):
-    """It does not read again what went out long before, though that has changed meanwhile."""
+    """A resume starts at the last saved checksum: earlier files are not read, even if changed."""
     monkeypatch.setattr(archive, "MARK", 300_000)
     destination = Destination()
     with (
@@ -62,7 +62,7 @@ def test_a_source_goes_on_from_where_it_has_marked_its_checksum(source, target, 
         before = digests(source)
         going = threads.submit(destination.fetch, through(offer, cut.port), target)
         assert cut.broke.wait(PATIENCE)
-        (source / "inventory").write_bytes(b"2")  # of the first file
+        (source / "inventory").write_bytes(b"2")  # the first file
         assert going.result(PATIENCE).resumed == 2
     assert digests(target) == before
 
@@ -97,7 +97,7 @@ def test_a_wire_that_damages_every_time_is_given_up(source, target, sender, dest
 
 
 def test_a_silent_source_is_given_up_in_time(source, target, sender, destination):
-    """Stopped in the middle: it neither sends nor closes."""
+    """The fetch gives up a source that is stopped, and neither sends nor closes."""
     offer = slowly(sender, source, destination.certificate)
     with ThreadPoolExecutor() as threads:
         going = threads.submit(destination.fetch, offer, target, timeout=3.0)
@@ -119,7 +119,7 @@ def test_a_transfer_that_takes_too_long_is_given_up(source, target, sender, dest
 
 
 def test_nobody_at_any_address(source, target, sender, destination):
-    """All of them are named."""
+    """The error names all addresses that refused."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     sender.close()
     with pytest.raises(TransferError) as caught:
@@ -167,12 +167,12 @@ def test_a_directory_that_is_not_there_is_not_offered(tmp_path, sender, destinat
         sender.offer(tmp_path / "none", seconds=PATIENCE, to=destination.certificate)
 
 
-# --- a source that is not what it should be --------------------------------------------------
+# --- faults of the source --------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def lying(directory: Path, to: str) -> Iterator[Offer]:
-    """Serves in this process, where a test may put something else in the place of its parts."""
+    """Serve in this process, where a test can replace parts of the server."""
     made: queue.Queue[Offer] = queue.Queue()
 
     async def run() -> None:
@@ -190,7 +190,7 @@ def lying(directory: Path, to: str) -> Iterator[Offer]:
         yield through(offer, offer.port)
     finally:
         loop, stop = ends[0]
-        with contextlib.suppress(RuntimeError):  # its loop has ended: what it offered was taken
+        with contextlib.suppress(RuntimeError):  # the loop has ended because the offer was taken
             loop.call_soon_threadsafe(stop.set)
         thread.join(PATIENCE)
 
@@ -208,7 +208,7 @@ def test_a_wrong_checksum_is_noticed(source, target, monkeypatch):
 
 
 def test_an_archive_that_leaves_its_directory_is_refused(source, target, tmp_path, monkeypatch):
-    """Whoever has made it, and though its checksum is right."""
+    """A path outside the directory is refused, even if the checksum of the archive is right."""
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w") as tar:
         entry = tarfile.TarInfo("../../outside")
@@ -220,7 +220,7 @@ def test_an_archive_that_leaves_its_directory_is_refused(source, target, tmp_pat
 
 
 def test_no_more_is_taken_than_was_offered(source, target, monkeypatch):
-    """What had no end would fill the disk."""
+    """A source without end cannot fill the disk."""
     offered = Archive(source)
     head = next(offered.pieces())
 
@@ -248,7 +248,7 @@ def test_a_stream_that_always_ends_too_soon_is_given_up(source, target, monkeypa
 
 
 def test_what_has_no_room_is_not_begun(source, sender, tmp_path, destination):
-    """The source's offer still stands for a place with more room."""
+    """The offer still stands after a refusal for lack of space, so another place can fetch it."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with small_disk(tmp_path / "disk") as disk:
         with pytest.raises(TransferError, match=r"do not fit .* the file system .*/disk has"):
@@ -265,7 +265,7 @@ def test_a_reserve_stays_free(source, target, sender, destination):
 
 
 def test_a_disk_that_is_full_meanwhile(sender, tmp_path, destination):
-    """Others write too: what came is removed, and the error names the file system."""
+    """A disk that others fill during the fetch fails it; the error names the file system."""
     source = tmp_path / "source"
     source.mkdir()
     (source / "pages").write_bytes(random.Random(7).randbytes(600_000))

@@ -1,4 +1,4 @@
-"""Ends of a transfer that are stopped, killed, or left alone."""
+"""Ends of a transfer that are stopped, killed or abandoned."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.integration.transfer.trees import PATIENCE, digests, listens, nothing
 
 
 def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fetcher, destination):
-    """What it leaves is hidden, and removed by the next fetch beside it."""
+    """A killed fetch leaves only a hidden directory, which the next fetch beside it removes."""
     offer = slowly(sender, source, fetcher.introduce())
     with ThreadPoolExecutor() as threads:
         going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
@@ -36,7 +36,7 @@ def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fe
 
 
 def test_a_fetch_can_be_stopped(source, target, sender, fetcher):
-    """From another thread; nothing is left."""
+    """A fetch can be stopped from another thread, and leaves nothing."""
     offer = slowly(sender, source, fetcher.introduce())
     with ThreadPoolExecutor() as threads:
         going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
@@ -94,7 +94,7 @@ def start(code: str, *arguments: object) -> subprocess.Popen:
 
 
 def test_an_offer_ends_with_the_process_that_made_it(source, destination):
-    """However that ends."""
+    """An offer ends when the process that made it is killed."""
     with start(_OFFERS, source, destination.certificate) as owner:
         offer = Offer.from_json(json.loads(owner.stdout.readline()))
         serving = Path(f"/proc/{owner.stdout.readline().strip()}")
@@ -105,7 +105,7 @@ def test_an_offer_ends_with_the_process_that_made_it(source, destination):
 
 
 def test_a_fetch_ends_with_the_process_that_asked_for_it(source, target, sender):
-    """However that ends; nothing is left."""
+    """A fetch ends when the process that requested it is killed, and leaves nothing."""
     with start(_FETCHES, target) as owner:
         pid, certificate = json.loads(owner.stdout.readline())
         fetching = Path(f"/proc/{pid}")
@@ -118,7 +118,7 @@ def test_a_fetch_ends_with_the_process_that_asked_for_it(source, target, sender)
 
 
 def is_dead(process: Path) -> bool:
-    """Ended, though nobody has taken note of it."""
+    """Return True if a process has ended, even if it is not reaped."""
     try:
         return "State:\tZ" in (process / "status").read_text()
     except FileNotFoundError:
@@ -143,7 +143,7 @@ def test_closing_twice_and_from_several_threads_does_no_harm(source, destination
 
 
 def test_a_destination_that_was_not_introduced_fetches_nothing(source, target, sender, destination):
-    """Nobody would speak with it, so it says so at once."""
+    """A fetch without `introduce` fails at once, because the source would refuse it."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with Fetcher() as fetcher, pytest.raises(TransferError, match="was not introduced"):
         fetcher.fetch(offer, target, timeout=PATIENCE)
@@ -151,7 +151,7 @@ def test_a_destination_that_was_not_introduced_fetches_nothing(source, target, s
 
 
 def test_an_end_that_is_ready_works_as_any_other(source, target):
-    """Its libraries are there before somebody has to stand still for them."""
+    """An end that loaded its libraries in advance works like any other."""
     with Sender() as sender, Fetcher() as fetcher:
         for end in (sender, fetcher):
             end.ready()

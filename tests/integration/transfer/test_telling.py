@@ -1,4 +1,4 @@
-"""What an end of a transfer says last is said whole, whoever ends it meanwhile."""
+"""Completeness of the last answer of a transfer end that is stopped at the same time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.ros.clusters import PATIENCE, wait_until
 
 
 def test_a_fetch_that_is_ended_while_it_tells_its_fault_tells_it() -> None:
-    """Who has read it closes the process's input, which ends it: that is no fault of its own."""
+    """A fetch that gets SIGTERM while it writes its error completes the error, and only that."""
     heard, said = os.pipe()
     with subprocess.Popen(
         [sys.executable, "-m", "rosrm_criu.transfer", "fetch"],
@@ -27,7 +27,7 @@ def test_a_fetch_that_is_ended_while_it_tells_its_fault_tells_it() -> None:
         assert "certificate" in json.loads(answers.readline())
         filled = fill(said)
         os.close(said)
-        fetch.stdin.close()  # it was stopped before it began: that is the fault
+        fetch.stdin.close()  # so the error is: stopped before it began
         waits_in = Path(f"/proc/{fetch.pid}/wchan")
         wait_until(lambda: "pipe_write" in waits_in.read_text(), "it is about to tell")
         fetch.send_signal(signal.SIGTERM)
@@ -38,8 +38,8 @@ def test_a_fetch_that_is_ended_while_it_tells_its_fault_tells_it() -> None:
 
 
 def fill(pipe: int) -> int:
-    """Leave no room in a pipe; how many bytes that took."""
-    # Opened anew: else whoever has the other end would not be made to wait either.
+    """Fill a pipe completely; return the number of bytes."""
+    # A new open file description, so that O_NONBLOCK does not apply to the other writer.
     another, filled = os.open(f"/proc/self/fd/{pipe}", os.O_WRONLY | os.O_NONBLOCK), 0
     with contextlib.suppress(BlockingIOError):
         while True:

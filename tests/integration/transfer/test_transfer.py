@@ -1,4 +1,4 @@
-"""Directories moved by real processes over real sockets: what arrives, and who may have it."""
+"""Transfers by real processes over real sockets: results and access control."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from tests.integration.transfer.trees import (
 )
 from tests.integration.transfer.wires import Fault, wire
 
-# --- as it should be -------------------------------------------------------------------------
+# --- successful transfers --------------------------------------------------------------------
 
 
 def test_100_mb_arrive_as_they_were(tmp_path, target, sender, fetcher):
-    """Every file, for its owner alone; then nothing listens any more."""
+    """All files arrive unchanged, readable by their owner alone, and the port is closed then."""
     source = tmp_path / "source"
     fill(source, megabytes=100, random_share=0.5)
     offer = sender.offer(source, seconds=PATIENCE, max_rate=0, to=fetcher.introduce())
@@ -57,18 +57,18 @@ def test_a_directory_without_files_arrives(tmp_path, target, sender, destination
 
 
 def test_nothing_listens_before_there_is_something_to_fetch(sender):
-    """A process that was started ahead has no socket."""
+    """A process that was started in advance has no socket."""
     assert psutil.Process(sender._process.pid).net_connections("inet") == []
     assert sender.close() == Sent("failed", 0)
 
 
 def test_a_rate_is_kept(source, target, sender, destination):
-    """4 MB take at least 2 s at 2 MB/s."""
+    """A limit of 2 MB/s is kept: 4 MB take nearly 2 s at least."""
     offer = sender.offer(source, seconds=PATIENCE, max_rate=2e6, to=destination.certificate)
     assert destination.fetch(offer, target).seconds > 1.5
 
 
-# --- who may ---------------------------------------------------------------------------------
+# --- access control --------------------------------------------------------------------------
 
 
 def test_a_wrong_token_is_refused_and_the_right_one_still_works(
@@ -90,7 +90,7 @@ def test_an_offer_is_taken_once(source, target, sender, tmp_path, destination):
 
 
 def test_nobody_goes_on_where_another_reader_began(source, target, sender, tmp_path, destination):
-    """Who has the token as well can tell that it was used, and gets nothing."""
+    """A second reader with the token learns only that it was used."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with (
         wire(offer.port, Fault(after=1_000_000), then_gone=True) as cut,
@@ -103,7 +103,7 @@ def test_nobody_goes_on_where_another_reader_began(source, target, sender, tmp_p
 
 
 def test_a_destination_that_was_introduced_is_the_only_one(source, target, sender, destination):
-    """Who has read the offer on its way, token and all, gets nothing, with a key of another."""
+    """An intercepted offer, including its token, is useless with another key."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     other = Destination()
     with pytest.raises(TransferError, match="is for another destination than this one"):
@@ -118,7 +118,7 @@ def test_a_destination_that_was_introduced_is_the_only_one(source, target, sende
 
 
 def test_who_shows_no_certificate_is_not_spoken_with(source, sender, destination):
-    """Not one byte is answered to a request that is right, token and all."""
+    """A client without a certificate gets no byte of an answer, even with a valid token."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     request = f"GET /archive HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {offer.token}\r\n\r\n"
     answer = b""
@@ -133,7 +133,7 @@ def test_who_shows_no_certificate_is_not_spoken_with(source, sender, destination
 
 
 def trusting() -> ssl.SSLContext:
-    """Speaks with whoever answers, and shows nothing."""
+    """Return a TLS context that accepts any server and shows no certificate."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -147,7 +147,7 @@ def test_an_introduction_that_is_none_is_refused(source, sender, to):
 
 
 def test_another_server_is_told_nothing(source, target, sender, destination):
-    """It shows another certificate, and so does not even see the token."""
+    """A server with another certificate does not even get the token."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with Sender() as other:
         elsewhere = other.offer(source, seconds=PATIENCE, to=destination.certificate)
@@ -158,7 +158,7 @@ def test_another_server_is_told_nothing(source, target, sender, destination):
 
 
 def test_what_travels_is_no_plain_text(source, target, sender, tmp_path, destination):
-    """Neither the token nor a file can be read on the way; nor does old TLS do."""
+    """The server refuses TLS 1.2, so that token and files are encrypted by TLS 1.3."""
     (source / "secret").write_bytes(b"plain text" * 1000)
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     context = trusting()

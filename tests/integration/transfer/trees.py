@@ -1,4 +1,4 @@
-"""Directories that are moved, and how they arrive."""
+"""Directories to transfer, and checks of their arrival."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rosrm_criu.transfer import DEFAULT_RESERVE, Fetched, Offer, Sender
 from rosrm_criu.transfer.certificate import new_identity
 from rosrm_criu.transfer.receiving import receive
 
-#: Generous: a busy machine may take its time.
+#: Seconds; generous for a busy machine.
 PATIENCE = 60.0
 
 
 class Destination:
-    """Fetches in this process, as often as a test wants to, as the one that was introduced.
+    """A known destination that fetches in this process, any number of times.
 
     Attributes:
         certificate: for the source.
-        fingerprint: of it.
+        fingerprint: of the certificate.
     """
 
     def __init__(self) -> None:

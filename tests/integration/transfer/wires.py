@@ -1,4 +1,4 @@
-"""A wire between the two ends of a connection, which can be cut or damage what it carries."""
+"""TCP proxy between two ends of a connection, which can cut it or damage its data."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Fault:
-    """What befalls one connection: after so many bytes from the server, one of these.
+    """A fault of one connection, after a number of bytes from the server.
 
     Attributes:
-        after: bytes.
-        flips: the next byte is another one; else the connection is cut.
+        after: number of bytes.
+        flips: flip a bit of the next byte; otherwise the connection is cut.
     """
 
     after: int
@@ -23,13 +23,13 @@ class Fault:
 
 
 class Wire:
-    """Listens on a port of its own and carries each connection to a server.
+    """A proxy that listens on its own port and forwards each connection to a server.
 
     Args:
         port: of the server, on loopback.
-        faults: of the first connections, in order; None: for each, by its number from 0.
-        for_each: gives the fault of a connection.
-        then_gone: after the first fault nobody listens any more.
+        faults: of the first connections, in order; all others have none.
+        for_each: returns the fault of a connection by its number from 0; replaces `faults`.
+        then_gone: stop listening after the first fault that cuts a connection.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Whether an image of one host can be restored at another, by what the hosts tell."""
+"""Compatibility of two hosts for a dump and a restore, by the facts that they report."""
 
 from __future__ import annotations
 

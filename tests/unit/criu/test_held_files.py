@@ -1,4 +1,4 @@
-"""Which of the files that a process holds open follow it: those of this one."""
+"""Open files of a process that follow it, tested with this process's own files."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from rosrm_criu.engine.image import HeldFile
 
 @pytest.fixture
 def work(tmp_path):
-    """The working directory."""
+    """Return an empty working directory."""
     (tmp_path / "work").mkdir()
     return tmp_path / "work"
 
 
 @pytest.fixture
 def directory(tmp_path):
-    """An empty image."""
+    """Return the directory of an empty image."""
     image.create(tmp_path / "image")
     return tmp_path / "image"
 
 
 def held(directory: Path, working_directory: object) -> dict[str, HeldFile]:
-    """What this process holds open, by path."""
+    """Return this process's open files by path."""
     found = open_files.open_files([os.getpid()], (), str(working_directory), directory)
     return {one.path: one for one in found}
 
 
 def test_each_file_that_follows_has_a_copy_of_its_own(work, directory):
-    """Also where one of them was seen first by a descriptor that only reads it."""
+    """Each file has its own copy, even if a read-only descriptor of it was listed first."""
     (work / "a").write_text("of a")
     with contextlib.ExitStack() as files:
         for name, mode in (("a", "r"), ("a", "r+"), ("b", "w")):
@@ -48,7 +48,7 @@ def test_each_file_that_follows_has_a_copy_of_its_own(work, directory):
 
 
 def test_nothing_follows_a_process_that_works_in_the_root_directory(work, directory):
-    """All files lie below it; what it wrote elsewhere is not the process's own."""
+    """A process in `/` takes no files along, because all files of the host lie below it."""
     with (work / "a").open("w"):
         assert held(directory, "/")[str(work / "a")].copy == ""
         assert held(directory, work)[str(work / "a")].copy

@@ -1,6 +1,6 @@
-"""What the program that holds a restored process does when it is started again: real processes.
+"""Restarts of the shim, with real processes.
 
-None of them comes so far as to need CRIU; what does is in tests/integration/criu/test_hold.py.
+None of them needs CRIU; tests/integration/criu/test_hold.py has those that do.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import pytest
 from rosrm_criu.engine import image, restore_result
 from rosrm_criu.engine.restore_result import Outcome
 
-#: A plain restore that failed, as `hold.FAILED`.
+#: Exit code of a failed restore, as `shim.FAILED`.
 FAILED = 125
 
 
 @pytest.fixture
 def directory(tmp_path):
-    """An image that is none: its files have nothing in them."""
+    """Return an invalid image, with an unreadable manifest."""
     image.create(tmp_path / "in-7")
     (tmp_path / "in-7" / image.MANIFEST).write_text("{")
     (tmp_path / "in-7" / image.PAGES / "pages-1.img").write_text("memory")
@@ -28,7 +28,7 @@ def directory(tmp_path):
 
 
 def start(directory: Path, *then: str, remove: bool = True) -> subprocess.CompletedProcess[str]:
-    """As the supervisor starts it, at first and after each crash."""
+    """Run the shim as the supervisor does, at first and after each crash."""
     command = restore_result.command(
         sys.executable, directory, criu=Path("/none"), remove=remove, timeout=5.0, then=then
     )
@@ -36,7 +36,7 @@ def start(directory: Path, *then: str, remove: bool = True) -> subprocess.Comple
 
 
 def test_after_a_life_that_was_restored_the_process_begins_anew(directory):
-    """What an earlier life told stays; a memory that a SIGKILL left on the disk goes."""
+    """A restart after a restore runs the command, keeps the result and removes leftover images."""
     told = Outcome(pid=7, inner_pid=7)
     restore_result.write(directory, told)
     for _ in range(2):
@@ -46,7 +46,7 @@ def test_after_a_life_that_was_restored_the_process_begins_anew(directory):
 
 
 def test_without_an_image_nothing_begins_anew(tmp_path):
-    """Whoever has removed it, what it held is lost, or goes on elsewhere: that is no second one."""
+    """A missing image fails the start, because its process is lost or may run elsewhere."""
     ended = start(tmp_path / "in-7", "echo", "anew")
     assert (ended.returncode, ended.stdout) == (FAILED, "")
     assert "holds no complete image" in ended.stderr
@@ -54,7 +54,7 @@ def test_without_an_image_nothing_begins_anew(tmp_path):
 
 @pytest.mark.parametrize("told", [None, Outcome(reason="no room")])
 def test_a_restore_that_never_worked_does_not_begin_anew(directory, told):
-    """It fails, and says why, as often as it is started."""
+    """A failed restore fails with its reason at each start, and the command never runs."""
     if told is not None:
         restore_result.write(directory, told)
     for _ in range(2):
@@ -64,7 +64,7 @@ def test_a_restore_that_never_worked_does_not_begin_anew(directory, told):
 
 
 def test_an_image_without_a_command_is_for_one_life_too(directory):
-    """Nothing else can be started; it stays known that the image was used up."""
+    """A used image without a command fails the start; the result of the restore stays."""
     told = Outcome(pid=7, inner_pid=7)
     restore_result.write(directory, told)
     ended = start(directory)

@@ -1,4 +1,4 @@
-"""The manifest of an image says whether each file, and it itself, is what was written."""
+"""Checksums in the manifest of an image, of each file and of the manifest itself."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rosrm.errors import CriuError
 from rosrm_criu.engine import image
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
 
-#: A large file of pages, a small one of CRIU's, and one that follows the process.
+#: A large file of memory pages, a small file of CRIU, and a file that follows the process.
 FILES: Mapping[str, bytes] = {
     "criu/pages-1.img": bytes(range(256)) * 16, "criu/pstree.img": b"magicnum\x0c\0\0\0\x08\x01",
     "files/0": b"1\n2\n3\n",
@@ -36,7 +36,7 @@ MANIFEST = Manifest(
 def written(
     files: Mapping[str, bytes] = FILES, manifest: Manifest = MANIFEST, *, checksums: bool = True
 ) -> Iterator[Path]:
-    """The directory of a complete image."""
+    """Yield the directory of a complete image."""
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder, "image")
         image.create(directory)
@@ -50,7 +50,7 @@ def written(
 
 
 def checked(directory: Path) -> Manifest:
-    """As the hold looks at it before CRIU begins."""
+    """Check an image like the shim does before it runs CRIU."""
     manifest = image.read(directory)
     image.check_contents(directory, manifest)
     return manifest
@@ -61,14 +61,14 @@ def checked(directory: Path) -> Manifest:
     st.lists(st.text(min_size=1)),
 )  # fmt: skip
 def test_a_manifest_is_read_as_it_was_written(process, made_at, ids, logs):
-    """Whatever names and numbers are in it: its own checksum fits."""
+    """A manifest with any names and numbers is read back equal, and its checksum matches."""
     told = replace(MANIFEST, process=process, made_at=made_at, ids=tuple(ids), logs=tuple(logs))
     with written({}, told) as directory:
         assert checked(directory) == told
 
 
 def test_a_whole_image_passes():
-    """Each file has its checksum."""
+    """An intact image passes, with the size and CRC-32 of each file."""
     with written() as directory:
         manifest = checked(directory)
         assert manifest.checksums == {name: zlib.crc32(data) for name, data in FILES.items()}
@@ -76,7 +76,7 @@ def test_a_whole_image_passes():
 
 
 def test_a_file_of_many_pieces_has_the_checksum_of_the_whole(monkeypatch):
-    """A file is read in bounded pieces, the last of which is shorter."""
+    """A file that is read in several pieces, the last one shorter, has the whole's checksum."""
     monkeypatch.setattr(image, "_PIECE", 100)
     with written() as directory:
         assert checked(directory).checksums["criu/pages-1.img"] == zlib.crc32(
@@ -86,7 +86,7 @@ def test_a_file_of_many_pieces_has_the_checksum_of_the_whole(monkeypatch):
 
 @given(st.data(), st.sampled_from(sorted(FILES)), st.integers(0, 7))
 def test_any_flipped_bit_of_a_file_is_named(data, name, bit):
-    """Where the size is the same only the checksum tells; it says which file, and what to do."""
+    """A change that keeps the size is found by checksum; the error names file and remedy."""
     position = data.draw(st.integers(0, len(FILES[name]) - 1))
     with written() as directory:
         changed = bytearray(FILES[name])
@@ -98,7 +98,7 @@ def test_any_flipped_bit_of_a_file_is_named(data, name, bit):
 
 
 def test_a_file_that_has_gone_since_is_named():
-    """Between the look at the sizes and that at the contents, or where the disk cannot read it."""
+    """A file that vanishes between the size check and the checksum is named in the error."""
     with written() as directory:
         manifest = image.read(directory)
         (directory / "criu/pstree.img").unlink()
@@ -107,7 +107,7 @@ def test_a_file_that_has_gone_since_is_named():
 
 
 def test_a_wrong_size_says_what_to_do():
-    """As a wrong checksum does."""
+    """A wrong size gives the same advice as a wrong checksum."""
     with written() as directory:
         (directory / "files/0").write_bytes(b"1\n")
         with pytest.raises(CriuError, match=r"2 bytes instead of 6.* `rosrm restart brain`"):
@@ -116,7 +116,7 @@ def test_a_wrong_size_says_what_to_do():
 
 @given(st.data(), st.integers(1, 255))
 def test_a_changed_byte_of_the_manifest_changes_nothing_or_is_refused(data, difference):
-    """A path or a pid that were others would restore another process than was dumped."""
+    """A changed manifest is refused, because another path or pid would restore another process."""
     with written() as directory:
         path, before = directory / image.MANIFEST, checked(directory)
         changed = bytearray(path.read_bytes())
@@ -127,7 +127,7 @@ def test_a_changed_byte_of_the_manifest_changes_nothing_or_is_refused(data, diff
 
 
 def test_without_checksums_sizes_alone_are_looked_at():
-    """An image of a move is read once less on each host; the transfer has a checksum."""
+    """An image of a migration has no checksums, because the transfer has one; sizes are checked."""
     with written(checksums=False) as directory:
         assert checked(directory).checksums == {}
         (directory / "criu/pstree.img").unlink()
@@ -136,14 +136,14 @@ def test_without_checksums_sizes_alone_are_looked_at():
 
 
 def as_before(directory: Path, **values: object) -> None:
-    """A manifest of format 1, which had no checksums, with some other values."""
+    """Write a manifest of format 1, which had no checksums, with some other values."""
     told: dict[str, Any] = asdict(image.read(directory))
     del told["checksums"]
     (directory / image.MANIFEST).write_text(json.dumps({"format": 1, **told, **values}))
 
 
 def test_an_old_manifest_is_read():
-    """What was checkpointed before there were checksums can be restored."""
+    """A checkpoint from the time before checksums can be restored."""
     with written() as directory:
         before = checked(directory)
         as_before(directory)
@@ -163,7 +163,7 @@ def test_an_old_manifest_is_read():
     ],
 )
 def test_a_manifest_of_another_form_is_refused(values, said):
-    """One sentence says what is wrong in it."""
+    """An invalid manifest is refused with a message that names the fault."""
     with written() as directory:
         as_before(directory, **values)
         with pytest.raises(CriuError, match=said):
@@ -171,7 +171,7 @@ def test_a_manifest_of_another_form_is_refused(values, said):
 
 
 def test_checksums_lie_in_the_image_too():
-    """Nothing beside it is ever read."""
+    """A checksum of a path outside the image is refused, so that no such file is read."""
     with written() as directory:
         image.write(directory, replace(image.read(directory), checksums={"../secret": 1}))
         with pytest.raises(CriuError, match=r"'\.\./secret' does not lie in"):

@@ -1,4 +1,4 @@
-"""Why CRIU failed: the lines of its logs that say so."""
+"""Extraction of causes from CRIU's logs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RESTORE = """\
 (00.03) Error (criu/cr-restore.c:1536): 12012 exited, status=1
 (00.04) Error (criu/cr-restore.c:2613): Restoring FAILED.
 """
-#: The processes' own lines are indented there.
+#: In this output, the lines of child processes are indented.
 WITHOUT_TIMES = """\
 Error (criu/util.c:1534): rlimit: Can't setup RLIMIT_NOFILE for self: Operation not permitted
   1189: Error (criu/sk-inet.c:1059): inet: Can't bind inet socket: in use

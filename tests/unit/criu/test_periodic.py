@@ -1,4 +1,4 @@
-"""Periodic images: which one counts, how often it is used, and what runs where there is none."""
+"""Periodic images: the valid one, the number of its uses, and the start without an image."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def parent(tmp_path):
 
 
 def image(parent):
-    """One that is dumped, and does not count yet."""
+    """Create an image that is dumped but not valid yet."""
     slot = slots.new_slot(parent)
     slot.mkdir(parents=True)
     (slot / "manifest.json").write_text("{}")
@@ -30,7 +30,7 @@ def image(parent):
 
 
 def test_the_newest_complete_image_counts(parent):
-    """Not one that is still being dumped; the one before goes when the next is complete."""
+    """An image under way is not used; a complete image replaces the previous one."""
     assert slots.newest(parent) is None
     first = image(parent)
     assert slots.newest(parent) is None
@@ -43,7 +43,7 @@ def test_the_newest_complete_image_counts(parent):
 
 
 def test_an_image_is_started_from_twice_at_most(parent):
-    """Who crashes again and again for what it remembers begins anew; a newer image counts again."""
+    """A process that keeps crashing starts without its image, until there is a newer image."""
     slot = image(parent)
     slots.complete(slot, REJOIN)
     assert [slots.newest(parent) is not None for _ in range(4)] == [True, True, False, False]
@@ -53,7 +53,7 @@ def test_an_image_is_started_from_twice_at_most(parent):
 
 
 def test_what_a_dump_has_left_goes(parent):
-    """The image that counts stays."""
+    """The rest of a dump is removed, and the valid image stays."""
     whole = image(parent)
     slots.complete(whole, REJOIN)
     torn = image(parent)
@@ -63,7 +63,7 @@ def test_what_a_dump_has_left_goes(parent):
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"control": "/x"}'])
 def test_a_damaged_one_is_named(parent, content):
-    """It cannot be told how its node would join."""
+    """An image without readable rejoin parameters is refused."""
     slot = image(parent)
     (slot / "rejoin.json").write_text(content)
     with pytest.raises(CriuError, match="is damaged: rejoin"):
@@ -71,7 +71,7 @@ def test_a_damaged_one_is_named(parent, content):
 
 
 def test_who_is_to_begin_anew_does_so_once(parent):
-    """Not even from an image that became complete meanwhile; those of its next life count."""
+    """`begin_anew` removes all images once, including one completed since; later ones are used."""
     slot = image(parent)
     slots.begin_anew(parent)
     slots.complete(slot, REJOIN)
@@ -83,7 +83,7 @@ def test_who_is_to_begin_anew_does_so_once(parent):
 
 
 def test_numbers_grow(parent):
-    """The tenth is newer than the ninth."""
+    """Images are ordered by number: the tenth is newer than the ninth."""
     for _ in range(10):
         slot = image(parent)
         slots.complete(slot, REJOIN)
@@ -102,7 +102,7 @@ def start(parent, *then):
 
 
 def test_without_an_image_it_is_the_process_itself(parent):
-    """Same pid, environment, exit code and Python's signals as by default."""
+    """Without an image, the process runs with its own exit code and Python's default signals."""
     program = (
         "import os, signal, sys\n"
         "print(signal.getsignal(signal.SIGINT), os.environ['HOME'])\nsys.exit(7)"
@@ -114,13 +114,13 @@ def test_without_an_image_it_is_the_process_itself(parent):
 
 
 def test_sigpipe_ends_it_as_ever(parent):
-    """A Python ignores it, and what it becomes would, too."""
+    """SIGPIPE ends the process, although Python ignores it and execve keeps ignored signals."""
     done = start(parent, "sh", "-c", "kill -PIPE $$; echo went on")
     assert (done.returncode, done.stdout) == (-13, "")
 
 
 def test_an_image_that_is_damaged_is_said_and_the_process_begins_anew(parent):
-    """As it would have without any."""
+    """A damaged image is logged, and the process starts without it."""
     slot = image(parent)
     (slot / "rejoin.json").write_text("{")
     done = start(parent, "echo", "anew")
@@ -129,7 +129,7 @@ def test_an_image_that_is_damaged_is_said_and_the_process_begins_anew(parent):
 
 
 def test_a_program_that_is_missing_is_named(parent):
-    """In the log, with an exit code."""
+    """A missing program is named in the log, and the exit code is 1."""
     done = start(parent, "/nonesuch")
     assert (done.returncode, done.stderr) == (
         1, "/nonesuch cannot be started: No such file or directory\n",
@@ -137,7 +137,7 @@ def test_a_program_that_is_missing_is_named(parent):
 
 
 def test_it_asks_the_node_to_join_before_it_is_restored(parent, tmp_path):
-    """The request lies there; that there is no CRIU here is said by who restores."""
+    """The request to rejoin is written before the shim runs, which then fails without CRIU."""
     control = tmp_path / "control"
     slot = image(parent)
     slots.complete(slot, Rejoin(str(control), "p#1-periodic-1", os.geteuid()))

@@ -1,4 +1,4 @@
-"""Paths in CRIU's images are changed, and nothing else."""
+"""Changes of paths in CRIU's images, and of nothing else."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def field(number: int, value: int | bytes) -> bytes:
 
 
 def image_of(*paths: str, rest: bytes = b"") -> bytes:
-    """As CRIU writes it: `rest` is a message of another kind of file."""
+    """Return a files.img like CRIU's; `rest` is a message of another kind of file."""
     regular = field(1, 7) + field(2, 1 << 40) + field(5, field(1, 3))
     messages = [
         field(1, 1) + field(2, 7) + field(3, regular + field(6, path.encode())) for path in paths
@@ -37,7 +37,7 @@ def image_of(*paths: str, rest: bytes = b"") -> bytes:
 
 
 def test_only_paths_at_and_below_the_directory_are_changed(tmp_path):
-    """Not one that merely begins with the same letters, nor text of another kind of file."""
+    """A path that only begins with the same letters, and text of other files, stay unchanged."""
     images = tmp_path / "criu"
     images.mkdir()
     before = image_of("/a/work", "/a/work/x", "/a/working", "/b", rest=b"/a/work")
@@ -55,7 +55,7 @@ def test_only_paths_at_and_below_the_directory_are_changed(tmp_path):
 
 @pytest.mark.parametrize(("old", "new"), [("", "/new"), ("/old", ""), ("/same", "/same")])
 def test_what_is_the_same_here_is_left_alone(tmp_path, old, new):
-    """No copy is made, whatever the image holds."""
+    """Equal or unknown directories need no copy of the image."""
     with relocation.images(tmp_path, old, new) as changed:
         assert changed == tmp_path
 
@@ -64,7 +64,7 @@ def test_what_is_the_same_here_is_left_alone(tmp_path, old, new):
     "data", [b"magicnum\x05", b"magicnum\x02\0\0\0\x1a\xff", b"magicnum\1\0\0\0\7"]
 )
 def test_an_image_that_is_none_is_refused(tmp_path, data):
-    """Cut short, or of another format: said in one sentence."""
+    """A truncated image, or one of another format, is refused as damaged."""
     images = tmp_path / "criu"
     images.mkdir()
     (images / "files.img").write_bytes(data)
@@ -77,7 +77,7 @@ def test_an_image_that_is_none_is_refused(tmp_path, data):
 
 @given(st.lists(st.sampled_from(["a", "b", "work"]), max_size=4))
 def test_moved_there_and_back_is_the_same(names):
-    """As in a chain of hops."""
+    """A path survives a change to another directory and back, as in a chain of migrations."""
     path = "/home/work/" + "/".join(names)
     there = relocation.moved(path, "/home/work", "/other/place")
     assert there.startswith("/other/place")

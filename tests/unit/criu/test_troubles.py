@@ -1,4 +1,4 @@
-"""What CRIU 4.2.1 said in our trials, and what rosrm makes of it."""
+"""Explanations of the messages that CRIU 4.2.1 gave in trials."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rosrm_criu.engine import log_messages
     ],
 )  # fmt: skip
 def test_why_it_could_not_be_dumped(said, meaning):
-    """The resource is named."""
+    """The explanation of a failed dump names the resource."""
     assert meaning in log_messages.of_dump(
         f"CRIU 4.2.1 could not dump: {said} (its log: /a/dump.log)"
     )
@@ -42,10 +42,10 @@ def test_why_it_could_not_be_dumped(said, meaning):
     ],
 )
 def test_why_it_could_not_be_restored(said, meaning):
-    """What this host lacks is named."""
+    """The explanation of a failed restore names what this host lacks."""
     assert re.search(meaning, log_messages.of_restore(f"CRIU 4.2.1 could not restore: {said}"))
 
 
 def test_what_is_not_in_the_table_is_passed_on():
-    """No guess is made."""
+    """An unknown message gets no explanation."""
     assert log_messages.of_dump("something new") == log_messages.of_restore("something new") == ""

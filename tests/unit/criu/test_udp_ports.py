@@ -1,4 +1,4 @@
-"""UDP ports that are kept for a process in its image: from whom, and for whom."""
+"""Reservation of the UDP ports of a checkpointed process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosrm_criu.engine import udp_ports
 
 @pytest.fixture
 def ours():
-    """A UDP socket of this process, bound as Fast DDS binds its own."""
+    """Yield a UDP socket of this process, bound like one of Fast DDS."""
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     one.bind(("127.0.0.1", 0))
     yield one
@@ -20,7 +20,7 @@ def ours():
 
 
 def bind(port: int, *, shared: bool) -> None:
-    """Bind the port for a moment; raises OSError where it is in use."""
+    """Bind the port for a moment; raise OSError if it is in use."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         if shared:
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -28,7 +28,7 @@ def bind(port: int, *, shared: bool) -> None:
 
 
 def test_the_ports_of_a_process_are_seen(ours):
-    """With the address that they are bound to, by IPv4 and IPv6."""
+    """Bound ports are listed with their addresses, for IPv4 and IPv6."""
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as other:
         other.bind(("::1", 0))
         found = udp_ports.bound([os.getpid()])
@@ -38,7 +38,7 @@ def test_the_ports_of_a_process_are_seen(ours):
 
 
 def test_a_reserved_port_is_for_who_shares_it_alone(ours):
-    """A new participant gets another one; CRIU's socket and the original owner's may be beside."""
+    """A reserved port admits sockets with SO_REUSEADDR, like CRIU's, but no new participant."""
     port = ours.getsockname()[1]
     ports = [one for one in udp_ports.bound([os.getpid()]) if one.port == port]
     ours.close()
@@ -54,13 +54,13 @@ def test_a_reserved_port_is_for_who_shares_it_alone(ours):
 
 
 def test_a_port_that_is_in_use_is_left_alone(ours):
-    """The restore will tell."""
+    """A port in use is not reserved, and causes no error before the restore."""
     port = udp_ports.Port(socket.AF_INET, "127.0.0.1", ours.getsockname()[1])
     assert udp_ports.reserve([port]) == []
 
 
 def test_ports_are_remembered_and_what_cannot_be_read_is_none(tmp_path):
-    """An image without them is restored all the same."""
+    """A missing or damaged file of ports counts as no ports, so that the restore can proceed."""
     path, ports = tmp_path / "kept-1.ports", [udp_ports.Port(socket.AF_INET, "0.0.0.0", 7412)]
     udp_ports.write(path, ports)
     assert udp_ports.read(path) == ports

@@ -1,4 +1,4 @@
-"""Who moves a node asks it by files: what is asked, awaited and refused; real processes."""
+"""Requests to a node by files: delivery, waiting and refusal, with real processes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def directory(tmp_path):
 
 @pytest.fixture
 def node(directory):
-    """The node's side, running."""
+    """Return the listener of a running node."""
     listener = Listener(directory)
     listener.say(Status(State.RUNNING))
     return listener
@@ -50,7 +50,7 @@ def node(directory):
 
 @pytest.fixture
 def start():
-    """Starts programs in Python, and ends them."""
+    """Return a function that starts Python programs; kill them at the end."""
     started = []
 
     def start(program: str) -> subprocess.Popen:
@@ -89,11 +89,11 @@ def join(node: Listener) -> Request:
     return request
 
 
-# --- the good course ---
+# --- successful requests ---
 
 
 def test_a_node_leaves_and_joins_when_it_is_asked_to(directory, node) -> None:
-    """What is asked is heard once, and each state is seen by who awaits it."""
+    """The node gets each request once, and clients that wait see each state."""
     ask_prepare(directory, None, "m1")
     assert leave(node) == Request("m1", Want.LEAVE)
     assert await_left(directory, "m1", 0.0).state is State.LEFT
@@ -104,7 +104,7 @@ def test_a_node_leaves_and_joins_when_it_is_asked_to(directory, node) -> None:
 
 
 def test_what_is_awaited_may_come_later(directory, node) -> None:
-    """Waiting ends when the node answers, not with the time."""
+    """A wait ends with the node's answer, before the timeout."""
     ask_prepare(directory, None, "m1")
     later = threading.Timer(0.1, leave, [node])
     later.start()
@@ -113,14 +113,14 @@ def test_what_is_awaited_may_come_later(directory, node) -> None:
 
 
 def test_times_and_missing_peers_arrive(directory, node) -> None:
-    """What the node tells of an absence is what is read."""
+    """A client reads the status exactly as the node wrote it."""
     status = Status(State.RUNNING, "m1", "", {"leave": 0.25}, ("readers of /count: 0 of 1",))
     node.say(status)
     assert status_of(directory) == status
 
 
 def test_the_directory_of_a_process_is_found_in_the_middle_of_its_execve(directory) -> None:
-    """On one processor the parent runs again before the child's execve has set the environment."""
+    """The directory is found even while the child's execve has not set the environment yet."""
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     try:
@@ -136,11 +136,11 @@ def test_the_directory_of_a_process_is_found_in_the_middle_of_its_execve(directo
         os.sched_setaffinity(0, allowed)
 
 
-# --- what comes twice, late, or in another order ---
+# --- repeated, late and reordered requests ---
 
 
 def test_a_request_that_comes_twice_does_nothing(directory, node) -> None:
-    """Asked again while it is away, and again after it is back: nothing happens."""
+    """A repeated request has no effect, neither while the node is away nor after its rejoin."""
     for _ in range(2):
         ask_prepare(directory, None, "m1")
     leave(node)
@@ -156,7 +156,7 @@ def test_a_request_that_comes_twice_does_nothing(directory, node) -> None:
 
 
 def test_a_node_that_is_called_back_before_it_left_stays(directory, node) -> None:
-    """Who awaits that it leaves is told so; a late word to leave of that attempt does nothing."""
+    """A withdrawn departure fails its wait, and a late request of its attempt has no effect."""
     ask_prepare(directory, None, "m1")
     ask_resume(directory, None, "m1")
     assert node.asked() is None
@@ -168,7 +168,7 @@ def test_a_node_that_is_called_back_before_it_left_stays(directory, node) -> Non
 
 
 def test_a_node_that_is_away_answers_another_request_to_leave(directory, node) -> None:
-    """It is where it is wanted; any later request brings it back, and both are over then."""
+    """A node that is away confirms another departure; one rejoin with any newer id ends both."""
     ask_prepare(directory, None, "m1")
     leave(node)
     ask_prepare(directory, None, "m2")
@@ -182,7 +182,7 @@ def test_a_node_that_is_away_answers_another_request_to_leave(directory, node) -
 
 
 def test_what_an_earlier_process_was_asked_does_not_count(directory, node) -> None:
-    """A process that is started again in the same directory runs, whatever lies there."""
+    """A new process in the same directory ignores the old process's files."""
     ask_prepare(directory, None, "m1")
     leave(node)
     again = Listener(directory)
@@ -192,7 +192,7 @@ def test_what_an_earlier_process_was_asked_does_not_count(directory, node) -> No
 
 
 def test_what_an_earlier_process_was_asked_can_be_asked_again(directory, node) -> None:
-    """A cluster whose journal was removed gives the same numbers once more."""
+    """A new process accepts a used id, because a cluster without its journal assigns it again."""
     ask_prepare(directory, None, "m1")
     leave(node)
     again = Listener(directory)
@@ -202,7 +202,7 @@ def test_what_an_earlier_process_was_asked_can_be_asked_again(directory, node) -
 
 
 def test_a_restored_node_finds_what_was_asked_at_the_same_path(directory, node) -> None:
-    """The directory may be made anew, and the request lie there before the node runs again."""
+    """The directory may be created again, with the request in it before the node runs again."""
     ask_prepare(directory, None, "m1")
     leave(node)
     remove_directory(directory)
@@ -213,11 +213,11 @@ def test_a_restored_node_finds_what_was_asked_at_the_same_path(directory, node) 
     assert await_joined(directory, "m1", 0.0).state is State.RUNNING
 
 
-# --- refused, failed, not there ---
+# --- refusals, failures and missing nodes ---
 
 
 def test_who_does_not_leave_says_why(directory, node) -> None:
-    """A refusal reaches who awaits; the node runs."""
+    """A refusal ends the wait with its reason, and the node still runs."""
     ask_prepare(directory, None, "m1")
     request = node.asked()
     node.done(Status(State.RUNNING, request.id, "sockets are open"))
@@ -226,7 +226,7 @@ def test_who_does_not_leave_says_why(directory, node) -> None:
 
 
 def test_who_cannot_join_says_why(directory, node) -> None:
-    """A failure reaches who awaits at once, whatever the request."""
+    """A failure of the node ends any wait at once with its reason."""
     node.say(Status(State.FAILED, "m1", "ValueError: no camera"))
     with pytest.raises(PortableError, match="cannot join the ROS graph again: ValueError: no cam"):
         await_joined(directory, "m1", PATIENCE)
@@ -235,13 +235,13 @@ def test_who_cannot_join_says_why(directory, node) -> None:
 
 
 def test_a_process_without_a_portable_node_is_not_asked(directory) -> None:
-    """No status, no node: it is said what is missing."""
+    """A request without a status fails; the error names `run_portable`."""
     with pytest.raises(PortableError, match="run_portable"):
         ask_prepare(directory, None, "m1")
 
 
 def test_the_signal_goes_to_nobody_whom_it_would_end(directory, node, start) -> None:
-    """A process that neither catches nor blocks it is not asked, and lives."""
+    """A process that neither catches nor blocks the signal gets no request, and survives."""
     process = start("")
     with pytest.raises(PortableError, match=f"does not catch signal {SIGNAL}"):
         ask_prepare(directory, process.pid, "m1")
@@ -259,7 +259,7 @@ threading.Thread(target=lambda: (signal.sigwait([{0}]), os._exit(42))).start()
 
 @pytest.mark.parametrize("how", [CATCHES, BLOCKS], ids=["caught", "blocked"])
 def test_the_signal_wakes_who_catches_or_awaits_it(directory, node, start, how) -> None:
-    """The request lies there, and the process is woken."""
+    """A process that catches or blocks the signal gets the request and the signal."""
     process = start(how.format(SIGNAL))
     ask_prepare(directory, process.pid, "m1")
     assert process.wait(PATIENCE) == 42
@@ -267,19 +267,19 @@ def test_the_signal_wakes_who_catches_or_awaits_it(directory, node, start, how) 
 
 
 def test_a_process_that_has_ended_is_not_waited_for(directory, node, start) -> None:
-    """Dead, or dead and not reaped: said at once."""
+    """A wait for an ended process fails at once, also before the process is reaped."""
     process = start("")
     ask_prepare(directory, None, "m1")
     process.send_signal(signal.SIGKILL)
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-    for _ in range(2):  # a zombie, then nothing
+    for _ in range(2):  # first a zombie, then reaped
         with pytest.raises(PortableError, match=f"process {process.pid} has ended"):
             await_left(directory, "m1", PATIENCE, process.pid)
         process.wait()
 
 
 def test_a_stopped_process_is_named_when_the_time_has_passed(directory, node, start) -> None:
-    """The time-out says what was awaited, of whom, and what keeps it."""
+    """The timeout error names the awaited state, the request, and the stopped process."""
     process = start("")
     process.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, process.pid, os.WSTOPPED)
@@ -293,7 +293,7 @@ def test_a_stopped_process_is_named_when_the_time_has_passed(directory, node, st
 
 
 def test_the_time_out_of_joining_says_how_it_stands(directory, node) -> None:
-    """Likewise; with no process named, nothing is said of one."""
+    """The timeout error names the node's state, and no process if none was given."""
     ask_prepare(directory, None, "m1")
     leave(node)
     with pytest.raises(PortableError, match=r"joined .* again within 0 s .*: it is left$"):
@@ -304,7 +304,7 @@ def test_the_time_out_of_joining_says_how_it_stands(directory, node) -> None:
 
 
 def test_a_node_that_waits_opens_nothing(directory, node, monkeypatch) -> None:
-    """It may be dumped at any moment, and what it has open then has to lie at the other host."""
+    """A waiting node opens no file, because an open file must exist on the destination too."""
     ask_prepare(directory, None, "m1")
     leave(node)
     with monkeypatch.context() as waiting:
@@ -321,14 +321,14 @@ def test_a_node_that_waits_opens_nothing(directory, node, monkeypatch) -> None:
      b'{"format": 1, "state": "left", "request": 7, "fault": "", "seconds": {}, "missing": []}'],
 )  # fmt: skip
 def test_a_damaged_status_is_said(directory, node, content) -> None:
-    """Whatever lies there: an error that names the file, and no traceback of ours."""
+    """A damaged status raises an error that names the file."""
     (directory / "status").write_bytes(content)
     with pytest.raises(PortableError, match="status"):
         status_of(directory)
 
 
 def test_a_damaged_request_is_left_alone(directory, node, capfd) -> None:
-    """The node runs on, says so once in its log, and hears the next one."""
+    """The node logs a damaged request once, runs on, and accepts the next request."""
     (directory / "request").write_bytes(b"nonsense")
     assert node.asked() is None
     assert node.asked() is None
@@ -338,7 +338,7 @@ def test_a_damaged_request_is_left_alone(directory, node, capfd) -> None:
 
 
 def test_a_status_is_seen_as_a_whole(directory, node) -> None:
-    """Read while it is written again and again, it is always the one or the other."""
+    """A reader sees one complete status or the other while they are replaced repeatedly."""
     over = threading.Event()
     one, other = Status(State.RUNNING, "a" * 2000), Status(State.LEFT, "b")
 
@@ -359,7 +359,7 @@ def test_a_status_is_seen_as_a_whole(directory, node) -> None:
 
 
 def test_a_node_whose_directory_is_gone_goes_on(directory, node, capfd) -> None:
-    """It says so in its log; nothing else happens to it."""
+    """A node with a removed directory logs the failed write and runs on."""
     remove_directory(directory)
     node.say(Status(State.LEFT, "m1"))
     assert node.status.state is State.LEFT
@@ -367,21 +367,21 @@ def test_a_node_whose_directory_is_gone_goes_on(directory, node, capfd) -> None:
 
 
 def test_an_orderly_end_leaves_no_portable_node(directory, node) -> None:
-    """Nobody can be asked any more, and nothing is left."""
+    """A regular end removes the status and the directory."""
     node.close()
     assert status_of(directory) is None
     assert not directory.exists()
 
 
 def test_a_directory_is_readable_by_its_owner_alone(directory) -> None:
-    """Who may write there could have a node leave."""
+    """A control directory has mode 0700, because a writer could make the node leave."""
     make_directory(directory / "deep")
     assert (directory / "deep").stat().st_mode & 0o777 == 0o700
     assert directory.stat().st_mode & 0o777 == 0o700
 
 
 def test_a_directory_that_others_can_write_is_refused(directory) -> None:
-    """Also where that is one above it."""
+    """A parent directory that others can write to is refused."""
     directory.mkdir()
     directory.chmod(0o777)
     with pytest.raises(PortableError, match="open to all"):

@@ -1,6 +1,6 @@
-"""A control directory may be another user's: whatever links that one puts there, none is followed.
+"""Symbolic links in control directories of another user, none of which is followed.
 
-The slave may be root. Each test does what a user could, with real files.
+The slave may be root. Each test does with real files what such a user could do.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from rosrm_criu.control import (
 from rosrm_criu.control.listener import Listener
 from rosrm_criu.control.messages import write_request, write_status
 
-#: A user who owns nothing.
+#: Uid of a user who owns nothing.
 NOBODY = 65534
 
 
 @pytest.fixture
 def precious(tmp_path):
-    """A file of ours, which no user may change, and the directory that it is in."""
+    """Return a file of this process's user, alone in its directory; no test may change it."""
     (tmp_path / "etc").mkdir()
     file = tmp_path / "etc" / "precious"
     file.write_text("ours")
@@ -41,14 +41,14 @@ def precious(tmp_path):
 
 @pytest.fixture
 def directory(tmp_path):
-    """A control directory."""
+    """Return a new control directory."""
     make_directory(tmp_path / "user" / "c")
     return tmp_path / "user" / "c"
 
 
 @pytest.fixture
 def of_nobody(tmp_path, monkeypatch):
-    """A control directory of another user, which is not made yet; root alone can make it."""
+    """Return the path of another user's control directory, which only root can create."""
     if os.geteuid() != 0:
         pytest.skip("only root can give a directory to another user")
     monkeypatch.setattr(client, "control_root", lambda uid: tmp_path / f"rosrm-{uid}" / "portable")
@@ -56,7 +56,7 @@ def of_nobody(tmp_path, monkeypatch):
 
 
 def unchanged(precious: Path) -> bool:
-    """It is as it was, and alone."""
+    """Return True if the file is unchanged, and still alone in its directory."""
     return (
         precious.read_text() == "ours"
         and precious.stat().st_uid == precious.parent.stat().st_uid == os.geteuid()
@@ -66,7 +66,7 @@ def unchanged(precious: Path) -> bool:
 
 @pytest.mark.parametrize("name", ["request", ".request.new", "status", ".status.new"])
 def test_what_is_written_goes_through_no_link(directory, precious, name) -> None:
-    """The link is replaced; neither what it led to, nor a second name of a file, is written to."""
+    """A write replaces a link, and changes neither its target nor another name of the file."""
     for make in (os.symlink, os.link):
         (directory / name).unlink(missing_ok=True)
         make(precious, directory / name)
@@ -77,7 +77,7 @@ def test_what_is_written_goes_through_no_link(directory, precious, name) -> None
 
 
 def test_nothing_is_written_where_a_link_leads(directory, precious) -> None:
-    """Neither in place of the directory, nor of one above it; it is said."""
+    """A write fails if the directory, or one above it, is a link."""
     for link in (directory, directory.parent):
         there = link.rename(link.with_name(f"{link.name}-there"))
         for leads_to in (precious.parent, there):
@@ -90,14 +90,14 @@ def test_nothing_is_written_where_a_link_leads(directory, precious) -> None:
 
 
 def test_what_is_read_is_no_link(directory, precious) -> None:
-    """Of another user's files nothing shows, not even whether they are there."""
+    """A read through a link fails, and does not reveal whether its target exists."""
     (directory / "status").symlink_to(precious)
     with pytest.raises(PortableError, match="status cannot be read"):
         status_of(directory)
 
 
 def test_a_directory_is_not_made_where_a_link_leads(tmp_path, precious) -> None:
-    """It is refused before anything is made there, and the link is named."""
+    """A link on the path of a new directory is refused by name before anything is created."""
     (tmp_path / "portable").symlink_to(precious.parent)
     with pytest.raises(PortableError, match=f"{tmp_path / 'portable'} is no directory"):
         make_directory(tmp_path / "portable" / "c")
@@ -105,7 +105,7 @@ def test_a_directory_is_not_made_where_a_link_leads(tmp_path, precious) -> None:
 
 
 def test_a_directory_is_removed_through_no_link(tmp_path, directory, precious) -> None:
-    """What a link leads to stays, in the directory's place and above it; so does what is in it."""
+    """A removal keeps the targets of links, in the directory, in its place, and above it."""
     (directory / "status").symlink_to(precious)
     remove_directory(directory)
     assert not directory.exists()
@@ -117,7 +117,7 @@ def test_a_directory_is_removed_through_no_link(tmp_path, directory, precious) -
 
 
 def test_a_node_makes_its_directory_as_carefully(tmp_path, precious) -> None:
-    """One that anybody could write to is refused: who can write there, can have it leave."""
+    """A listener refuses a link, and a directory in which others could make its node leave."""
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
     with pytest.raises(PortableError, match="open to all"):
@@ -129,7 +129,7 @@ def test_a_node_makes_its_directory_as_carefully(tmp_path, precious) -> None:
 
 
 def test_another_users_directory_is_given_to_that_user(of_nobody) -> None:
-    """With all that had to be made above it; what was there stays whose it is."""
+    """The user owns all newly created directories, and existing ones keep their owners."""
     make_directory(of_nobody, NOBODY)
     make_directory(of_nobody, NOBODY)
     made = (of_nobody, of_nobody.parent, of_nobody.parent.parent)
@@ -138,7 +138,7 @@ def test_another_users_directory_is_given_to_that_user(of_nobody) -> None:
 
 
 def test_nothing_else_is_given_to_a_user(of_nobody, precious, monkeypatch) -> None:
-    """Who has put a link in the place of a new directory at once does not get what it leads to."""
+    """A link that replaces a new directory at once does not give its target to the user."""
     mkdir = os.mkdir
 
     def mkdir_and_swap(path, *arguments, **named) -> None:
@@ -155,7 +155,7 @@ def test_nothing_else_is_given_to_a_user(of_nobody, precious, monkeypatch) -> No
 
 
 def test_a_user_gets_no_directory_elsewhere(of_nobody, precious) -> None:
-    """A process says by itself where it is spoken to: that may be anywhere."""
+    """A path outside the user's control root is refused, since a process could report any path."""
     with pytest.raises(PortableError, match=r"no control directory of user 65534"):
         make_directory(precious.parent / "cron.d", NOBODY)
     assert unchanged(precious)

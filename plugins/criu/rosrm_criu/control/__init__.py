@@ -1,8 +1,8 @@
-"""How a running node is asked to leave the ROS graph and to join it again, through small files.
+"""File-based requests to a running node to leave the ROS graph and to rejoin it.
 
-A process that is to be dumped by CRIU may hold no socket and no pipe to the outside, so it is
-spoken to by two files in a directory of its own and a signal that wakes it: `messages` has the
-files, `client` is for who asks, `listener` for the node. Nothing here needs ROS.
+A process that CRIU is to dump may hold no socket and no pipe to the outside. So requests and
+answers are two files in a directory per node, and a signal wakes the node. `messages` defines the
+files, `client` is the requesting side, `listener` the node's side. Nothing here needs ROS.
 """
 
 from rosrm_criu.control.client import (

@@ -1,7 +1,7 @@
-"""For who moves a node: ask it to leave the ROS graph or to join it again, and await that.
+"""Client side of a control directory: request graph departure or rejoin, and await the result.
 
-The node finds its directory by a path that is fixed when its process starts, and keeps it through a
-move: at another host the very same path has to exist (`make_directory`) before it is restored.
+The path of the directory is fixed when the node's process starts, and a move keeps it. So the same
+path must exist on the destination (`make_directory`) before the process is restored there.
 """
 
 from __future__ import annotations
@@ -27,21 +27,24 @@ from rosrm_criu.control.messages import (
     write_request,
 )
 
-#: Seconds between two looks at a status: the standard library cannot await the change of a file.
+#: Seconds between two reads of a status file; the standard library cannot wait for a file change.
 _LOOK: Final = 0.005
 
 
 def control_root(uid: int) -> Path:
-    """The directory of all control directories of a user: a path that every host can make."""
+    """Return the parent of all control directories of a user; every host can create this path."""
     return Path(f"/tmp/rosrm-{uid}/portable")  # noqa: S108 - owner and mode are checked
 
 
 def control_directory(token: str, uid: int) -> Path:
-    """Where the node of one instance is spoken to.
+    """Return the control directory of one instance.
 
     Args:
-        token: of the instance, unique on all hosts that share this /tmp; a plain file name.
-        uid: of the user that the process runs as.
+        token: names the instance, unique on all hosts that share this /tmp; a plain file name.
+        uid: the user that the process runs as.
+
+    Raises:
+        PortableError: the token is no plain file name.
     """
     if not token or "/" in token or token.startswith("."):
         raise PortableError(f"{token!r} cannot name a control directory: a plain file name can")
@@ -49,10 +52,10 @@ def control_directory(token: str, uid: int) -> Path:
 
 
 def directory_of(pid: int) -> Path | None:
-    """Where the node of a process is spoken to, as it was told at its start; None: nowhere.
+    """Return the control directory that a process got at its start; None: it got none.
 
     Raises:
-        OSError: it has ended, or is not ours to look at.
+        OSError: the process has ended, or may not be read by this user.
     """
     mark = f"{VARIABLE}=".encode()
     variables = read_environment(pid)
@@ -61,15 +64,15 @@ def directory_of(pid: int) -> Path | None:
 
 
 def make_directory(directory: Path, uid: int | None = None) -> None:
-    """Make a control directory, before a process starts or is restored; nothing of it remains.
+    """Create an empty control directory, before a process starts or is restored.
 
     Args:
-        directory: absolute; readable by its owner alone. Of another user it has to be one of
-            `control_directory`: a process says by itself where it is spoken to.
-        uid: whose it is to be; None: our own.
+        directory: an absolute path, readable by its owner alone. For another user it must be
+            one of `control_directory`, because a process chooses the path that it reports.
+        uid: the owner; None: this process's user.
 
     Raises:
-        PortableError: it cannot be made, or is somebody else's.
+        PortableError: it cannot be created, or belongs to another user.
     """
     owner = os.geteuid() if uid is None else uid
     if owner != os.geteuid() and directory != control_directory(directory.name, owner):
@@ -84,29 +87,29 @@ def make_directory(directory: Path, uid: int | None = None) -> None:
             f"the control directory {directory} cannot be made: {error.strerror}"
         ) from None
     remove_status(directory)
-    remove_request(directory)  # nobody asks before there is a status
+    remove_request(directory)  # requests follow only after the node has written a status
 
 
 def remove_directory(directory: Path) -> None:
-    """Nobody is spoken to there any more."""
+    """Remove a control directory, which no node listens to any more."""
     remove(directory)
 
 
 def status_of(directory: Path) -> Status | None:
-    """How the node stands; None: no portable node runs there (yet). Raises `PortableError`."""
+    """Return the node's status; None: no portable node runs there (yet). Raise `PortableError`."""
     return read_status(directory)
 
 
 def ask_prepare(directory: Path, pid: int | None, request_id: str) -> None:
-    """Ask a running node to leave the ROS graph. The same request a second time does nothing.
+    """Request graph departure from a running node. Repeating the same request has no effect.
 
     Args:
         directory: its control directory.
-        pid: its process, which is woken; None: it looks by itself, four times a second.
-        request_id: of this attempt to move it; never used before.
+        pid: its process, which gets a signal; None: the node polls four times a second.
+        request_id: identifies this attempt to move the node; never used before.
 
     Raises:
-        PortableError: it cannot be asked: what to do is said.
+        PortableError: the request cannot be delivered; the message says what to do.
     """
     status = _status_to_ask(directory)
     if status.state is State.FAILED:
@@ -115,32 +118,32 @@ def ask_prepare(directory: Path, pid: int | None, request_id: str) -> None:
 
 
 def ask_resume(directory: Path, pid: int | None, request_id: str) -> None:
-    """Ask a node that has left to join again; one that has not left yet, to stay.
+    """Request a rejoin from a node that has left; a node that has not left yet stays.
 
-    It may be asked before it is restored (`pid` None): then it joins as soon as it runs.
+    The request may precede the restore (`pid` None): then the node rejoins as soon as it runs.
 
     Args:
-        directory: its control directory; at another host the path is the same.
-        pid: its process, which is woken; None: it looks by itself, twenty times a second.
-        request_id: with which it was asked to leave.
+        directory: its control directory; on another host the path is the same.
+        pid: its process, which gets a signal; None: the node polls every 10 ms while away.
+        request_id: the one of the request to leave.
 
     Raises:
-        PortableError: it cannot be asked: what to do is said.
+        PortableError: the request cannot be delivered; the message says what to do.
     """
     _ask(directory, pid, Request(request_id, Want.JOIN))
 
 
 def await_left(directory: Path, request_id: str, timeout: float, pid: int | None = None) -> Status:
-    """Wait until a node has left: no ROS is in it any more, it can be dumped.
+    """Wait until a node has left: it holds no ROS entity any more and can be dumped.
 
     Args:
         directory: its control directory.
-        request_id: of `ask_prepare`.
+        request_id: the one given to `ask_prepare`.
         timeout: seconds.
-        pid: its process; it is not waited for when that has ended.
+        pid: its process; the wait ends when that process ends.
 
     Raises:
-        PortableError: it refused, failed, was called back, or the time passed.
+        PortableError: the node refused or failed, the request was withdrawn, or the timeout passed.
     """
     status = _await(directory, request_id, State.LEFT, timeout, pid)
     if status.state is State.LEFT:
@@ -155,16 +158,16 @@ def await_left(directory: Path, request_id: str, timeout: float, pid: int | None
 def await_joined(
     directory: Path, request_id: str, timeout: float, pid: int | None = None
 ) -> Status:
-    """Wait until a node runs again in the ROS graph.
+    """Wait until a node runs in the ROS graph again.
 
     Args:
         directory: its control directory.
-        request_id: of `ask_resume`.
+        request_id: the one given to `ask_resume`.
         timeout: seconds.
-        pid: its process; it is not waited for when that has ended.
+        pid: its process; the wait ends when that process ends.
 
     Raises:
-        PortableError: it failed, or the time passed.
+        PortableError: the node failed, or the timeout passed.
     """
     status = _await(directory, request_id, State.RUNNING, timeout, pid)
     if status.state is State.FAILED:
@@ -197,7 +200,7 @@ def _ask(directory: Path, pid: int | None, request: Request) -> None:
 
 
 def listens(pid: int) -> bool:
-    """Whether a process waits to be asked; one that has ended does not."""
+    """Return True if a process handles the request signal; an ended process does not."""
     try:
         _check_catches(pid)
     except PortableError:
@@ -206,9 +209,9 @@ def listens(pid: int) -> bool:
 
 
 def _check_catches(pid: int) -> None:
-    """A process that neither catches the signal nor awaits it would be ended by it.
+    """Raise `PortableError` unless the process catches or blocks the signal, which would kill it.
 
-    Who holds a restored process blocks all signals, and passes them on.
+    The shim of a restored process blocks all signals and forwards them.
     """
     status = _of_process(pid)
     safe = int(status.get("SigCgt", "0"), 16) | int(status.get("SigBlk", "0"), 16)
@@ -220,7 +223,7 @@ def _check_catches(pid: int) -> None:
 
 
 def _of_process(pid: int) -> dict[str, str]:
-    """Lines of /proc/PID/status; raises `PortableError` when the process has ended."""
+    """Return the lines of /proc/PID/status; raise `PortableError` if the process has ended."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -234,7 +237,7 @@ def _of_process(pid: int) -> dict[str, str]:
 def _await(
     directory: Path, request_id: str, wanted: State, timeout: float, pid: int | None
 ) -> Status:
-    """The first status that answers a request, or is final."""
+    """Return the first status that answers a request or is final."""
     deadline = time.monotonic() + timeout
     while True:
         status = read_status(directory)
@@ -252,7 +255,7 @@ def _is_answer(status: Status, request_id: str, wanted: State) -> bool:
         return True
     if status.request != request_id:
         return False
-    # RUNNING answers who awaits that it left, too: it was refused, or called back.
+    # RUNNING also answers a wait for LEFT: the node refused, or the request was withdrawn.
     return status.state in (wanted, State.RUNNING)
 
 
@@ -276,7 +279,7 @@ def _standing(request_id: str, status: Status | None) -> str:
 
 
 def _doing(pid: int | None) -> str:
-    """What keeps it, as far as that can be seen from outside."""
+    """Describe the likely cause of the delay, as far as /proc shows it."""
     if pid is None:
         return ""
     if _of_process(pid).get("State", "")[:1] in "tT":

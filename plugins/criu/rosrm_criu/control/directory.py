@@ -1,8 +1,8 @@
-"""A control directory, as everybody opens it: no link is followed, neither to it nor in it.
+"""Safe access to a control directory: no symbolic link is followed, neither on the path nor inside.
 
-It may belong to another user than the one who writes there, and that may be root: a link in the
-place of a file or directory would have it write, give away or remove what it leads to. So each part
-of the path is opened in the one before it, by descriptors. Standard library alone.
+The directory may belong to another user than the writer, and the writer may be root. Through a
+link, root would write, chown or remove the link's target. So each part of the path is opened by
+file descriptor, relative to the one before. Standard library only.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from typing import Final
 from rosrm.errors import PortableError
 
 _DIRECTORY: Final = os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-#: To go on from, where nothing may be read.
+#: Opens a directory only to descend from it; works without read permission.
 _WAY: Final = os.O_PATH | _DIRECTORY
 
 
 @contextlib.contextmanager
 def opened(directory: Path) -> Iterator[int]:
-    """A descriptor of it; raises `OSError`, also where a link lies on the way."""
+    """Yield a descriptor of a directory; raise `OSError`, also for a symbolic link on the path."""
     with contextlib.ExitStack() as way:
         here = _go(way, "/")
         for name in directory.absolute().parts[1:]:
@@ -32,15 +32,16 @@ def opened(directory: Path) -> Iterator[int]:
 
 
 def make(directory: Path, owner: int) -> None:
-    """Make it, and what is missing above it, where nobody but its owner can write.
+    """Create a directory and its missing parents, writable by their owner alone.
 
     Args:
-        directory: absolute; what is made is readable by its owner alone.
-        owner: the user whose it is to be.
+        directory: an absolute path; new directories are readable by their owner alone.
+        owner: uid of the user who is to own them.
 
     Raises:
-        OSError: it cannot be made.
-        PortableError: something on the way is no directory, somebody else's, or open to all.
+        OSError: a directory cannot be created.
+        PortableError: part of the path is no directory, belongs to another user, or is writable by
+            everyone.
     """
     with contextlib.ExitStack() as way:
         here, path = _go(way, "/"), Path("/")
@@ -55,7 +56,7 @@ def make(directory: Path, owner: int) -> None:
 
 
 def remove(directory: Path) -> None:
-    """Remove it, and the files in it, as far as that can be done."""
+    """Remove a directory and the files in it; ignore errors."""
     with contextlib.suppress(OSError):
         with opened(directory) as here:
             listing = os.open(".", os.O_RDONLY | _DIRECTORY, dir_fd=here)
@@ -78,7 +79,7 @@ def _go(way: contextlib.ExitStack, name: str, above: int | None = None, flags: i
 def _go_or_make(way: contextlib.ExitStack, name: str, above: int, owner: int) -> int:
     with contextlib.suppress(FileNotFoundError):
         return _go(way, name, above)
-    with contextlib.suppress(FileExistsError):  # somebody else makes it just now
+    with contextlib.suppress(FileExistsError):  # another process creates it at the same time
         os.mkdir(name, 0o700, dir_fd=above)
     new = _go(way, name, above, os.O_RDONLY | _DIRECTORY)
     if owner != os.fstat(new).st_uid == os.geteuid():
@@ -87,7 +88,7 @@ def _go_or_make(way: contextlib.ExitStack, name: str, above: int, owner: int) ->
 
 
 def _check(path: Path, descriptor: int, owner: int) -> None:
-    """Who may write there could have a node leave: nobody but its owner and root may."""
+    """Raise `PortableError` unless only owner and root can write: writers can make a node leave."""
     state = os.fstat(descriptor)
     open_to_all = state.st_mode & stat.S_IWOTH and not state.st_mode & stat.S_ISVTX
     if state.st_uid not in {0, owner, os.geteuid()} or open_to_all:

@@ -1,4 +1,4 @@
-"""The node's side of its control directory: what it is asked, and what it answers."""
+"""The node's side of its control directory: reads requests and writes the status."""
 
 from __future__ import annotations
 
@@ -21,24 +21,23 @@ from rosrm_criu.control.messages import (
     write_status,
 )
 
-#: Absences that are remembered: a request of theirs that comes late does nothing.
+#: Finished absences to remember; a late request of one of them has no effect.
 _REMEMBERED: Final = 1000
-#: Seconds after which the status is written anew: those who clean /tmp take what nobody touches.
+#: Seconds until the status is written again: cleaners of /tmp remove files that stay untouched.
 _FRESH: Final = 3600.0
 
 
 class Listener:
-    """Hears requests, each once, and says how the node stands.
+    """Reader of requests, each once, and writer of the node's status.
 
     Args:
-        directory: it is made where it does not exist. At the start of a process nothing of an
-            earlier one counts.
+        directory: created if missing. Files of an earlier process there are removed.
 
     Raises:
-        PortableError: it cannot be used, or others could write there.
+        PortableError: it cannot be used, or other users could write there.
 
     Attributes:
-        status: as it was said last.
+        status: the last one that was written.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -52,7 +51,7 @@ class Listener:
         make_directory(directory)
 
     def asked(self) -> Request | None:
-        """What the node shall do now, as it stands; None: nothing new."""
+        """Return the request that the node has to act on now; None: there is no new one."""
         if time.monotonic() > self._said + _FRESH:
             self.say(self.status)
         request = self._read()
@@ -64,14 +63,14 @@ class Listener:
         standing = Want.JOIN if self.status.state is State.RUNNING else Want.LEAVE
         if request.want is not standing:
             return request
-        # It stands where it is wanted: called back before it left, or asked twice to leave.
+        # The node is already in the requested state: withdrawn before it left, or requested twice.
         if request.want is Want.JOIN:
             self._over.append(request.id)
         self.say(Status(self.status.state, request.id))
         return None
 
     def say(self, status: Status) -> None:
-        """Tell whoever looks. Who waits has a time-out, should it not be writable."""
+        """Write the status. If that fails, log it; clients that wait have a timeout."""
         if self.status.request not in ("", status.request):
             self._over.append(self.status.request)
         self.status = status
@@ -82,23 +81,23 @@ class Listener:
             self._complain(f"{self._directory} cannot be written: {error.strerror}")
 
     def enter(self, state: State, request: str = "") -> None:
-        """Say the next state of an absence; its times so far stand."""
+        """Write the next state of an absence; its measured times are kept."""
         self.say(replace(self.status, state=state, request=request or self.status.request))
 
     def done(self, status: Status) -> None:
-        """Say that an absence is over, one way or another."""
+        """Write the final status of an absence, successful or not."""
         self._over.append(status.request)
         self.say(status)
 
     def close(self) -> None:
-        """The process ends in good order: nobody is spoken to there any more."""
+        """Remove the control directory at the regular end of the process."""
         remove_directory(self._directory)
 
     def _read(self) -> Request | None:
-        """What is asked; None: nothing that was not read before.
+        """Return the request, if its file has changed since the last read; otherwise None.
 
-        A node that is away looks often, and may be dumped meanwhile. What it has open then has to
-        lie at the other host too, and this file does not.
+        A node that is away polls often, and may be dumped at any moment. A file that is open then
+        must exist on the destination too, and this one does not.
         """
         edition = edition_of_request(self._directory)
         if edition == self._edition:
@@ -112,7 +111,7 @@ class Listener:
         return found
 
     def _complain(self, fault: str) -> None:
-        """Once, in the log of the process: there may be no ROS just now."""
+        """Log a fault once to standard error, because rclpy's logging may be down."""
         if fault != self._fault:
             self._fault = fault
             print(f"rosrm: {fault}", file=sys.stderr, flush=True)  # noqa: T201 - its log

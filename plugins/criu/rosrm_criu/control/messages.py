@@ -1,11 +1,11 @@
-"""The two files of a control directory: `request`, what a node is asked; `status`, how it stands.
+"""The two files of a control directory: `request`, for the node; `status`, its state.
 
     RUNNING -> LEAVING -> LEFT -> JOINING -> RUNNING
                   |                  |
                   +-> (refused)      +-> FAILED
                       RUNNING
 
-Each is one JSON object, at most 64 KiB, and is replaced as a whole. Standard library alone.
+Each is one JSON object of at most 64 KiB, and is replaced atomically. Standard library only.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from typing import Any, Final
 from rosrm.errors import PortableError
 from rosrm_criu.control.directory import opened
 
-#: Names the control directory in the environment of a process.
+#: Environment variable that names the control directory of a process.
 VARIABLE: Final = "ROSRM_PORTABLE"
 
-#: Wakes a node that was asked something. A real-time signal: SIGUSR1 and SIGUSR2 belong to authors
-#: and their libraries (faulthandler, loggers). Its default is to end a process, so it goes only to
-#: one that catches it. The first real-time signals are debuggers' and libraries' favourites.
+#: Wakes a node that has a request. A real-time signal, because SIGUSR1 and SIGUSR2 belong to node
+#: authors and their libraries (faulthandler, loggers). By default it ends a process, so it is sent
+#: only to one that catches it. Debuggers and libraries prefer the first real-time signals.
 SIGNAL: Final = int(signal.SIGRTMIN) + 5
 
 FORMAT: Final = 1
@@ -40,14 +40,14 @@ _PRESENT: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class Want(Enum):
-    """What a node is asked for."""
+    """The action that a request asks for."""
 
     LEAVE = "leave"
     JOIN = "join"
 
 
 class State(Enum):
-    """Where a node stands."""
+    """A node's relation to the ROS graph."""
 
     RUNNING = "running"
     LEAVING = "leaving"
@@ -58,11 +58,11 @@ class State(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a node is asked.
+    """One request to a node.
 
     Attributes:
-        id: of one absence: the same for leaving and for joining again, and never used anew.
-        want: of the two.
+        id: identifies one absence: the same for leaving and rejoining, and never reused.
+        want: the action.
     """
 
     id: str
@@ -71,15 +71,16 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How a node stands.
+    """The state of a node, as the node reports it.
 
     Attributes:
-        state: of its part in the ROS graph.
-        request: id of the newest request that it has taken up; "": none yet.
-        fault: why that was refused, or why it has failed; "": neither.
-        seconds: how long the steps of the last absence took: "leave"; "enter" the graph and see the
-            other ends again, with "entries", how many it took; "join", until its peers are found.
-        missing: peers that it had before it left, and did not find again in time.
+        state: its relation to the ROS graph.
+        request: id of the newest request that it has accepted; "": none yet.
+        fault: why that request was refused, or why the node failed; "": neither.
+        seconds: durations of the steps of the last absence: "leave"; "enter", until the node sees
+            the other endpoints again; "join", until it has matched its peers. Besides these,
+            "entries" is the number of attempts to enter the graph.
+        missing: peers that it had before it left and did not match again in time.
     """
 
     state: State
@@ -90,15 +91,15 @@ class Status:
 
 
 def write_request(directory: Path, request: Request) -> None:
-    """Ask; raises `OSError`."""
+    """Write a request; raise `OSError`."""
     _write(directory, _REQUEST, {"id": request.id, "want": request.want.value})
 
 
 def read_request(directory: Path) -> Request | None:
-    """What is asked; None: nothing.
+    """Return the request; None: there is none.
 
     Raises:
-        PortableError: what lies there is no request.
+        PortableError: the file holds no valid request.
     """
     found = _read(directory, _REQUEST)
     if found is None:
@@ -110,7 +111,7 @@ def read_request(directory: Path) -> Request | None:
 
 
 def edition_of_request(directory: Path) -> tuple[int, ...]:
-    """Another one for each request that is written; (): there is none. It opens no file."""
+    """Return a value that differs for each written request; (): none. Opens no file."""
     try:
         found = os.lstat(directory / _REQUEST)
     except OSError:
@@ -119,7 +120,7 @@ def edition_of_request(directory: Path) -> tuple[int, ...]:
 
 
 def write_status(directory: Path, status: Status) -> None:
-    """Say how a node stands; raises `OSError`."""
+    """Write the status of a node; raise `OSError`."""
     content = {
         "state": status.state.value,
         "request": status.request,
@@ -131,10 +132,10 @@ def write_status(directory: Path, status: Status) -> None:
 
 
 def read_status(directory: Path) -> Status | None:
-    """How the node stands; None: there is none that says so.
+    """Return the status of the node; None: there is none.
 
     Raises:
-        PortableError: what lies there is no status.
+        PortableError: the file holds no valid status.
     """
     found = _read(directory, _STATUS)
     if found is None:
@@ -150,12 +151,12 @@ def read_status(directory: Path) -> Status | None:
 
 
 def remove_status(directory: Path) -> None:
-    """No node stands here any more."""
+    """Remove the status file."""
     _remove(directory, _STATUS)
 
 
 def remove_request(directory: Path) -> None:
-    """Nothing is asked."""
+    """Remove the request file."""
     _remove(directory, _REQUEST)
 
 
@@ -171,11 +172,11 @@ def _text(value: Any) -> str:
 
 
 def _write(directory: Path, name: str, content: Mapping[str, Any]) -> None:
-    """Replace a file as a whole: who reads it finds the old one or the new one."""
+    """Replace a file atomically: a reader finds the old content or the new one."""
     beside = f".{name}.new"
     with opened(directory) as place:
         with contextlib.suppress(FileNotFoundError):
-            os.unlink(beside, dir_fd=place)  # whatever it was, it is not written through
+            os.unlink(beside, dir_fd=place)  # a link left there must not be written through
         with os.fdopen(os.open(beside, _NEW, 0o666, dir_fd=place), "w", encoding="utf-8") as file:
             json.dump({"format": FORMAT, **content}, file)
         os.replace(beside, name, src_dir_fd=place, dst_dir_fd=place)
@@ -184,7 +185,7 @@ def _write(directory: Path, name: str, content: Mapping[str, Any]) -> None:
 def _read(directory: Path, name: str) -> dict[str, Any] | None:
     path = directory / name
     try:
-        # Whatever somebody put there, it neither blocks nor fills the memory.
+        # The flags keep a FIFO from blocking, and the size limit keeps a large file out of memory.
         with opened(directory) as place:
             descriptor = os.open(name, _PRESENT, dir_fd=place)
         with os.fdopen(descriptor, "rb") as file:

@@ -1,1 +1,1 @@
-"""CRIU: a process as files, and a process again. Optional: without it everything else works."""
+"""CRIU engine: process dump and restore. Optional: without CRIU everything else in rosrm works."""

@@ -1,6 +1,6 @@
-"""The program CRIU: where it is, and how it is run.
+"""The CRIU program: search and execution.
 
-Looked for in this order: the environment variable `ROSRM_CRIU` (a path), the private prefix that
+Search order: the environment variable `ROSRM_CRIU` (a path), the private prefix that
 `rosrm criu install` fills, and PATH.
 """
 
@@ -21,29 +21,29 @@ from typing import Final
 from rosrm.errors import CriuError
 from rosrm_criu.engine.log_reader import causes, first_words
 
-#: Names the program itself; nothing else is looked at then.
+#: Environment variable with the path of the program; if it is set, nothing else is searched.
 PROGRAM_VARIABLE: Final = "ROSRM_CRIU"
-#: Names the private prefix.
+#: Environment variable with the path of the private prefix.
 PREFIX_VARIABLE: Final = "ROSRM_CRIU_PREFIX"
-#: Below a prefix.
+#: Path of the program below a prefix.
 PROGRAM: Final = "bin/criu"
-#: Older ones cannot dump a process with an internet socket, which every ROS node has.
+#: Oldest usable version; older ones cannot dump an internet socket, which every ROS node has.
 OLDEST: Final = (4, 2)
 
 #: Seconds for `criu --version`.
 _ANSWER: Final = 10.0
 _CAP_SYS_ADMIN: Final = 21  # linux/capability.h
-#: An ordinary user's PATH leaves out where Debian has it.
+#: Folders that Debian uses for CRIU and that an ordinary user's PATH lacks.
 _PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin"
 
 
 @dataclass(frozen=True)
 class Criu:
-    """A CRIU that starts; what it can do here is for `rosrm_criu.engine.probe` to say.
+    """A CRIU that starts; `rosrm_criu.engine.probe` tests its capability on this host.
 
     Args:
-        command: the program, and what has to stand before every argument.
-        version: as it says itself: "4.2.1".
+        command: the program, and the words that precede every argument.
+        version: as CRIU reports it, e.g. "4.2.1".
     """
 
     command: tuple[str, ...]
@@ -51,7 +51,7 @@ class Criu:
 
     @property
     def number(self) -> tuple[int, ...]:
-        """The version, to compare it."""
+        """Return the version as a tuple of numbers, for comparisons."""
         return tuple(map(int, re.findall(r"\d+", self.version)))
 
     def run(
@@ -62,23 +62,23 @@ class Criu:
         log: Path,
         pass_fds: Sequence[int] = (),
     ) -> None:
-        """Run CRIU and wait for its end; with `--unprivileged`, unless we may do all.
+        """Run CRIU and wait for its end; without CAP_SYS_ADMIN, pass `--unprivileged`.
 
-        It has a session of its own: a Ctrl-C that is meant for us does not cut a dump in two.
-        A process whose dump is cut off goes on; but where CRIU was to kill it after the dump, it
-        may have done so by then.
+        CRIU runs in a session of its own, so that a Ctrl-C for this process does not interrupt a
+        dump. A process whose dump is interrupted continues to run. If CRIU was to kill it after the
+        dump, it may already be dead.
 
         Args:
-            arguments: the first one is what it shall do: `dump`, `restore`, ...
-            timeout: seconds; it is killed when they have passed.
-            log: its log, written anew; an absolute path.
-            pass_fds: open files that it gets under the same numbers.
+            arguments: the first one is the CRIU command: `dump`, `restore`, ...
+            timeout: seconds; then CRIU is killed.
+            log: CRIU's log file, an absolute path; an existing file is replaced.
+            pass_fds: file descriptors that CRIU inherits under the same numbers.
 
         Raises:
-            CriuError: it failed, with the lines of its log that say why; or its time passed.
+            CriuError: CRIU failed (with the lines of its log that say why), or the timeout passed.
         """
         unprivileged = () if may_do_all() else ("--unprivileged",)
-        log.unlink(missing_ok=True)  # an older one would be taken for the cause
+        log.unlink(missing_ok=True)  # otherwise its errors would be reported as the cause
         words = [*self.command, *arguments, *unprivileged, "--log-file", str(log)]
         with tempfile.TemporaryFile("w+", errors="replace") as said:
             try:
@@ -106,13 +106,13 @@ class Criu:
 
 
 def find(prefix: Path | None = None) -> Criu:
-    """The CRIU to use here.
+    """Return the CRIU to use on this host.
 
     Args:
         prefix: the private prefix, instead of the default one.
 
     Raises:
-        CriuError: there is none that starts: where it was looked for, and what to do.
+        CriuError: none starts; the message names the places searched, and what to do.
     """
     named = os.environ.get(PROGRAM_VARIABLE, "")
     if named:
@@ -135,12 +135,12 @@ def find(prefix: Path | None = None) -> Criu:
     raise CriuError("; ".join([*broken, f"there is no CRIU here ({looked})"]) + f". {REMEDY}")
 
 
-#: What to do where there is none.
+#: Remedy in error messages if there is no CRIU.
 REMEDY: Final = "`rosrm criu install` brings one, without touching the system"
 
 
 def opened(program: Path) -> Criu:
-    """A program that is to be a CRIU; raises `CriuError` where it does not answer as one."""
+    """Return a program as a `Criu`; raise `CriuError` if it does not answer like CRIU."""
     try:
         answer = subprocess.run(
             [program, "--version"],
@@ -169,14 +169,14 @@ def opened(program: Path) -> Criu:
 
 
 def may_do_all() -> bool:
-    """Whether this process has CAP_SYS_ADMIN: root does, but not in every container."""
+    """Return True if this process has CAP_SYS_ADMIN: root does, but not in every container."""
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
     effective = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
     return effective is not None and bool(int(effective[1], 16) >> _CAP_SYS_ADMIN & 1)
 
 
 def default_prefix() -> Path:
-    """Where `rosrm criu install` puts it: below the user's data directory, or as it is told."""
+    """Return the prefix of `rosrm criu install`: PREFIX_VARIABLE, or the user's data directory."""
     told = os.environ.get(PREFIX_VARIABLE, "")
     if told:
         return Path(told).absolute()
@@ -186,14 +186,14 @@ def default_prefix() -> Path:
 
 
 def _end_of(process: subprocess.Popen[bytes], timeout: float) -> int | None:
-    """Its exit code; None where its time passed: then it and its children have been ended."""
+    """Return the exit code; None: the timeout passed, and the process group was killed."""
     code = None
     try:
         code = process.wait(timeout)
     except subprocess.TimeoutExpired:
         pass
     finally:
-        if code is None:  # also where we are interrupted: nobody would wait for it
+        if code is None:  # also if this wait is interrupted: the process would never be reaped
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
@@ -201,7 +201,7 @@ def _end_of(process: subprocess.Popen[bytes], timeout: float) -> int | None:
 
 
 def _why(log: Path, output: str) -> str:
-    """The cause, from the log, or from what it said before it had one."""
+    """Return the cause of a failure from the log, or from earlier output if there is no log."""
     try:
         written = log.read_text(errors="replace")
     except OSError:

@@ -1,8 +1,8 @@
-"""Whether a process that is dumped here can be restored there.
+"""Compatibility of two hosts for a dump on one and a restore on the other.
 
-Each host tells *facts* about itself: text by name, as `compatibility_facts` gathers them. What
-cannot be told by them (a library of another version) CRIU itself finds out in the restore, which
-fails then, and the source goes on.
+Each host reports *facts* about itself: strings by name, as `compatibility_facts` collects them.
+Other differences (such as another version of a library) show only when CRIU restores. The restore
+then fails, and the source continues to run.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 from rosrm.wording import listed
 
-#: The facts that are compared, each with its meaning.
+#: The names of the facts, each with its meaning.
 FACTS = {
     "version": "of CRIU",
     "kernel": "its release; told, but not compared: CRIU adapts a process to another kernel",
@@ -27,7 +27,7 @@ FACTS = {
 
 
 def mismatch(source: Mapping[str, str], destination: Mapping[str, str]) -> str:
-    """Why an image of one host cannot be restored at another one; "" where it can.
+    """Return the reason why an image of one host cannot be restored on another; "": it can.
 
     Args:
         source: facts of the host that dumps.

@@ -1,4 +1,4 @@
-"""What a host tells about itself, so that no image is sent where it cannot be restored."""
+"""Facts of a host that decide where its images can be restored."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Final
 
 from rosrm_criu.engine.binary import Criu, may_do_all
 
-#: What runs this program: its real path (`sys.executable` may be a link, or empty).
+#: Real path of the running interpreter (`sys.executable` may be a link, or empty).
 INTERPRETER: Final = os.path.realpath("/proc/self/exe")
 
-#: Of the many flags of an x86 processor those that a program may come to depend on: instructions
-#: and registers. Others are of the kernel, or differ without anybody's noticing.
+#: The x86 CPU flags that a program may depend on: instructions and registers. Other flags concern
+#: only the kernel, or may differ without effect on programs.
 _X86: Final = re.compile(
     r"mmx|fxsr|fpu|cx8|cx16|cmov|sse\w*|ssse3|pni|avx\w*|fma\w*|aes|vaes|v?pclmulqdq|popcnt|movbe|"
     r"f16c|bmi[12]|abm|adx|sha_ni|sha512|sm[34]|rdrand|rdseed|rdtscp|xsave\w*|fsgsbase|gfni|"
@@ -25,7 +25,7 @@ _X86: Final = re.compile(
 
 
 def facts_of(criu: Criu) -> Mapping[str, str]:
-    """The facts of this host, by the names of `rosrm_criu.engine.compatibility.FACTS`."""
+    """Return this host's facts, by the names of `rosrm_criu.engine.compatibility.FACTS`."""
     return {
         "version": criu.version,
         "kernel": platform.release(),
@@ -40,10 +40,10 @@ def facts_of(criu: Criu) -> Mapping[str, str]:
 
 
 def features(cpuinfo: str) -> str:
-    """The features that all processors of a machine have, sorted.
+    """Return the features that all CPUs of a machine have, sorted and separated by spaces.
 
     Args:
-        cpuinfo: /proc/cpuinfo: `flags` on x86, `Features` on ARM.
+        cpuinfo: content of /proc/cpuinfo: `flags` on x86, `Features` on ARM.
     """
     lines = re.findall(r"^(flags|Features)\s*:(.*)$", cpuinfo, re.MULTILINE)
     common = set.intersection(*(set(words.split()) for _, words in lines)) if lines else set()

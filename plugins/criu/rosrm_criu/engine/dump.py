@@ -1,8 +1,8 @@
-"""Dumps the process tree of an instance into an image; it stands still meanwhile.
+"""Dump of an instance's process tree into an image; the processes are stopped during the dump.
 
-Options of CRIU, and why: `--tcp-close`: TCP connections come back closed, for their other ends do
-not wait (listening and UDP sockets come back as they were); `--file-locks`: what is locked is
-locked again; `--manage-cgroups=ignore`: it comes back in the cgroup of its new instance.
+CRIU options and their reasons: `--tcp-close`: TCP connections are restored closed, because their
+peers do not wait (listening and UDP sockets are restored as they were). `--file-locks`: file locks
+are restored. `--manage-cgroups=ignore`: the process is restored in its new instance's cgroup.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from rosrm_criu.engine import external_resources, image, log_messages, open_file
 from rosrm_criu.engine.binary import Criu
 from rosrm_criu.engine.image import Manifest
 
-#: What both CRIU's dump and its restore are told.
+#: Options for both the dump and the restore.
 COMMON: Final = ("--tcp-close", "--file-locks", "--manage-cgroups=ignore")
 
-#: Seconds for CRIU to stop all threads; nothing was changed when they have passed.
+#: Seconds for CRIU to stop all threads; if they pass, nothing has changed.
 _FREEZE: Final = 10
-#: Seconds that a signal may take to stop a process or let it go on.
+#: Seconds for a signal to stop or continue a process.
 _SIGNAL: Final = 5.0
 
-#: What becomes of the process after the dump.
+#: State of the process after the dump.
 Leave = Literal["stopped", "running", "killed"]
 
 
@@ -46,25 +46,25 @@ def dump(
     instance: int = 0,
     checksums: bool = True,
 ) -> Manifest:
-    """Dump the tree of a process, and say what is in the image.
+    """Dump a process tree, and return the manifest of the image.
 
-    It may take its time: no loop should wait for it. Whatever fails, the process runs on.
+    A dump may take long: do not call it in an event loop. After any failure the process runs on.
 
     Args:
-        criu: to use.
-        pid: of the instance's leader, which may be a hold: then what it holds is dumped.
-        directory: of the image; an absolute path, empty or not there.
-        leave: what becomes of the process: "stopped" until `resume` or a SIGKILL, "running" or
+        criu: the CRIU to use.
+        pid: the instance's leader. If it is a shim, the process that it holds is dumped.
+        directory: of the image; an absolute path, empty or missing.
+        leave: state of the process afterwards: "stopped" until `resume` or a SIGKILL, "running" or
             "killed".
-        timeout: seconds. CRIU is killed when they have passed, which can harm the process; give it
-            many times what it needs (half a second for each GiB, and the time to write that).
+        timeout: seconds. Then CRIU is killed, which can harm the process; allow many times the
+            expected duration (half a second per GiB, plus the time to write that).
         process: its name, for the manifest.
-        instance: its number, likewise.
-        checksums: make those of the files, which reads the image once more: for an image that is
-            to lie on a disk. What goes to another host at once needs none.
+        instance: its number, for the manifest.
+        checksums: add checksums of the files, which reads the image once more. Needed for an image
+            that is stored on disk, but not for one that is sent to another host at once.
 
     Raises:
-        CriuError: what cannot be dumped, or what failed; the process runs as before.
+        CriuError: the process cannot be dumped, or the dump failed; the process runs as before.
     """
     root = process_tree.root_of(pid)
     if not process_tree.is_alive(root):
@@ -83,7 +83,7 @@ def dump(
             platform.machine(), inner_pid(root), (), (), "", _shelter(pid), "",
         ))  # fmt: skip
         if leave == "running" and not was_stopped:
-            resume(pid)  # the checksums are of files alone: it need not stand still for them
+            resume(pid)  # only files are read from here on, so the process may run
         if checksums:
             made = image.file_checksums(directory, manifest.sizes)
             manifest = replace(manifest, checksums=made)
@@ -100,19 +100,19 @@ def dump(
 
 
 def resume(pid: int) -> None:
-    """Let go on what a dump has left stopped.
+    """Continue a process that a dump has left stopped.
 
     Args:
-        pid: of the instance's leader.
+        pid: the instance's leader.
     """
     process_tree.send(process_tree.tree(process_tree.root_of(pid)), signal.SIGCONT)
 
 
 def kill(pid: int) -> None:
-    """End what was dumped, at once; its parent has to reap it before it is restored here.
+    """Kill a dumped process at once; its parent must reap it before a restore on this host.
 
     Args:
-        pid: of the instance's leader; a hold ends by itself then.
+        pid: the instance's leader; a shim ends when the process that it holds ends.
     """
     process_tree.send(reversed(process_tree.tree(process_tree.root_of(pid))), signal.SIGKILL)
 
@@ -137,14 +137,14 @@ def _run(criu: Criu, root: int, directory: Path, timeout: float, process: str) -
 
 
 def _meaning(root: int, message: str) -> str:
-    """What kept CRIU from it; the process is still there, so its descriptors tell what they are."""
+    """Return CRIU's reason in plain words; the process still exists, so check its descriptors."""
     for one, kind in external_resources.odd_descriptors(process_tree.tree(root)):
         return f"its file descriptor {one.number} is {kind}, which cannot be dumped"
     return log_messages.of_dump(message)
 
 
 def _describe(root: int, directory: Path, manifest: Manifest) -> Manifest:
-    """Complete the manifest; the processes stand still."""
+    """Complete the manifest, while the processes are stopped."""
     pids = process_tree.tree(root)
     logs = open_files.logs(root)
     working_directory = _link(root, "cwd")
@@ -161,7 +161,7 @@ def _describe(root: int, directory: Path, manifest: Manifest) -> Manifest:
 
 
 def _shelter(leader: int) -> str:
-    """The directory of its supervisor for those that name none; "" where it has no supervisor."""
+    """Return the supervisor's default working directory; "": there is no supervisor."""
     _, state = procfs.read_marks(leader)
     return paths.work_directory(state) if state else ""
 
@@ -179,7 +179,7 @@ def _told(directory: Path, error: Exception) -> str:
 
 
 def _go_on(root: int, was_stopped: bool) -> str:
-    """After a failure the process is to run as before; what is to be said where it does not."""
+    """Continue the process after a failed dump; return a remark if it does not run as before."""
     pids = process_tree.tree(root)
     if not was_stopped:
         process_tree.send([pid for pid in pids if process_tree.is_stopped(pid)], signal.SIGCONT)

@@ -1,6 +1,7 @@
-"""What ties a process to others outside of what is dumped: pipes, Unix sockets, a debugger.
+"""External resources of a process tree: pipes, Unix sockets and debuggers outside the dump.
 
-CRIU dumps most of them without a word; the restore fails, or the process finds nobody there.
+CRIU dumps most of them without an error. Later the restore fails, or the restored process finds no
+peer.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Final
 from rosrm.supervisor.procfs import everyone
 from rosrm_criu.engine.open_files import Descriptor, descriptors
 
-#: Of linux/netlink.h, linux/sock_diag.h and linux/unix_diag.h.
+#: Constants of linux/netlink.h, linux/sock_diag.h and linux/unix_diag.h.
 _NETLINK_SOCK_DIAG: Final = 4
 _SOCK_DIAG_BY_FAMILY: Final = 20
 _REQUEST_ALL: Final = 0x301
@@ -24,12 +25,12 @@ _PEER: Final = 2
 _DONE: Final = 3
 _ERROR: Final = 2
 
-#: How Fast DDS names its files in shared memory.
+#: Prefix of Fast DDS's files in shared memory.
 _OF_FAST_DDS: Final = "/dev/shm/fastrtps_"  # noqa: S108 - not a file of ours
 
 
 def outward(pids: Iterable[int]) -> str:
-    """What a process of the tree shares with one outside, in words; "" where there is nothing.
+    """Describe an external resource of a process tree; return "" if there is none.
 
     Args:
         pids: all processes of the tree.
@@ -55,7 +56,7 @@ def outward(pids: Iterable[int]) -> str:
 
 
 def tracer(pid: int) -> int:
-    """Who follows it by ptrace, as a debugger does; 0: nobody."""
+    """Return the pid of the process that traces this one by ptrace, e.g. a debugger; 0: none."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text(errors="replace").splitlines()
     except OSError:
@@ -64,14 +65,14 @@ def tracer(pid: int) -> int:
 
 
 def shared_memory(pids: Iterable[int]) -> str:
-    """What of Fast DDS a tree shares with its peers in memory, in words; "" where there is nothing.
+    """Describe the Fast DDS shared memory of a process tree; return "" if there is none.
 
-    The peers of one that stands still, or has ended, clear that away.
+    The peers of a process that is stopped or has ended remove its shared memory.
     """
     for pid in pids:
         try:
             maps = Path(f"/proc/{pid}/maps").read_text(errors="replace")
-        except OSError:  # it has ended
+        except OSError:  # the process has ended
             continue
         found = next((line for line in maps.splitlines() if _OF_FAST_DDS in line), "")
         if found:
@@ -85,7 +86,7 @@ def shared_memory(pids: Iterable[int]) -> str:
 
 
 def _half_pipes(held: Iterable[Descriptor]) -> Iterator[Descriptor]:
-    """One end of each pipe whose other end is not among them."""
+    """Yield one end of each pipe whose other end is not in `held`."""
     ends: dict[str, list[Descriptor]] = {}
     for one in held:
         if one.target.startswith("pipe:"):
@@ -104,7 +105,7 @@ def _holder_outside(target: str, inside: list[int]) -> str:
 
 
 def program(pid: int) -> str:
-    """The name of what a process runs."""
+    """Return the command name of a process, or "ended"."""
     try:
         return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
     except OSError:
@@ -120,7 +121,7 @@ def _inode(one: Descriptor) -> int:
 
 
 def _unix_peers() -> Mapping[int, int]:
-    """For each connected Unix socket of this network, by inode, the one that it is connected to."""
+    """Return the peer's inode for each connected Unix socket of this network namespace."""
     request = struct.pack("=BBHIIIII", socket.AF_UNIX, 0, 0, 0xFFFFFFFF, 0, _SHOW_PEER, 0, 0)
     header = struct.pack("=IHHII", 16 + len(request), _SOCK_DIAG_BY_FAMILY, _REQUEST_ALL, 0, 0)
     peers: dict[int, int] = {}
@@ -130,13 +131,13 @@ def _unix_peers() -> Mapping[int, int]:
             kernel.sendto(header + request, (0, 0))
             while _read_peers(kernel.recv(1 << 17), peers):
                 pass
-    except OSError:  # a kernel that does not tell: CRIU could not dump any socket then
+    except OSError:  # a kernel without sock_diag, on which CRIU cannot dump any socket
         return {}
     return peers
 
 
 def _read_peers(answer: bytes, peers: dict[int, int]) -> bool:
-    """Take one datagram of the kernel's; False: it was the last."""
+    """Add the peers of one kernel datagram; return False if it was the last one."""
     offset = 0
     while offset + 16 <= len(answer):
         length, kind = struct.unpack_from("=IH", answer, offset)
@@ -154,7 +155,7 @@ def _read_peers(answer: bytes, peers: dict[int, int]) -> bool:
 
 
 def odd_descriptors(pids: Iterable[int]) -> Iterator[tuple[Descriptor, str]]:
-    """Those that CRIU has most likely stumbled over, with what they are."""
+    """Yield the descriptors that most likely made CRIU fail, each with its kind."""
     for one in descriptors(pids):
         if one.target.startswith("anon_inode:[io_uring]"):
             yield one, "an io_uring"
@@ -163,7 +164,7 @@ def odd_descriptors(pids: Iterable[int]) -> Iterator[tuple[Descriptor, str]]:
 
 
 def _is_device(one: Descriptor) -> bool:
-    """Not one of those of memory and chance (`/dev/null`), which are everywhere the same."""
+    """Return True for a device, except memory and random ones (`/dev/null`), equal on all hosts."""
     try:
         status = os.stat(f"/proc/{one.pid}/fd/{one.number}")  # noqa: PTH116 - a link into nothing
     except OSError:

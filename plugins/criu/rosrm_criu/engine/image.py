@@ -1,10 +1,10 @@
-"""An image: a directory with all that is needed to restore a process, readable by its owner alone.
+"""Checkpoint image: a directory with everything that a restore needs, readable by its owner alone.
 
-manifest.json     what it is (see `Manifest`); written last, so what has none is incomplete
-criu/             what CRIU wrote
+manifest.json     description (see `Manifest`); written last: without it the image is incomplete
+criu/             CRIU's files
 files/            copies of the files that follow the process
-dump.log          what CRIU said; restore.log likewise
-hold.json         how the restore went (see `rosrm_criu.engine.shim`)
+dump.log          CRIU's log of the dump; restore.log: of the restore
+hold.json         the result of the restore (see `rosrm_criu.engine.shim`)
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from typing import Any, Final
 
 from rosrm.errors import CriuError
 
-#: What is written; another one is refused, but for the one before it.
+#: The format that is written. Only this one and its predecessor can be read.
 FORMAT: Final = 2
-#: Its manifest has neither checksums of the files nor one of its own.
+#: The predecessor, whose manifest has no checksums, neither of the files nor of itself.
 _WITHOUT_CHECKSUMS: Final = 1
 
 MANIFEST: Final = "manifest.json"
 PAGES: Final = "criu"
 COPIES: Final = "files"
-#: While it is restored: as `PAGES`, with the paths of this host.
+#: Exists during a restore: like `PAGES`, with the paths of this host.
 HERE: Final = f"{PAGES}.here"
 DUMP_LOG: Final = "dump.log"
 RESTORE_LOG: Final = "restore.log"
 
-#: Bytes that stay free on the file system of an image.
+#: Bytes to keep free on the file system of an image.
 _SPARE: Final = 16 << 20
-#: Bytes of a file that are in memory at a time for its checksum.
+#: Bytes per read while a file's checksum is computed.
 _PIECE: Final = 1 << 20
 
 
@@ -44,11 +44,12 @@ class HeldFile:
 
     Args:
         path: absolute, as the process knows it.
-        size: bytes, when it was dumped.
+        size: bytes at the time of the dump.
         mode: its permissions.
-        grows: the process only appends to it, so it may have another size at the restore, and is
-            made anew where it is missing.
-        copy: its copy below the image, which is put back; "": it has to lie there.
+        grows: the process only appends to it. So its size may differ at the restore, and it is
+            created if it is missing.
+        copy: path of its copy below the image, which the restore puts back; "": the file must
+            exist at the restore.
     """
 
     path: str
@@ -75,26 +76,26 @@ class MappedFile:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What an image is, and what its restore needs.
+    """Description of an image and of the requirements for its restore.
 
     Args:
         process: name of the process.
         instance: number of the instance that was dumped.
-        host: where, by its network name.
+        host: network name of the host of the dump.
         made_at: seconds since 1970.
-        criu: version that dumped it.
+        criu: version of the CRIU that dumped it.
         kernel: release of the kernel.
         machine: "x86_64", ...
-        pid: of the root, in its own pid namespace.
-        ids: of all its processes and threads there.
+        pid: of the root process, in its own pid namespace.
+        ids: of all processes and threads, in the same namespace.
         logs: files that were its standard output and error.
-        working_directory: of the root.
-        shelter: where the supervisor runs those that name no working directory; "": not known.
-        interpreter: the program that the root runs.
-        files: that were open.
-        mapped: files that were mapped.
-        sizes: bytes of each file below the image but the manifest.
-        checksums: CRC-32 of each of them; empty: none were made.
+        working_directory: of the root process.
+        shelter: the supervisor's default working directory; "": unknown.
+        interpreter: the program that the root process runs.
+        files: open files.
+        mapped: mapped files.
+        sizes: bytes of each file below the image except the manifest.
+        checksums: CRC-32 of each of these files; empty: none were computed.
     """
 
     process: str
@@ -117,12 +118,12 @@ class Manifest:
 
     @property
     def size(self) -> int:
-        """Bytes of the image, without the manifest."""
+        """Return the bytes of the image, without the manifest."""
         return sum(self.sizes.values())
 
 
 def create(directory: Path) -> None:
-    """An empty image; raises CriuError where there is something already, or it cannot be made."""
+    """Create an empty image; raise CriuError if it cannot be created or the directory has files."""
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         directory.chmod(0o700)
@@ -134,7 +135,7 @@ def create(directory: Path) -> None:
 
 
 def check_room(directory: Path, needed: int) -> None:
-    """Raise CriuError where an image of so many bytes has no room."""
+    """Raise CriuError if there is no room for an image of so many bytes."""
     free = shutil.disk_usage(directory).free
     if free < needed + _SPARE:
         raise CriuError(
@@ -144,7 +145,7 @@ def check_room(directory: Path, needed: int) -> None:
 
 
 def file_sizes(directory: Path) -> dict[str, int]:
-    """Bytes of each file that belongs to an image, by its path below it; makes them private."""
+    """Return the bytes of each file of an image by relative path; set each mode to 0600."""
     sizes = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
@@ -155,7 +156,7 @@ def file_sizes(directory: Path) -> dict[str, int]:
 
 
 def file_checksums(directory: Path, names: Iterable[str]) -> dict[str, int]:
-    """CRC-32 of files of an image, by their paths below it; raises OSError."""
+    """Return the CRC-32 of files of an image, by relative path; raise OSError."""
     return {name: _checksum_of_file(directory / name) for name in names}
 
 
@@ -179,10 +180,10 @@ def write(directory: Path, manifest: Manifest) -> None:
 
 
 def read(directory: Path) -> Manifest:
-    """The manifest of an image whose files are all there, at their sizes.
+    """Return the manifest of an image, after a check that all files exist with their sizes.
 
     Raises:
-        CriuError: it is no image, is incomplete or damaged, or of another format.
+        CriuError: it is no image, is incomplete or damaged, or has another format.
     """
     try:
         open_to_others = directory.stat().st_mode & 0o077
@@ -226,14 +227,14 @@ def _check_files(directory: Path, manifest: Manifest) -> None:
 
 
 def check_contents(directory: Path, manifest: Manifest) -> None:
-    """Compare each file with its checksum, where there are some; it reads the whole image.
+    """Compare each file with its checksum, if the manifest has any; this reads the whole image.
 
     Args:
         directory: of the image.
-        manifest: as it was read.
+        manifest: of the image, as `read` returns it.
 
     Raises:
-        CriuError: which file has changed, or cannot be read.
+        CriuError: a file has changed or cannot be read; the message names it.
     """
     for name, checksum in manifest.checksums.items():
         try:
@@ -250,7 +251,7 @@ def check_contents(directory: Path, manifest: Manifest) -> None:
 
 
 def _advice(manifest: Manifest) -> str:
-    """An image without checksums is one of a move: its process is still there."""
+    """Return advice for a damaged image; "" for one without checksums: its process still exists."""
     if not manifest.checksums:
         return ""
     return (
@@ -260,11 +261,11 @@ def _advice(manifest: Manifest) -> str:
 
 
 def remove(directory: Path, *, logs: bool = True) -> None:
-    """Remove what an image is made of; the directory, and how its restore went, stay.
+    """Remove the contents of an image, except the directory and the result of its restore.
 
     Args:
         directory: of the image.
-        logs: CRIU's too.
+        logs: remove CRIU's logs too.
     """
     for name in (MANIFEST, f"{MANIFEST}.new", *((DUMP_LOG, RESTORE_LOG) if logs else ())):
         (directory / name).unlink(missing_ok=True)
@@ -278,7 +279,7 @@ _KINDS: Final[Mapping[str, type]] = {"str": str, "int": int, "float": float, "bo
 
 
 def _whole(values: dict[str, Any], written: int) -> dict[str, Any]:
-    """What a manifest says, if that is what was written; in the format before nothing tells."""
+    """Return the manifest's values after a check of its checksum, which the old format lacks."""
     if written == _WITHOUT_CHECKSUMS:
         return {**values, "checksums": {}}
     own = values.pop("checksum")
@@ -288,7 +289,7 @@ def _whole(values: dict[str, Any], written: int) -> dict[str, Any]:
 
 
 def _checksum_of_values(values: dict[str, Any]) -> int:
-    """The same for what was read as for what was written."""
+    """Return a checksum of values, the same before writing and after reading."""
     return zlib.crc32(json.dumps(values, sort_keys=True).encode())
 
 
@@ -321,7 +322,7 @@ def _numbers(values: dict[str, Any], name: str) -> dict[str, int]:
 
 
 def _plain(kind: type[Any], values: dict[str, Any]) -> Any:
-    """A dataclass from an object that has exactly its fields, each of its type."""
+    """Return a dataclass from an object with exactly its fields and types."""
     for one in fields(kind):
         wanted = _KINDS.get(str(one.type))
         found = values[one.name]

@@ -1,13 +1,13 @@
-"""`rosrm criu install`: a working CRIU in a prefix of its own.
+"""`rosrm criu install`: installation of a working CRIU in a private prefix.
 
-    PREFIX/bin/criu         a link into the tree in use: changed last, and at once
-    PREFIX/trees/VERSION.X/ packages, unpacked; the program is changed so that it finds the C
-                            library and all others there, by path: a real binary, which may be
-                            given capabilities (a wrapper may not)
+    PREFIX/bin/criu         a link into the tree in use; changed last, atomically
+    PREFIX/trees/VERSION.X/ unpacked packages; the program is patched to load the C library and
+                            all other libraries from there: a real binary, which can be given
+                            capabilities (a wrapper cannot)
     PREFIX/packages/        the package files: a second installation needs no network
-    PREFIX/fetching.X/      while packages are fetched
+    PREFIX/fetching.X/      exists while packages are fetched
 
-The system is not touched, and no root is needed.
+The installation changes nothing in the system and needs no root.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from rosrm_criu.engine import packages as debian
 from rosrm_criu.engine.binary import OLDEST, PROGRAM, Criu, opened
 from rosrm_criu.engine.packages import Say
 
-#: The second one changes the first one's idea of where its libraries are.
+#: Packages to fetch; `patchelf` changes the library paths in the program `criu`.
 _WANTED: Final = ("criu", "patchelf")
-#: Bytes that an installation needs at most: packages, lists and the tree.
+#: Bytes that an installation needs at most: packages, package lists and the tree.
 _ROOM: Final = 160 << 20
 
 BUILD_IT: Final = (
@@ -42,19 +42,19 @@ BUILD_IT: Final = (
 def install(
     prefix: Path, say: Say, *, given: Path | None = None, mirrors: Sequence[str] = ()
 ) -> Criu:
-    """Install CRIU into a prefix, if it is not there yet or other packages are given.
+    """Install CRIU into a prefix, unless a working one is there and no packages are given.
 
-    What was there is in use until the new one answers.
+    The existing CRIU stays in use until the new one has answered.
 
     Args:
-        prefix: made where it is missing.
-        say: told of each step.
-        given: a package file, or a folder of them, instead of those of the archive. Without the C
-            library among them the system's own libraries are used.
-        mirrors: of the distribution's archive, instead of those that the system's sources name.
+        prefix: created if it is missing.
+        say: receives a line about each step.
+        given: a package file, or a folder of them, instead of the archive's packages. If the C
+            library is not among them, the system's libraries are used.
+        mirrors: mirrors of the distribution's archive, instead of those in the system's sources.
 
     Raises:
-        CriuError: what hinders, and what can be done.
+        CriuError: the installation failed; the message says why, and what to do.
     """
     prefix = prefix.absolute()
     _check_name(prefix)
@@ -68,7 +68,7 @@ def install(
 
 
 def _installed(prefix: Path, files: Sequence[Path], say: Say) -> Criu:
-    """Unpack packages beside what is in use, see that it answers, and only then use it."""
+    """Unpack packages into a new tree, test the program, and only then switch to it."""
     versions = dict(map(debian.version_of, files))
     if "criu" not in versions:
         raise CriuError(f"no package `criu` among {len(files)} files: {', '.join(versions)}")
@@ -93,7 +93,7 @@ def _installed(prefix: Path, files: Sequence[Path], say: Say) -> Criu:
 
 
 def _new_enough(criu: Criu) -> Criu:
-    """A CRIU that may work; raises `CriuError` for one that is known not to."""
+    """Return a CRIU of a supported version; raise `CriuError` for an older one."""
     if criu.number < OLDEST:
         raise CriuError(
             f"this is CRIU {criu.version}; rosrm needs {'.'.join(map(str, OLDEST))} or newer, as "
@@ -103,17 +103,17 @@ def _new_enough(criu: Criu) -> Criu:
 
 
 def bound(tree: Path) -> Path:
-    """The program of an unpacked tree, which from now on uses the tree's own libraries.
+    """Return the program of an unpacked tree, patched to use the tree's own libraries.
 
-    A tree without a C library is left as it is: it was made for this system.
+    A tree without a C library stays unchanged: its packages were built for this system.
 
     Raises:
-        CriuError: there is none, or it cannot be changed.
+        CriuError: there is no program, or it cannot be patched.
     """
     program = tree / "usr/sbin/criu"
     if not program.is_file():
         raise CriuError("the package has no usr/sbin/criu in it: this is not Debian's `criu`")
-    # Packages older than Debian 13 have libraries outside of /usr, too.
+    # Packages older than Debian 13 also have libraries outside /usr.
     folders = [*tree.glob("usr/lib/*-linux-*"), *tree.glob("lib/*-linux-*")]
     loader = next((file for folder in folders for file in folder.glob("ld-linux*.so.*")), None)
     if loader is None:
@@ -122,7 +122,7 @@ def bound(tree: Path) -> Path:
     changer = tree / "usr/bin/patchelf"
     if not changer.is_file():
         raise CriuError("the packages bring a C library but no `patchelf` to use it with")
-    # DT_RPATH, unlike what patchelf sets by default, also counts for the libraries' libraries.
+    # patchelf sets DT_RUNPATH by default; only DT_RPATH also applies to the libraries' libraries.
     debian.output_of(
         *(loader, "--library-path", libraries, changer, "--set-interpreter", loader),
         *("--force-rpath", "--set-rpath", libraries, program),
@@ -134,7 +134,7 @@ def bound(tree: Path) -> Path:
 
 
 def _check_name(prefix: Path) -> None:
-    """Refuse what the dynamic linker or apt would read as something else; raises `CriuError`."""
+    """Raise `CriuError` if the dynamic linker or apt would misread a character of the prefix."""
     bad = sorted(set(str(prefix)) & set(':;$"\\\n'))
     if bad:
         raise CriuError(
@@ -144,7 +144,7 @@ def _check_name(prefix: Path) -> None:
 
 
 def _present(prefix: Path) -> Criu | None:
-    """A CRIU that is in this prefix and answers."""
+    """Return the CRIU in this prefix; None: there is none that answers and is supported."""
     try:
         return _new_enough(opened(prefix / PROGRAM))
     except CriuError:
@@ -153,7 +153,7 @@ def _present(prefix: Path) -> Criu | None:
 
 @contextlib.contextmanager
 def _prepared(prefix: Path) -> Iterator[None]:
-    """Hold the prefix, with enough room and without what a killed installation left there."""
+    """Lock the prefix, check the free space, and remove the rest of a killed installation."""
     try:
         prefix.mkdir(parents=True, exist_ok=True)
         lock = (prefix / "lock").open("a")
@@ -184,7 +184,7 @@ def _prepared(prefix: Path) -> Iterator[None]:
 
 
 def _given(place: Path) -> list[Path]:
-    """The package files that a person named; raises `CriuError` where there are none."""
+    """Return the package files that the user named; raise `CriuError` if there are none."""
     found = sorted(place.glob("*.deb")) if place.is_dir() else [place]
     if not found or not found[0].is_file():
         raise CriuError(f"{place}: no such package file, and no folder with *.deb files")
@@ -192,12 +192,12 @@ def _given(place: Path) -> list[Path]:
 
 
 def _kept(prefix: Path) -> list[Path]:
-    """The packages of an earlier installation."""
+    """Return the packages of an earlier installation."""
     return sorted((prefix / "packages").glob("*.deb"))
 
 
 def _fetched(prefix: Path, say: Say, mirrors: Sequence[str]) -> list[Path]:
-    """Packages of the distribution's archive, kept in the prefix."""
+    """Fetch packages from the distribution's archive into the prefix, and return them."""
     with tempfile.TemporaryDirectory(prefix="fetching.", dir=prefix) as place:
         try:
             files = debian.fetch(_WANTED, debian.archive_here(), Path(place), say, mirrors=mirrors)
@@ -211,7 +211,7 @@ def _fetched(prefix: Path, say: Say, mirrors: Sequence[str]) -> list[Path]:
 
 
 def _keep(prefix: Path, files: Sequence[Path]) -> None:
-    """Make these files the prefix's packages."""
+    """Store these files as the prefix's packages."""
     kept = prefix / "packages"
     if files[0].parent.resolve() == kept.resolve():
         return
@@ -225,7 +225,7 @@ def _keep(prefix: Path, files: Sequence[Path]) -> None:
 
 
 def _use(link: Path, program: Path) -> None:
-    """Let the link lead to this program, in one step."""
+    """Point the link to this program, atomically."""
     link.parent.mkdir(exist_ok=True)
     new = link.with_name("criu.new")
     new.unlink(missing_ok=True)

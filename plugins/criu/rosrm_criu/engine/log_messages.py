@@ -1,7 +1,7 @@
-"""What CRIU's messages mean, one clear sentence each.
+"""Explanations of CRIU's error messages, one plain sentence each.
 
-Gathered by dumping and restoring such processes with CRIU 4.2.1. A message that is not in the table
-is passed on as CRIU said it.
+Collected from dumps and restores of such processes with CRIU 4.2.1. A message that is not in the
+table is passed on unchanged.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-#: A message of CRIU's, and what it means; `\\1` stands for its first group.
+#: Pairs of a CRIU message and its explanation; `\\1` stands for the first group.
 _DUMP: Final = (
     (r"Can't dump file (\d+) of that type \[\w+\] \(\w+ (\d+:\d+)\)",
      r"its file descriptor \1 is the device \2, which cannot be dumped"),
@@ -47,12 +47,12 @@ _RESTORE: Final = (
 
 
 def of_dump(message: str) -> str:
-    """What kept CRIU from dumping, from its message; "" where the table does not know it."""
+    """Explain CRIU's message about a failed dump; return "" if the table does not have it."""
     return _meaning(message, _DUMP)
 
 
 def of_restore(message: str) -> str:
-    """What kept CRIU from restoring, likewise."""
+    """Explain CRIU's message about a failed restore; return "" if the table does not have it."""
     return _meaning(message, _RESTORE)
 
 

@@ -1,4 +1,4 @@
-"""Why CRIU failed, as its log tells it."""
+"""Error messages in CRIU's logs."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Final
 _ERROR: Final = re.compile(
     r"^(?:\(\s*\d+\.\d+\))?\s*(?:\d+:\s*)?Error\s*(?:\([^)]*\):?)?:?\s*(?P<said>.*\S)\s*$"
 )
-#: These stand beside every failure and say nothing of its cause.
+#: These messages accompany every failure and do not name its cause.
 _EMPTY: Final = re.compile(
     r"(?:Pre-)?(?:Dumping|Restoring) FAILED\.?|"
     r"(?:\d+ )?(?:exited, status=\d+|killed by signal \d+.*|stopped by signal \d+.*)|"
     r"Failed to restore .* task|Can't wait or bad status.*|"
-    r"rlimit: Can't setup RLIMIT_NOFILE for self: .*"  # it goes on with fewer open files
+    r"rlimit: Can't setup RLIMIT_NOFILE for self: .*"  # CRIU continues with fewer open files
 )
-#: Lines that a message has room for; CRIU says the cause first and what followed from it after.
+#: Most lines in an error message; CRIU logs the cause first, then its consequences.
 _MOST: Final = 3
 
 
 def causes(log: str) -> tuple[str, ...]:
-    """The lines of a log that say why CRIU failed, the first cause first, each one once.
+    """Return the lines of a log that explain CRIU's failure, first cause first, without repeats.
 
     Args:
-        log: CRIU's log, or what it said on its standard error.
+        log: CRIU's log, or its output on standard error.
     """
     said = [match["said"] for line in log.splitlines() if (match := _ERROR.match(line))]
     telling = [line for line in said if not _EMPTY.fullmatch(line)] or said
@@ -32,10 +32,10 @@ def causes(log: str) -> tuple[str, ...]:
 
 
 def first_words(output: str) -> tuple[str, ...]:
-    """What it said first where it has not called anything an error: how it may be used, mostly.
+    """Return the first line of output that names no error: mostly a note on usage.
 
     Args:
-        output: its standard output and error.
+        output: CRIU's standard output and error.
     """
     lines = (line.strip(" :") for line in output.splitlines())
     return tuple(line for line in lines if line and not line.startswith(("Warn", "(")))[:1]

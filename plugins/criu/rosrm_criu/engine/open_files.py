@@ -1,4 +1,4 @@
-"""The regular files that processes hold open or have mapped, and which of them follow them."""
+"""Regular files that processes have open or mapped, and copies of those that follow the process."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from typing import Final, NamedTuple
 
 from rosrm_criu.engine.image import COPIES, HeldFile, MappedFile
 
-#: Bytes of the largest file that follows.
+#: Bytes of the largest file that follows the process.
 MOST: Final = 64 << 20
 
 _DELETED: Final = " (deleted)"
-#: What the kernel shows as files; its processes are others elsewhere.
+#: Files of the kernel; their contents differ between hosts.
 _OF_THE_KERNEL: Final = ("/proc/", "/sys/")
 
 
 class Descriptor(NamedTuple):
-    """One open file of one process.
+    """An open file of a process.
 
     Attributes:
-        pid: whose it is.
-        number: its number there.
-        target: what /proc says that it is: a path, or `pipe:[4711]`.
-        flags: that it was opened with.
+        pid: the process.
+        number: number of the descriptor in that process.
+        target: link target in /proc: a path, or e.g. `pipe:[4711]`.
+        flags: flags of open(2).
     """
 
     pid: int
@@ -36,18 +36,18 @@ class Descriptor(NamedTuple):
 
     @property
     def writes(self) -> bool:
-        """It was opened for writing."""
+        """Return True if the file was opened for writing."""
         return self.flags & os.O_ACCMODE != os.O_RDONLY
 
 
 def descriptors(pids: Iterable[int]) -> Iterator[Descriptor]:
-    """All open files of some processes, standard output and error included."""
+    """Yield all open files of some processes, including standard output and error."""
     for pid in pids:
         for number in _numbers(pid):
             try:
                 target = os.readlink(f"/proc/{pid}/fd/{number}")  # noqa: PTH115 - may be no path
                 flags = _flags(pid, number)
-            except OSError:  # closed meanwhile
+            except OSError:  # closed since the listing
                 continue
             yield Descriptor(pid, number, target, flags)
 
@@ -55,7 +55,7 @@ def descriptors(pids: Iterable[int]) -> Iterator[Descriptor]:
 def _numbers(pid: int) -> list[int]:
     try:
         return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))  # noqa: PTH208
-    except OSError:  # it has ended, or belongs to somebody else
+    except OSError:  # the process has ended, or belongs to another user
         return []
 
 
@@ -67,7 +67,7 @@ def _flags(pid: int, number: int) -> int:
 
 
 def logs(root: int) -> tuple[str, ...]:
-    """The files that are its standard output and error."""
+    """Return the regular files that are the standard output and error of a process."""
     found = [one.target for one in descriptors([root]) if one.number in (1, 2)]
     return tuple(dict.fromkeys(path for path in found if _is_regular(root, path)))
 
@@ -75,16 +75,16 @@ def logs(root: int) -> tuple[str, ...]:
 def open_files(
     pids: Iterable[int], leave_out: Iterable[str], directory: str, image: Path
 ) -> tuple[HeldFile, ...]:
-    """Note what they hold open, and copy what follows into an image; they must stand still.
+    """List the open files of stopped processes, and copy those that follow into an image.
 
-    A file follows that one of them may write to and that lies below its working directory. Where
-    that is the root directory, which holds everybody's files, none does.
+    A file follows the process if the process may write to it and it lies below the working
+    directory. If the working directory is `/`, which holds everybody's files, none follows.
 
     Args:
-        pids: the processes.
-        leave_out: paths that are no matter: the logs.
+        pids: the processes, which must be stopped.
+        leave_out: paths to ignore: the logs.
         directory: the working directory.
-        image: its directory.
+        image: directory of the image.
     """
     found: dict[str, HeldFile] = {}
     copies = 0
@@ -108,7 +108,7 @@ def open_files(
 
 
 def _copy(one: Descriptor, size: int, image: Path, number: int) -> str:
-    """The name of the copy; "" for what is too large to follow."""
+    """Copy a file into the image and return the copy's name; "": it is too large to follow."""
     if size > MOST:
         return ""
     name = f"{COPIES}/{number}"
@@ -120,7 +120,7 @@ def _copy(one: Descriptor, size: int, image: Path, number: int) -> str:
 
 
 def mapped_files(pids: Iterable[int]) -> tuple[MappedFile, ...]:
-    """Programs, libraries and shared memory that they have mapped from files."""
+    """Return the programs, libraries and shared-memory files that processes have mapped."""
     found: dict[str, MappedFile] = {}
     for pid in pids:
         for line in Path(f"/proc/{pid}/maps").read_text(errors="replace").splitlines():
@@ -135,7 +135,7 @@ def mapped_files(pids: Iterable[int]) -> tuple[MappedFile, ...]:
 
 
 def _is_regular(pid: int, path: str) -> bool:
-    """A path that leads to a regular file for that process; not what was deleted."""
+    """Return True if a path is a regular file for that process, and is not deleted."""
     if not path.startswith("/") or path.endswith(_DELETED):
         return False
     try:
@@ -149,10 +149,10 @@ def _status(pid: int, path: str) -> os.stat_result:
 
 
 def _seen_by(pid: int, path: str) -> Path:
-    """The path in the mount namespace of a process."""
+    """Return a path that leads into the mount namespace of a process."""
     return Path(f"/proc/{pid}/root{path}")
 
 
 def _lies_below(path: str, directory: str) -> bool:
-    """Not of the root directory: all that a process writes anywhere lies below that one."""
+    """Return True if a path lies below a directory other than `/`, below which every path lies."""
     return directory != "/" and path.startswith(f"{directory}/")

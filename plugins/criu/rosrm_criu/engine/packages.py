@@ -1,8 +1,8 @@
-"""Packages of a distribution's newest archive, fetched by apt without touching the system.
+"""Download of packages from a distribution's newest archive by apt, without changes to the system.
 
-apt resolves what they need, with lists, cache and a status file of its own, in which nothing is
-installed: so everything down to the C library comes along. No root is needed. Where the archive is,
-the system's own sources say; what is fetched has to be signed by the distribution's own key.
+apt resolves the dependencies with its own lists, cache and an empty status file. Because nothing
+counts as installed there, everything down to the C library is fetched. No root is needed. The
+system's sources give the mirrors; packages must be signed by the distribution's own key.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from typing import Final
 from rosrm.errors import CriuError
 from rosrm.runtime.disk_space import room_for
 
-#: Takes a line that tells a person how far it is.
+#: Receives a line of progress for the user.
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Archive:
-    """What a distribution calls its archive.
+    """Names in a distribution's package archive.
 
     Args:
         suite: the one with the newest packages.
-        components: the parts of it that CRIU lies in.
-        keyring: whose keys have signed it.
+        components: the components that CRIU and its dependencies are in.
+        keyring: file with the keys that sign the archive.
     """
 
     suite: str
@@ -39,18 +39,18 @@ class Archive:
 
 
 _KEYRINGS: Final = Path("/usr/share/keyrings")
-#: By the ID of /etc/os-release. Both names stay: they are aliases for what is newest.
+#: By the ID in /etc/os-release. Both suites are permanent aliases of the newest release.
 ARCHIVES: Final = {
     "debian": Archive("sid", "main", _KEYRINGS / "debian-archive-keyring.gpg"),
     "ubuntu": Archive("devel", "main universe", _KEYRINGS / "ubuntu-archive-keyring.gpg"),
 }
-#: Seconds: for what apt does by itself, and for what it fetches.
+#: Timeouts in seconds: for local commands, and for downloads.
 _QUICK: Final = 60.0
 _FETCH: Final = 900.0
-#: More mirrors than anybody has; a system with many third-party sources is not asked for all.
+#: Limit for systems with many third-party sources: no more mirrors than this are tried.
 _MOST_MIRRORS: Final = 8
 
-#: For apt. Its own user, to which it changes as root, cannot write into our folder.
+#: Configuration of apt. Run by root, apt would switch to its own user, who cannot write here.
 _CONFIGURATION: Final = """\
 #clear APT::Update::Pre-Invoke;
 #clear APT::Update::Post-Invoke;
@@ -74,7 +74,7 @@ Dir::Cache "{place}/cache";
 
 
 def archive_here() -> Archive:
-    """The archive of this system's distribution; raises `CriuError` where it has none of ours."""
+    """Return the archive of this distribution; raise `CriuError` for an unknown distribution."""
     try:
         system = platform.freedesktop_os_release()
     except OSError:
@@ -88,17 +88,17 @@ def archive_here() -> Archive:
 def fetch(
     wanted: Sequence[str], archive: Archive, place: Path, say: Say, *, mirrors: Sequence[str] = ()
 ) -> list[Path]:
-    """Fetch packages and all that they need.
+    """Fetch packages and their dependencies.
 
     Args:
-        wanted: names of packages; the first one's version is said.
-        archive: which one.
-        place: an empty folder for all that apt keeps; the packages stay in it.
-        say: told of each step.
-        mirrors: where the archive may be, instead of what the system's sources say.
+        wanted: names of packages; `say` receives the version of the first one.
+        archive: the archive to use.
+        place: an empty folder for all files of apt; the packages stay in it.
+        say: receives a line about each step.
+        mirrors: mirrors of the archive, instead of those in the system's sources.
 
     Raises:
-        CriuError: there is no apt, mirror, network or room, or not these packages.
+        CriuError: apt, a mirror, the network, disk space or a package is missing.
     """
     if not archive.keyring.is_file():
         raise CriuError(f"the distribution's keys are missing: {archive.keyring}")
@@ -123,25 +123,25 @@ def fetch(
 
 
 def unpack(packages: Sequence[Path], place: Path) -> None:
-    """Lay the files of packages below a folder; nothing of them is run. Raises `CriuError`."""
+    """Unpack packages into a folder without running their scripts; raise `CriuError`."""
     for package in packages:
         _output(_QUICK, "dpkg-deb", "--extract", package, place, room=place)
 
 
 def output_of(*words: str | Path) -> str:
-    """What a short command prints; raises `CriuError` with its complaint."""
+    """Return the output of a short command; raise `CriuError` with its error message."""
     return _output(_QUICK, *words)
 
 
 def version_of(package: Path) -> tuple[str, str]:
-    """Name and version of a package file; raises `CriuError` where it is none."""
+    """Return name and version of a package file; raise `CriuError` if it is no package."""
     said = _output(_QUICK, "dpkg-deb", "--show", "--showformat", "${Package} ${Version}", package)
     name, _, version = said.partition(" ")
     return name, version
 
 
 class _Apt:
-    """apt, with everything that it writes below one folder."""
+    """apt, restricted to one folder for all files that it writes."""
 
     def __init__(self, place: Path) -> None:
         self._place = place
@@ -155,7 +155,7 @@ class _Apt:
         (place / "apt.conf").write_text(said, encoding="utf-8")
 
     def use(self, mirror: str, archive: Archive) -> None:
-        """Ask this mirror from now on."""
+        """Use this mirror from now on."""
         (self._place / "archive.sources").write_text(
             f"Types: deb\nURIs: {mirror}\nSuites: {archive.suite}\n"
             f"Components: {archive.components}\nSigned-By: {archive.keyring}\n",
@@ -163,7 +163,7 @@ class _Apt:
         )
 
     def candidate(self, package: str) -> str:
-        """The version of a package that would be fetched; raises `CriuError` if there is none."""
+        """Return the version that apt would fetch of a package; raise `CriuError` if none."""
         said = self.run(_QUICK, "apt-cache", "policy", package)
         version = re.search(r"^\s*Candidate:\s*(\S+)", said, re.MULTILINE)
         if version is None or version[1] == "(none)":
@@ -171,13 +171,13 @@ class _Apt:
         return version[1]
 
     def run(self, seconds: float, program: str, *arguments: str) -> str:
-        """Its output; raises `CriuError` with what it calls an error."""
+        """Run a program of apt and return its output; raise `CriuError` with its error message."""
         file = self._place / "apt.conf"
         return _output(seconds, program, "-c", file, *arguments, room=self._place)
 
 
 def _mirrors() -> list[str]:
-    """Where the system's own sources lead, the first ones first; raises `CriuError`."""
+    """Return the mirrors in the system's sources, in their order; raise `CriuError` if none."""
     said = _output(_QUICK, "apt-get", "update", "--print-uris")
     found = re.findall(r"^'([^']+)/dists/[^']*/InRelease'", said, re.MULTILINE)
     mirrors = [uri for uri in dict.fromkeys(found) if not uri.startswith("cdrom:")]
@@ -187,7 +187,7 @@ def _mirrors() -> list[str]:
 
 
 def _output(seconds: float, *words: str | Path, room: Path | None = None) -> str:
-    """What a program prints; raises `CriuError` with its complaint, and what room there is."""
+    """Return a program's output; raise `CriuError` with its error message and the free space."""
     try:
         done = subprocess.run(
             words,

@@ -1,4 +1,4 @@
-"""Where a host keeps images, of moves under way and of checkpoints, below its slave's directory."""
+"""Paths of a host's images, of moves under way and of checkpoints, below the slave's directory."""
 
 from __future__ import annotations
 
@@ -8,42 +8,42 @@ import rosrm
 
 
 def folder_of_rosrm() -> str:
-    """Return the folder in which `rosrm` lies, for a Python that looks nowhere by itself."""
+    """Return the folder that contains `rosrm`, for a Python that runs without site-packages."""
     return str(Path(rosrm.__path__[0]).resolve().parent)
 
 
 def outgoing(state: Path, number: int) -> Path:
-    """The image of an instance that is to go elsewhere."""
+    """Return the path of the image of an instance that moves to another host."""
     return state / "images" / f"out-{number}"
 
 
 def incoming(state: Path, number: int) -> Path:
-    """The image that an instance is restored from."""
+    """Return the path of the image that an instance is restored from."""
     return state / "images" / f"in-{number}"
 
 
 def kept(state: Path, number: int) -> Path:
-    """The image of an instance that was checkpointed: it lies there until it is restored."""
+    """Return the path of the checkpoint of an instance; the image stays there until the restore."""
     return state / "images" / f"kept-{number}"
 
 
 def ports_of_kept(state: Path, number: int) -> Path:
-    """The ports that such an instance had, beside its image."""
+    """Return the path of the file with the ports of a checkpointed instance, beside its image."""
     return state / "images" / f"kept-{number}.ports"
 
 
 def kept_numbers(state: Path) -> list[int]:
-    """Of the instances of which there is such an image."""
+    """Return the numbers of the instances that have a checkpoint."""
     names = [path.name.removeprefix("kept-") for path in (state / "images").glob("kept-*")]
     return sorted(int(name) for name in names if name.isdigit())
 
 
 def periodic(state: Path, number: int) -> Path:
-    """The images of an instance that goes on: see `rosrm_criu.engine.slots`."""
+    """Return the directory of a running instance's images: see `rosrm_criu.engine.slots`."""
     return state / "images" / f"periodic-{number}"
 
 
 def periodic_numbers(state: Path) -> list[int]:
-    """Of the instances of which there are such images."""
+    """Return the numbers of the instances that have periodic images."""
     names = [path.name.removeprefix("periodic-") for path in (state / "images").glob("periodic-*")]
     return sorted(int(name) for name in names if name.isdigit())

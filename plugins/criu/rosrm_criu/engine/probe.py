@@ -1,10 +1,10 @@
-"""Can CRIU move a process here? Tried, not asked: `criu check` says yes where it is no.
+"""Functional test of CRIU on this host; `criu check` also succeeds where dumps fail.
 
     python -m rosrm_criu.engine.probe      one line of JSON: works, reason, facts
 
-A child with a bound UDP socket and a counter in its memory is dumped and restored; then its counter
-has to go on and its socket has to answer. This takes a few tenths of a second and leaves nothing
-behind, also where this process is killed: a shell waits for its end and clears up.
+The test dumps and restores a child with a bound UDP socket and a counter in its memory. Then the
+counter must continue, and the socket must answer. This takes a few tenths of a second. Nothing is
+left behind, even if this process is killed, because a shell waits for its end and cleans up.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from rosrm.errors import CriuError
 from rosrm_criu.engine.binary import OLDEST, REMEDY, Criu, find
 from rosrm_criu.engine.compatibility_facts import INTERPRETER, facts_of
 
-#: Seconds for all of it; it takes a few tenths.
+#: Seconds for the whole test, which normally takes a few tenths.
 TIMEOUT: Final = 20.0
-#: A word in what CRIU says where it has no rights; its error messages are no interface, but this
-#: one names the interface.
+#: Part of CRIU's error message if it lacks rights. The messages are no stable interface, but this
+#: word is the name of a capability.
 _NO_RIGHT: Final = "CAP_CHECKPOINT_RESTORE"
 _YAMA: Final = Path("/proc/sys/kernel/yama/ptrace_scope")
 
-#: The child. It tells the clearer of itself, so that it is not missed; then it counts what it is
-#: sent, and ends by itself where it is sent nothing for long.
+#: Program of the child. It reports its pid to the cleaner, so that the cleaner can kill it. Then it
+#: counts the datagrams that it receives, and ends after a long time without one.
 _SUBJECT: Final = """
 import os, socket, sys
 clearer = int(sys.argv[3])
@@ -52,8 +52,8 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
         ours.recv(1)
         count += 1
 """
-#: Makes the folder. Then it reads the child's pid, and nothing when that is gone. At the end of its
-#: input, which comes when neither the probe nor a CRIU of it lives any more, it removes all.
+#: Program of the cleaner: creates the folder and reads the child's pid (an empty line: the child
+#: has ended). Its input ends when neither the probe nor its CRIU lives; then it removes everything.
 _CLEARER: Final = """
 trap "" PIPE
 mkdir -m 700 -- "$0" || exit
@@ -66,12 +66,12 @@ rm -rf -- "$0"
 
 @dataclass(frozen=True)
 class Ability:
-    """What CRIU can do here.
+    """The capability of CRIU on this host.
 
     Args:
         works: a process was dumped and restored.
-        reason: why not, and what to do about it; "" where it works.
-        facts: see `rosrm_criu.engine.compatibility`; empty where there is no CRIU.
+        reason: the obstacle and its remedy; "": CRIU works.
+        facts: see `rosrm_criu.engine.compatibility`; empty if there is no CRIU.
     """
 
     works: bool
@@ -80,7 +80,7 @@ class Ability:
 
 
 def ability(prefix: Path | None = None) -> Ability:
-    """Find the CRIU to use here and try it."""
+    """Find the CRIU to use on this host and test it."""
     try:
         return probe(find(prefix))
     except CriuError as error:
@@ -88,11 +88,11 @@ def ability(prefix: Path | None = None) -> Ability:
 
 
 def probe(criu: Criu, *, timeout: float = TIMEOUT) -> Ability:
-    """Try a CRIU by a dump and a restore.
+    """Test a CRIU by a dump and a restore.
 
     Args:
-        criu: the one to try.
-        timeout: seconds for all of it.
+        criu: the CRIU to test.
+        timeout: seconds for the whole test.
     """
     reason = ""
     try:
@@ -105,16 +105,16 @@ def probe(criu: Criu, *, timeout: float = TIMEOUT) -> Ability:
 
 
 def setcap_command(criu: Criu) -> str:
-    """What gives an ordinary user's CRIU the rights that it needs."""
+    """Return the command that gives an ordinary user's CRIU the capabilities that it needs."""
     capabilities = "cap_checkpoint_restore,cap_setpcap"
     with contextlib.suppress(OSError, ValueError):
-        if int(_YAMA.read_text(encoding="ascii")) > 0:  # only parents may look into a process
+        if int(_YAMA.read_text(encoding="ascii")) > 0:  # only a parent may ptrace a process
             capabilities += ",cap_sys_ptrace"
     return f"sudo setcap {capabilities}+eip {os.path.realpath(criu.command[-1])}"
 
 
 def _with_remedy(criu: Criu, reason: str) -> str:
-    """A reason, and what to do where that is known."""
+    """Return the reason with its remedy, if one is known."""
     if criu.number < OLDEST:
         least = ".".join(map(str, OLDEST))
         return f"CRIU {criu.version} is too old, {least} is needed: {REMEDY} (tried: {reason})"
@@ -136,7 +136,7 @@ def _with_remedy(criu: Criu, reason: str) -> str:
 
 
 def _exercise(criu: Criu, until: float) -> None:
-    """Dump and restore a child; raises `CriuError` at what does not work."""
+    """Dump and restore a child; raise `CriuError` at the first step that fails."""
     with (
         _folder() as (folder, clearer),
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
@@ -147,8 +147,8 @@ def _exercise(criu: Criu, until: float) -> None:
             address = _heard(ours, trial, "0", "started")
             _ask(ours, address, trial, "1", "started")
             trial.run("dump", "--tree", str(process.pid))
-            process.wait(max(1.0, trial.left))  # a zombie would still have the pid
-            # A sibling of CRIU is a child of ours: we can wait for its end.
+            process.wait(max(1.0, trial.left))  # otherwise the zombie would still hold the pid
+            # --restore-sibling makes the process a child of this one, which can then reap it.
             trial.run("restore", "--restore-detached", "--restore-sibling")
             _ask(ours, address, trial, "2", "was restored")
 
@@ -162,30 +162,30 @@ class _Trial:
 
     @property
     def left(self) -> float:
-        """Seconds."""
+        """Return the seconds that are left."""
         return self.until - time.monotonic()
 
     def run(self, *arguments: str) -> None:
-        """Let CRIU do something; raises `CriuError`."""
+        """Run a CRIU command; raise `CriuError`."""
         log = self.folder / f"{arguments[0]}.log"
         words = (*arguments, "--images-dir", str(self.folder))
         try:
             self.criu.run(words, timeout=max(0.1, self.left), log=log, pass_fds=(self.clearer,))
         except CriuError as error:
-            # The log is removed with all else.
+            # The log is removed together with the folder.
             raise CriuError(str(error).replace(f" (its log: {log})", "")) from None
 
 
 def _ask(
     ours: socket.socket, address: tuple[str, int], trial: _Trial, count: str, after: str
 ) -> None:
-    """Have the child count on; raises `CriuError` where it does not."""
+    """Make the child count one step further; raise `CriuError` if it does not."""
     ours.sendto(b"?", address)
     _heard(ours, trial, count, after)
 
 
 def _heard(ours: socket.socket, trial: _Trial, count: str, after: str) -> tuple[str, int]:
-    """Where the child's count came from; raises `CriuError` if another one came, or none."""
+    """Return the sender of the expected count; raise `CriuError` for another count or none."""
     ours.settimeout(max(0.1, trial.left))
     try:
         said, address = ours.recvfrom(16)
@@ -198,7 +198,7 @@ def _heard(ours: socket.socket, trial: _Trial, count: str, after: str) -> tuple[
 
 @contextlib.contextmanager
 def _subject(port: int, trial: _Trial) -> Iterator[subprocess.Popen[bytes]]:
-    """The child, and what it is restored as, for a time."""
+    """Start the child; at the end, kill it or the process that it was restored as."""
     words = (str(port), f"{max(1.0, trial.left):.0f}", str(trial.clearer))
     process = subprocess.Popen(
         [INTERPRETER, "-I", "-S", "-c", _SUBJECT, *words],
@@ -215,7 +215,7 @@ def _subject(port: int, trial: _Trial) -> Iterator[subprocess.Popen[bytes]]:
         if process.poll() is None:
             process.kill()
             process.wait()
-        # Restored, it is another child of ours with the same pid.
+        # After the restore it is a new child of this process, with the same pid.
         with contextlib.suppress(ChildProcessError):
             if os.waitpid(process.pid, os.WNOHANG)[0] == 0:
                 os.kill(process.pid, signal.SIGKILL)
@@ -225,7 +225,7 @@ def _subject(port: int, trial: _Trial) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextlib.contextmanager
 def _folder() -> Iterator[tuple[Path, int]]:
-    """A folder, and the pipe to the shell that removes it when all who hold the pipe are gone."""
+    """Yield a folder, and the pipe of the cleaner, which removes it once all ends are closed."""
     folder = Path(tempfile.gettempdir(), f"rosrm-criu-{uuid.uuid4().hex}")
     with subprocess.Popen(
         ["/bin/sh", "-c", _CLEARER, str(folder)],
@@ -244,7 +244,7 @@ def _folder() -> Iterator[tuple[Path, int]]:
 
 
 def main() -> int:
-    """Say what CRIU can do here, for a program that started this one."""
+    """Print the result of the test as JSON, for the program that started this one."""
     print(json.dumps(asdict(ability())), flush=True)  # noqa: T201 - that is what it is for
     return 0
 

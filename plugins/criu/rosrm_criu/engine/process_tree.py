@@ -1,4 +1,4 @@
-"""The processes of an instance as /proc shows them: who they are, and whether they stand still."""
+"""Process tree of an instance as /proc shows it: its members and their states."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import Final
 
 from rosrm.supervisor.procfs import inner_pid, read_stat
 
-#: Namespaces that CRIU has to share with what it dumps, with the option of nsenter for each.
+#: Namespaces that CRIU must share with the process that it dumps, each with its nsenter option.
 _NAMESPACES: Final = {
     "mnt": "--mount", "pid": "--pid", "net": "--net", "ipc": "--ipc", "uts": "--uts",
     "cgroup": "--cgroup",
 }  # fmt: skip
-#: Names the program that holds a restored process, in its command line, and the one that may become
-#: it, or else the process itself.
+#: Parts of command lines: of the shim, and of the program that becomes either the shim or the
+#: process itself.
 HOLD: Final = "rosrm_criu/engine/shim.py"
 _AGAIN: Final = "rosrm_criu/engine/restart_from_image.py"
 
 
 def children(pid: int) -> list[int]:
-    """Of all its threads, the oldest first; none where it has ended."""
+    """Return the children of all threads of a process, oldest first; none if it has ended."""
     found: list[int] = []
     with contextlib.suppress(OSError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -34,7 +34,7 @@ def children(pid: int) -> list[int]:
 
 
 def tree(root: int) -> list[int]:
-    """A process and all that descend from it, parents before children."""
+    """Return a process and all its descendants, parents before children."""
     found = [root]
     for pid in found:
         found.extend(children(pid))
@@ -42,9 +42,9 @@ def tree(root: int) -> list[int]:
 
 
 def root_of(leader: int) -> int:
-    """The process that an instance is about: its leader, or what the leader holds, if restored.
+    """Return the main process of an instance: its leader, or the restored process of a shim.
 
-    While it is being restored that is CRIU.
+    While the restore runs, this is CRIU.
     """
     if not is_hold(leader):
         return leader
@@ -53,19 +53,19 @@ def root_of(leader: int) -> int:
             return child
         held = children(child)
         if held:
-            return held[0]  # what came to it later are orphans
+            return held[0]  # children that were added later are orphans
     return leader
 
 
 def is_hold(pid: int) -> bool:
-    """It runs the program that holds a restored process."""
+    """Return True if a process is a shim."""
     return _names(_words(pid), HOLD)
 
 
 def leads(pid: int) -> bool | None:
-    """Return True if it is a hold; None: not yet, but it may be one in a moment.
+    """Return True if a process is a shim; None: not yet, but it may become one in a moment.
 
-    One that was spawned just now has no command line yet: it may be anything.
+    A process that was spawned just now has no command line yet, so it may become a shim.
     """
     words = _words(pid)
     if _names(words, HOLD):
@@ -78,7 +78,7 @@ def _names(words: Sequence[str], program: str) -> bool:
 
 
 def _words(pid: int) -> list[str]:
-    """Its command line; [""] in the middle of an execve, [] where there is no such process."""
+    """Return the command line; [""] in the middle of an execve, [] if there is no such process."""
     try:
         return os.fsdecode(Path(f"/proc/{pid}/cmdline").read_bytes()).split("\0")
     except OSError:
@@ -86,15 +86,15 @@ def _words(pid: int) -> list[str]:
 
 
 def is_alive(pid: int) -> bool:
-    """It runs, or is stopped."""
+    """Return True if a process runs or is stopped."""
     stat = read_stat(pid)
     return stat is not None and stat.alive
 
 
 def is_gone(pid: int) -> bool:
-    """It has ended with all its threads, and nothing of it is open any more.
+    """Return True if a process has ended with all its threads, and all its files are closed.
 
-    The first thread may wait to be reaped while others still end, and their sockets are bound.
+    The first thread may be a zombie while other threads still end and their sockets are bound.
     """
     try:
         threads = sum(1 for _ in Path(f"/proc/{pid}/task").iterdir())
@@ -104,18 +104,18 @@ def is_gone(pid: int) -> bool:
 
 
 def is_stopped(pid: int) -> bool:
-    """By a signal, not by a debugger."""
+    """Return True if a process is stopped by a signal (not by a debugger)."""
     stat = read_stat(pid)
     return stat is not None and stat.state == "T"
 
 
 def inner_ids(pid: int) -> list[int]:
-    """The ids of its threads in its own pid namespace; raises OSError where it has ended."""
+    """Return a process's thread ids in its own pid namespace; raise OSError if it has ended."""
     return sorted(inner_pid(pid, int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir())
 
 
 def entering(pid: int) -> tuple[str, ...]:
-    """The words that run a command in the namespaces of a process; () where they are our own."""
+    """Return the nsenter prefix for a process's namespaces; (): they are those of this process."""
     flags = [flag for name, flag in _NAMESPACES.items() if _namespace(pid, name) != _own(name)]
     return ("nsenter", f"--target={pid}", *flags, "--") if flags else ()
 
@@ -129,7 +129,7 @@ def _own(name: str) -> str:
 
 
 def memory_of(pids: Iterable[int]) -> int:
-    """Bytes that an image of them takes at least: memory that no file backs."""
+    """Return the least bytes that an image of processes needs: memory that no file backs."""
     total = 0
     for pid in pids:
         with contextlib.suppress(OSError):
@@ -140,18 +140,18 @@ def memory_of(pids: Iterable[int]) -> int:
 
 
 def wait_until_stopped(pids: Iterable[int], timeout: float) -> bool:
-    """Until each of them is stopped or gone; False: not within so many seconds."""
+    """Wait until each process is stopped or gone; return False after the timeout in seconds."""
     end = time.monotonic() + timeout
     waiting = list(pids)
     while waiting := [pid for pid in waiting if is_alive(pid) and not is_stopped(pid)]:
         if time.monotonic() > end:
             return False
-        time.sleep(0.001)  # a stop that was asked for: nothing tells of it but a look
+        time.sleep(0.001)  # polled, because no event reports a stop
     return True
 
 
 def send(pids: Iterable[int], number: signal.Signals) -> None:
-    """A signal to each that is still there."""
+    """Send a signal to each process that still exists."""
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, number)

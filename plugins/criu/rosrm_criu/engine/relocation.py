@@ -1,12 +1,12 @@
-"""Another directory in the place of one that a process knows: it is not the same on every host.
+"""Replacement of a directory in CRIU's image by another one on the host of the restore.
 
-The processes that name no working directory run in their supervisor's, whose path holds the name of
-its host. CRIU opens what it restores by the paths in its image, so these are changed there. What
-the process itself has kept of them in its memory stays as it was.
+Processes without a configured working directory run in the supervisor's, whose path contains the
+name of its host. CRIU opens files by the paths in its image, so these paths are changed there.
+Copies of the paths in the memory of the process stay unchanged.
 
-An image of CRIU is two magic numbers, and then messages of Protocol Buffers with their sizes before
-them. In `files.img` each is an open file; its field 3 is a regular file or a directory, which has
-no other text than its path.
+A CRIU image file consists of two magic numbers and Protocol Buffers messages, each preceded by its
+size. In `files.img` each message is an open file; its field 3 is a regular file or a directory,
+and the path is the only string in that field.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from rosrm.errors import CriuError
 from rosrm_criu.engine.image import HERE
 
 _FILES: Final = "files.img"
-#: What comes before the first message.
+#: Bytes before the first message.
 _MAGIC: Final = 8
-#: Of a FileEntry.
+#: Field of a FileEntry with a regular file or directory.
 _REGULAR: Final = 3
-#: Wire types: a number; eight bytes; bytes with their length before them; four bytes.
+#: Wire types: varint; eight bytes; bytes preceded by their length; four bytes.
 _NUMBER, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
 
 
 def moved(path: str, old: str, new: str) -> str:
-    """A path, where one directory has taken the place of another; "" moves nothing."""
+    """Return a path with the directory `old` replaced by `new`; unchanged if either is ""."""
     if old and new and (path == old or path.startswith(f"{old}/")):
         return new + path[len(old) :]
     return path
@@ -40,12 +40,12 @@ def moved(path: str, old: str, new: str) -> str:
 
 @contextlib.contextmanager
 def images(directory: Path, old: str, new: str) -> Iterator[Path]:
-    """CRIU's images with other paths, for a time; the image itself stays as it is.
+    """Yield a temporary copy of CRIU's images with other paths; the image itself stays unchanged.
 
     Args:
         directory: of CRIU's images.
-        old: directory that the process knows; "": it is the same here.
-        new: in its place.
+        old: directory that the process knows; "": it is the same on this host.
+        new: its replacement.
 
     Raises:
         CriuError: the image is damaged.
@@ -82,19 +82,19 @@ def _files(data: bytes, change: Callable[[str], str]) -> bytes:
 
 
 def _entry(number: int, value: bytes, change: Callable[[str], str]) -> bytes:
-    """A field of an open file."""
+    """Return a field of an open file, with changed paths."""
     if number != _REGULAR:
         return value
     return _fields(value, lambda _, text: _text(text, change))
 
 
 def _text(value: bytes, change: Callable[[str], str]) -> bytes:
-    """A field of a regular file: only its path begins so."""
+    """Return a field of a regular file; a value that begins with "/" is its path and is changed."""
     return os.fsencode(change(os.fsdecode(value))) if value.startswith(b"/") else value
 
 
 def _fields(message: bytes, change: Callable[[int, bytes], bytes]) -> bytes:
-    """A message whose fields of bytes are changed."""
+    """Return a message with `change` applied to its fields of bytes."""
     changed = []
     position = 0
     while position < len(message):
@@ -118,7 +118,7 @@ def _fields(message: bytes, change: Callable[[int, bytes], bytes]) -> bytes:
 
 
 def _varint(message: bytes, position: int) -> tuple[int, int]:
-    """A number, and where it ends."""
+    """Return a varint and the position after it."""
     number = shift = 0
     while True:
         byte = message[position]

@@ -1,11 +1,11 @@
-"""Starts a process from its newest periodic image, or as its command says where there is none.
+"""Start of a process from its newest periodic image, or by its own command if there is none.
 
-The supervisor starts this program in place of the process's own command line, at first and after
-each crash; it becomes the one or the other. So neither slave nor master is needed for it. What
-cannot be used is said in the log, and then the process begins anew: as it would without images.
+The supervisor runs this program instead of the process's own command line, at the first start and
+after each crash. The program becomes the shim or the process, so a restart needs neither slave nor
+master. If an image cannot be used, the log says so and the process starts without it.
 
-Standard library only; it runs as `python -I -S restart_from_image.py FOLDER DIRECTORY -- COMMAND`
-(see `command`; `rosrm` lies in FOLDER), and loads little, as it runs at each start.
+Standard library only. It runs as `python -I -S restart_from_image.py FOLDER DIRECTORY -- COMMAND`
+(see `command`; FOLDER contains `rosrm`), and imports little, because it runs at each start.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 def command(
     python: str, directory: Path, then: Sequence[str], *, criu: Path, timeout: float
 ) -> tuple[str, ...]:
-    """The command line that the supervisor is given in place of the process's own.
+    """Return the command line for the supervisor, in place of the process's own.
 
     Args:
         python: an interpreter.
-        directory: of its periodic images; an absolute path, which need not exist.
+        directory: of the periodic images; an absolute path, which need not exist.
         then: the process's own command line.
-        criu: the program.
+        criu: the CRIU program.
         timeout: seconds for a restore.
     """
     options = [str(directory), f"--criu={criu}", f"--timeout={timeout}"]
@@ -46,7 +46,7 @@ def command(
 
 
 def main() -> NoReturn:
-    """Become the program that restores and holds the process, or the process."""
+    """Become the shim that restores and holds the process, or the process itself."""
     end = sys.argv.index("--")
     options, then = _options(sys.argv[1:end]), sys.argv[end + 1 :]
     try:
@@ -70,7 +70,7 @@ def _options(words: list[str]) -> argparse.Namespace:
 
 
 def _restore(image: Path, rejoin: Rejoin, options: argparse.Namespace) -> NoReturn:
-    """It joins as soon as it runs: who asks it is told beforehand."""
+    """Become the shim; write the request to rejoin first, so that the node rejoins once it runs."""
     from rosrm_criu.control import ask_resume, make_directory  # noqa: PLC0415 - likewise
     from rosrm_criu.engine import restore_result  # noqa: PLC0415 - for few of the starts
 
@@ -96,7 +96,7 @@ def _become(words: Sequence[str]) -> NoReturn:
         sys.exit(f"{words[0]} cannot be started: {error.strerror}")
 
 
-#: Signals for which Python has ways of its own, which an execve keeps where it ignores them.
+#: Signals that Python handles or ignores by default; ignored ones would stay ignored after execve.
 _PYTHON_S: Final = (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT)
 
 if __name__ == "__main__":

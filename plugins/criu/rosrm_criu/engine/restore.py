@@ -1,6 +1,6 @@
-"""Restores an image on this host: what it needs is looked at first, then CRIU does its work.
+"""Restore of an image on this host: a check of its requirements, then CRIU.
 
-It runs in the program that holds the restored process (`shim`); nobody else calls it.
+This module runs only in the shim (`rosrm_criu.engine.shim`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from rosrm_criu.engine.binary import Criu
 from rosrm_criu.engine.dump import COMMON
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
 
-#: CRIU writes the pid of the restored root here.
+#: File into which CRIU writes the pid of the restored root.
 _PID_FILE: Final = "restored.pid"
-#: LTTng's, which every ROS process maps: of no content, and made by whoever comes first.
+#: LTTng's files, which every ROS process maps: without content, and made by its first user.
 _TRACING: Final = "/dev/shm/lttng-ust-wait-"  # noqa: S108 - LTTng's own
-#: Ids that CRIU and its children may take while they restore.
+#: Ids that CRIU and its children may use during a restore.
 _IDS_OF_CRIU: Final = 400
 
 
 def moved_here(manifest: Manifest) -> Manifest:
-    """As it is on this host: whose supervisor has another directory for those that name none."""
+    """Return the manifest with this host's paths: default working directories differ by host."""
     state = os.environ.get(SUPERVISOR_MARK, "")
     new = paths.work_directory(state) if state else ""
 
@@ -49,7 +49,7 @@ def moved_here(manifest: Manifest) -> Manifest:
 
 
 def check(manifest: Manifest) -> None:
-    """Raise CriuError for what the process needs and does not find here, before anything starts."""
+    """Raise CriuError, before any change, if this host lacks a requirement of the process."""
     here = platform.node()
     if manifest.machine != platform.machine():
         raise CriuError(f"the image was made on {manifest.machine}; {here} is {platform.machine()}")
@@ -86,13 +86,13 @@ def _check_file(file: HeldFile | MappedFile, here: str, holds: str) -> None:
 
 
 def prepare(directory: Path, manifest: Manifest) -> None:
-    """Put back the files that follow, make those that only grow, and LTTng's.
+    """Put back the files that follow the process; create missing append-only and LTTng files.
 
-    Nothing is touched before the whole image was compared with its checksums: a file that follows
-    is put over what lies there, and CRIU restores other memory as readily as the right one.
+    The checksums of the whole image are compared before the first change. Otherwise a damaged file
+    could replace an intact one, and CRIU would restore damaged memory without an error.
 
     Raises:
-        CriuError: the image is damaged, or what cannot be put back.
+        CriuError: the image is damaged, or a file cannot be put back.
     """
     image.check_contents(directory, manifest)
     for mapped in manifest.mapped:
@@ -120,9 +120,9 @@ def _put_back(directory: Path, held: HeldFile) -> None:
 
 
 def _replace(source: Path, target: Path, mode: int) -> None:
-    """Put a copy in the place of a file, whose owner it gets; no link there is followed.
+    """Replace a file by a copy with the same owner; no symbolic link there is followed.
 
-    Whoever owns the folder could have root write anywhere else.
+    Otherwise the owner of the folder could make root write anywhere.
     """
     new = target.with_name(f".{target.name}.rosrm")
     new.unlink(missing_ok=True)
@@ -142,7 +142,7 @@ def _make_tracing_file(mapped: MappedFile) -> None:
     try:
         os.ftruncate(descriptor, mapped.size)
         os.fchmod(descriptor, mapped.mode)
-        os.link(new, mapped.path)  # unlike a rename it leaves alone what came meanwhile
+        os.link(new, mapped.path)  # unlike rename, this keeps a file that appeared since the check
     except FileExistsError:
         pass
     finally:
@@ -153,20 +153,20 @@ def _make_tracing_file(mapped: MappedFile) -> None:
 def restore(
     criu: Criu, directory: Path, manifest: Manifest, shelter: str, *, log: int, timeout: float
 ) -> int:
-    """Restore the process, as a descendant of the caller; returns its pid.
+    """Restore the process as a descendant of the caller, and return its pid.
 
-    CRIU's children end, so the nearest subreaper or init above the caller becomes its parent.
+    CRIU's processes end, so the nearest subreaper or init above the caller becomes the parent.
 
     Args:
-        criu: to use.
-        directory: of the image, checked and prepared for.
-        manifest: of the image, as it was read.
-        shelter: takes the place of the image's.
-        log: descriptor that becomes its standard output and error.
-        timeout: seconds; CRIU is killed when they have passed.
+        criu: the CRIU to use.
+        directory: of the image, after `check` and `prepare`.
+        manifest: of the image, as `read` returns it.
+        shelter: replaces the image's default working directory.
+        log: descriptor that becomes standard output and error of the process.
+        timeout: seconds; then CRIU is killed.
 
     Raises:
-        CriuError: what failed.
+        CriuError: the restore failed; the message says why.
     """
     pid_file = directory / _PID_FILE
     pid_file.unlink(missing_ok=True)
@@ -194,11 +194,11 @@ def restore(
 
 
 def id_for_criu(ids: tuple[int, ...], most: int) -> int:
-    """An id in a fresh pid namespace, behind which CRIU's own processes take none of the image's.
+    """Return an id for a new pid namespace after which CRIU's processes take none of the image's.
 
     Args:
-        ids: of the image.
-        most: ids there are.
+        ids: ids in the image.
+        most: size of the id range.
     """
     taken = sorted(one for one in ids if one < most)
     for low, high in zip([300, *taken], [*taken, most], strict=True):
@@ -208,13 +208,14 @@ def id_for_criu(ids: tuple[int, ...], most: int) -> int:
 
 
 def mark_anew(pid: int, marks: Mapping[str, str]) -> None:
-    """Change variables in the environment of a process as others see it in /proc.
+    """Change environment variables of a process, as /proc shows them to others.
 
-    What it has read already, it knows as it was. A value that is too long for its place is emptied.
+    Values that the process has already read stay as they were. A new value that is longer than the
+    old one is replaced by "".
 
     Args:
-        pid: of the process.
-        marks: the values, by name; "" empties one.
+        pid: the process.
+        marks: new values by name; "" empties a variable.
     """
     with contextlib.suppress(OSError, ValueError):
         fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()

@@ -1,6 +1,6 @@
-"""How a restore went, as the program that holds the restored process tells it; and how it starts.
+"""Result file and command line of the shim.
 
-It tells by a file beside the image, for it is nobody's child but the supervisor's.
+The shim reports by a file beside the image, because it is a child of the supervisor alone.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from typing import Final
 from rosrm.errors import CriuError
 from rosrm_criu.engine import paths
 
-#: Below the directory of the image.
+#: Name of the file below the directory of the image.
 FILE: Final = "hold.json"
 
-#: What ends a wait is a file: nothing tells of it but a look.
+#: Seconds between two reads of the file; the standard library cannot wait for a file.
 _LOOK: Final = 0.005
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a restore went.
+    """Result of a restore.
 
     Args:
-        reason: why it failed; "": it did not.
-        pid: of the restored process, as those see it who started the hold.
-        inner_pid: as it sees itself: what it had where it was dumped (Fast DDS writes it into the
+        reason: cause of the failure; "": the restore succeeded.
+        pid: of the restored process, in the pid namespace of the shim's parent.
+        inner_pid: in its own namespace, equal to the pid at the dump (Fast DDS writes it into the
             GIDs of endpoints).
-        namespace: it has a pid namespace of its own, and ends with its hold at once.
-        seconds: that the restore took, from the start of the hold.
+        namespace: the process has its own pid namespace, so it dies with its shim at once.
+        seconds: duration of the restore, from the start of the shim.
     """
 
     reason: str = ""
@@ -47,20 +47,21 @@ def command(
     python: str, directory: Path, *, criu: Path, remove: bool, timeout: float,
     then: Sequence[str] = (),
 ) -> tuple[str, ...]:  # fmt: skip
-    """The command line that the supervisor is given in place of the process's own.
+    """Return the command line for the supervisor, in place of the process's own.
 
-    Without site-packages (-S), as the supervisor itself: 0.07 s sooner with the ROS wheels.
+    Without site-packages (-S), like the supervisor itself: 0.07 s faster with the ROS wheels.
 
     Args:
         python: an interpreter.
         directory: of the image; an absolute path.
-        criu: the program.
-        remove: the image goes as soon as the process is restored. The directory stays, with what
-            was told: whoever looks later, however short that life was, sees that it was used up.
+        criu: the CRIU program.
+        remove: remove the image as soon as the process is restored. The directory stays with the
+            result, so that later readers see that the image was used, even if the process ended
+            soon.
         timeout: seconds for the restore.
-        then: the process's own command line, which runs when this is started again after the end of
-            the restored process: an image is for one life. What was told says that there was one,
-            so the directory has to stay as long as the instance may be started again.
+        then: the process's own command line, for a restart after the restored process has ended:
+            an image is restored only once. The result shows that it was, so the directory must
+            stay as long as the instance may be restarted.
     """
     program = str(Path(__file__).resolve().with_name("shim.py"))
     words = [python, "-I", "-S", program, paths.folder_of_rosrm(), str(directory)]
@@ -70,7 +71,7 @@ def command(
 
 
 def write(directory: Path, outcome: Outcome) -> None:
-    """Tell it, in one step."""
+    """Write the result atomically."""
     new = directory / f"{FILE}.new"
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
@@ -79,7 +80,7 @@ def write(directory: Path, outcome: Outcome) -> None:
 
 
 def read(directory: Path) -> Outcome | None:
-    """What was told; None: nothing yet. Raises CriuError for what nobody can read."""
+    """Return the result; None: there is none yet. Raise CriuError if it cannot be read."""
     try:
         return Outcome(**json.loads((directory / FILE).read_text(encoding="utf-8")))
     except FileNotFoundError:
@@ -89,19 +90,19 @@ def read(directory: Path) -> Outcome | None:
 
 
 def wait(directory: Path, *, timeout: float, ended: Callable[[], bool] = lambda: False) -> Outcome:
-    """Wait for the outcome of a restore; not to be called in a loop that others wait for.
+    """Wait for the result of a restore; do not call this in an event loop.
 
     Args:
         directory: of the image.
         timeout: seconds.
-        ended: whether the hold has ended, however that was noticed.
+        ended: returns True once the shim has ended.
 
     Raises:
-        CriuError: the restore failed, or nothing was heard of it.
+        CriuError: the restore failed, or there is no result in time.
     """
     end = time.monotonic() + timeout
     while True:
-        is_over = ended()  # asked first: what it told before its end is there then
+        is_over = ended()  # first, because a result written before the end is then found
         outcome = read(directory)
         if outcome is not None:
             break

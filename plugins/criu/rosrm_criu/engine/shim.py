@@ -1,16 +1,17 @@
-"""Holds a restored process: the supervisor starts this program in place of the process.
+"""Shim: restores a process and holds it; the supervisor starts it in place of the process.
 
-It is the instance's leader. It enters a new pid namespace, in which the ids of the image are free
-on every host, restores the image there, and from then on passes on: the signals that it gets to the
-restored process, and the end of that, exit code or signal, to the supervisor. Its own SIGKILL ends
-the namespace, and so every process of the instance, however these have daemonised.
+The shim is the instance's leader. It enters a new pid namespace, where the ids of the image are
+free on every host, and restores the image there. Then it forwards its signals to the restored
+process, and that process's exit code or signal to the supervisor. A SIGKILL of the shim ends the
+namespace, and so every process of the instance, even daemonised ones.
 
-Who is who: the hold; its child, the init of the namespace, which runs CRIU and reaps; the restored
-process, a child of the init. Where no namespace may be entered (no CAP_SYS_ADMIN), the hold is the
-parent itself, the ids have to be free on the host, and a guard beside it does the kernel's part.
+Processes: the shim; its child, the init of the namespace, which runs CRIU and reaps; the restored
+process, a child of the init. Without the right to create a namespace (no CAP_SYS_ADMIN), the shim
+itself is the parent and the ids must be free on the host. A guard process then kills the restored
+process when the shim dies, as the kernel does with a namespace.
 
 Standard library only; it runs as `python -I -S shim.py FOLDER DIRECTORY` (see
-`restore_result.command`), where FOLDER is the one in which `rosrm` lies.
+`restore_result.command`), where FOLDER contains `rosrm`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from rosrm_criu.engine.restore_result import Outcome
 #: Exit code of a restore that failed.
 FAILED: Final = 125
 
-#: Of linux/sched.h, linux/mount.h and linux/prctl.h.
+#: Constants of linux/sched.h, linux/mount.h and linux/prctl.h.
 _NEW_MOUNTS: Final = 0x00020000
 _NEW_PIDS: Final = 0x20000000
 _SLAVE: Final = 1 << 19
@@ -50,7 +51,7 @@ _RECURSIVE: Final = 1 << 14
 _SET_PDEATHSIG: Final = 1
 _SET_CHILD_SUBREAPER: Final = 36
 
-#: What cannot be caught, tells of our own children, or is our own fault.
+#: Signals that cannot be caught, report the shim's own children, or report its own faults.
 _OWN: Final = {
     signal.SIGKILL, signal.SIGSTOP, signal.SIGCHLD, signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE,
     signal.SIGILL, signal.SIGTRAP, signal.SIGSYS, signal.SIGABRT, signal.SIGPIPE, signal.SIGTTIN,
@@ -62,16 +63,16 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def main() -> None:
-    """Restore, hold, and end as the restored process ends."""
+    """Restore and hold the process, and end as it ends."""
     began = time.monotonic()
     words, then = _split(sys.argv[1:])
     options = _options(words)
     directory = Path(options.directory).absolute()
     if (then or options.remove) and _was_restored(directory):
         if options.remove:
-            image.remove(directory)  # what a SIGKILL has left of it
+            image.remove(directory)  # the rest that a SIGKILL of an earlier shim left
         _start_anew(directory, then)
-    # What comes while it is restored waits for it; SIGKILL alone does not.
+    # Signals that arrive during the restore stay pending; only SIGKILL takes effect at once.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
     try:
         manifest = image.read(directory)
@@ -88,7 +89,7 @@ def main() -> None:
 
 
 def _split(words: list[str]) -> tuple[list[str], list[str]]:
-    """Our own words, and behind the first "--" the command line of the process itself."""
+    """Split the shim's own arguments from the process's command line, at the first "--"."""
     end = words.index("--") if "--" in words else len(words)
     return words[:end], words[end + 1 :]
 
@@ -104,7 +105,7 @@ def _options(words: list[str]) -> argparse.Namespace:
 
 
 def _was_restored(directory: Path) -> bool:
-    """An earlier life of ours told so. That there is no image says nothing: others remove it."""
+    """Return True if an earlier shim reported success; a missing image proves nothing."""
     with contextlib.suppress(CriuError):
         told = restore_result.read(directory)
         return told is not None and not told.reason
@@ -112,11 +113,11 @@ def _was_restored(directory: Path) -> bool:
 
 
 def _start_anew(directory: Path, command: list[str]) -> NoReturn:
-    """Become the program itself: it was restored, has ended, and an image is for one life."""
+    """Become the process's own program: its image was already restored, and works only once."""
     if not command:
         sys.stderr.write(f"not restored: the image {directory} was restored before\n")
         sys.exit(FAILED)
-    for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT):  # Python's own ways
+    for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT):  # changed by Python
         signal.signal(number, signal.SIG_DFL)
     try:
         os.execvp(command[0], command)  # noqa: S606 - as the supervisor would start it
@@ -126,7 +127,7 @@ def _start_anew(directory: Path, command: list[str]) -> NoReturn:
 
 @dataclass(frozen=True)
 class _Restore:
-    """One restore: what it needs, and what is told of it."""
+    """One restore: its inputs and its report."""
 
     criu: Criu
     directory: Path
@@ -137,7 +138,7 @@ class _Restore:
     began: float
 
     def run(self, marks: dict[str, str]) -> int:
-        """Restore here and now; returns the pid in this namespace, raises CriuError."""
+        """Restore the process; return its pid in this namespace, or raise CriuError."""
         restore.prepare(self.directory, self.here)
         log = _reopened_log()
         try:
@@ -152,21 +153,22 @@ class _Restore:
         return pid
 
     def tell(self, pid: int, *, namespace: bool) -> None:
-        """That it is done: first so that everybody knows, for ever, and then the image may go."""
+        """Report success: first write the result, for all later readers; then remove the image."""
         seconds = round(time.monotonic() - self.began, 3)
         told = Outcome(pid=pid, inner_pid=self.manifest.pid, namespace=namespace, seconds=seconds)
         try:
             restore_result.write(self.directory, told)
             if self.remove:
                 image.remove(self.directory)
-        except OSError as error:  # the process lives; who waits for the word has a time-out
+        except OSError as error:  # the process lives, and clients that wait have a timeout
             sys.stderr.write(f"restored, but {self.directory} cannot be written: {error}\n")
 
 
 def _reopened_log() -> int:
-    """Our standard output, opened by its path.
+    """Return a new descriptor of standard output, opened by its path.
 
-    Only then does it belong to our mount namespace: the next dump could not tell its mount else.
+    Only such a descriptor belongs to this mount namespace; otherwise the next dump could not find
+    the file's mount.
     """
     with contextlib.suppress(OSError):
         path = os.readlink("/proc/self/fd/1")  # noqa: PTH115 - it may be no path
@@ -175,7 +177,7 @@ def _reopened_log() -> int:
 
 
 def _fail(directory: Path, reason: str) -> NoReturn:
-    """Say why there is no process, in the log and to who waits."""
+    """Report the failure in the log and in the result file, and exit."""
     sys.stderr.write(f"not restored: {reason}\n")
     with contextlib.suppress(OSError):
         restore_result.write(directory, Outcome(reason=reason))
@@ -186,7 +188,7 @@ def _fail(directory: Path, reason: str) -> NoReturn:
 
 
 def _hold_namespace(task: _Restore) -> NoReturn:
-    """The hold: our next child is the init of a pid namespace."""
+    """Fork the init of the new pid namespace, and represent it to the supervisor."""
     living, end_of_life = os.pipe()
     hearing, saying = os.pipe()
     init = os.fork()
@@ -210,28 +212,28 @@ def _hold_namespace(task: _Restore) -> NoReturn:
 
 
 def _be_init(task: _Restore, living: int, saying: int) -> NoReturn:
-    """The init: restores, reaps whoever ends, and goes with the restored process."""
+    """Run as init: restore, reap every ended process, and end with the restored process."""
     code = FAILED
     try:
         _libc.prctl(_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         poll = select.poll()
         poll.register(living, 0)
-        if poll.poll(0):  # the hold ended before it could take us along
+        if poll.poll(0):  # the shim ended before the prctl call
             os._exit(code)
         with os.fdopen(saying, "w", buffering=1) as said:
             try:
                 _own_mounts()
                 _skip_ids(task.manifest)
-                # Contained by the namespace: what it was elsewhere must not be taken for a mark.
+                # The namespace contains it; marks of its former host must not identify it here.
                 root = task.run({INSTANCE_MARK: "", SUPERVISOR_MARK: ""})
             except (CriuError, OSError) as error:
                 said.write(json.dumps({"failed": str(error)}) + "\n")
                 os._exit(code)
             said.write(json.dumps({"restored": root}) + "\n")
-            os.read(living, 16)  # until the hold has seen it: it may end at once
+            os.read(living, 16)  # until the shim has seen the process, which may end at once
             said.write(f"{_reap_until(root)}\n")
         code = 0
-    except Exception:  # noqa: BLE001 - a bug: it is told in the log, and the hold told of the end
+    except Exception:  # noqa: BLE001 - a bug: logged, and the shim sees this process end
         sys.excepthook(*sys.exc_info())
     finally:
         sys.stderr.flush()
@@ -239,7 +241,7 @@ def _be_init(task: _Restore, living: int, saying: int) -> NoReturn:
 
 
 def _own_mounts() -> None:
-    """A /proc that shows this namespace; what is mounted on the host later is seen here too."""
+    """Mount a /proc of this namespace; later mounts of the host still appear here."""
     done = (
         _libc.unshare(_NEW_MOUNTS) == 0
         and _libc.mount(b"none", b"/", None, _RECURSIVE | _SLAVE, None) == 0
@@ -251,7 +253,7 @@ def _own_mounts() -> None:
 
 
 def _skip_ids(manifest: Manifest) -> None:
-    """CRIU's own processes must not take ids that it is to restore."""
+    """Keep CRIU's own processes from taking ids that it is to restore."""
     most = int(Path("/proc/sys/kernel/pid_max").read_text())
     behind = restore.id_for_criu(manifest.ids, most)
     Path("/proc/sys/kernel/ns_last_pid").write_text(str(behind))
@@ -261,7 +263,7 @@ def _skip_ids(manifest: Manifest) -> None:
 
 
 def _hold_child(task: _Restore) -> NoReturn:
-    """The restored process becomes a child of our own."""
+    """Restore the process as a child of the shim itself."""
     _libc.prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     own = {name: os.environ.get(name, "") for name in (INSTANCE_MARK, SUPERVISOR_MARK)}
     try:
@@ -269,24 +271,24 @@ def _hold_child(task: _Restore) -> NoReturn:
     except (CriuError, OSError) as error:
         process_tree.send(
             process_tree.tree(os.getpid())[1:], signal.SIGKILL
-        )  # what CRIU had begun with
+        )  # processes that CRIU had started
         _fail(task.directory, str(error))
     guard, guarding = _start_guard(root)
     task.tell(root, namespace=False)
     status = _attend(root, root)
     os.write(guarding, b"ended")
-    with contextlib.suppress(ChildProcessError):  # it was reaped already: somebody killed it
+    with contextlib.suppress(ChildProcessError):  # already reaped: another process killed the guard
         os.waitpid(guard, 0)
     _end_as(status)
 
 
 def _start_guard(root: int) -> tuple[int, int]:
-    """Beside us, to end the restored process with us; its pid, and where it is told to go."""
+    """Start the guard that kills the restored process if the shim dies; return its pid and pipe."""
     living, end_of_life = os.pipe()
     hearing, saying = os.pipe()
     guard = os.fork()
     if guard == 0:
-        os.setsid()  # a SIGKILL to our group shall not reach it
+        os.setsid()  # so that a SIGKILL to the shim's group does not reach it
         os.close(end_of_life)
         os.close(saying)
         if not os.read(living, 16):
@@ -294,7 +296,7 @@ def _start_guard(root: int) -> tuple[int, int]:
         os._exit(0)
     os.close(living)
     os.close(saying)
-    os.read(hearing, 1)  # until it stands apart
+    os.read(hearing, 1)  # until the guard has its own session
     os.close(hearing)
     return guard, end_of_life
 
@@ -303,11 +305,12 @@ def _start_guard(root: int) -> tuple[int, int]:
 
 
 def _attend(root: int, child: int) -> int:
-    """Pass on signals until our child has ended; returns its wait status.
+    """Forward signals until a child has ended; return its wait status.
 
     Args:
-        root: the restored process; it leads a group, as everything that the supervisor starts.
-        child: whose end is awaited.
+        root: the restored process; it leads a process group, like every process that the supervisor
+            starts.
+        child: the child to wait for.
     """
     awaited = {*_PASSED_ON, signal.SIGCHLD}
     signal.pthread_sigmask(signal.SIG_BLOCK, awaited)
@@ -327,7 +330,7 @@ def _reap_until(root: int) -> int:
 
 
 def _reap(child: int, flags: int) -> int | None:
-    """Take the end of whoever has ended; the wait status, if that was the child."""
+    """Reap ended children; return the wait status of `child`, or None if it still runs."""
     while True:
         pid, status = os.waitpid(-1, flags)
         if pid == child:
@@ -337,10 +340,10 @@ def _reap(child: int, flags: int) -> int | None:
 
 
 def _end_as(status: int) -> NoReturn:
-    """As the restored process ended."""
+    """End this process with the same exit code or signal as the restored process."""
     number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
     if number:
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # its core is not ours
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core of the shim
         if number != signal.SIGKILL:
             signal.signal(number, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})

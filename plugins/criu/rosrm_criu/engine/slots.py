@@ -1,9 +1,9 @@
-"""Periodic images: of a process that goes on, which starts from the newest of them after a crash.
+"""Periodic images of a running process, which restarts from the newest of them after a crash.
 
-    images/periodic-NUMBER/1, 2, ...    each an image, with a file `rejoin.json` that makes it count
+    images/periodic-NUMBER/1, 2, ...    one image each; the file `rejoin.json` makes it valid
 
-Only a node that has left the ROS graph is dumped so, and that joins it as a new participant: its
-peers take what it says for new, however often one image is used. Standard library alone.
+Only a node that has left the ROS graph is dumped this way, and it rejoins as a new participant. So
+its peers treat its messages as new, however often one image is used. Standard library only.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from rosrm.errors import CriuError
 _REJOIN: Final = "rejoin.json"
 _STARTS: Final = "starts"
 _ANEW: Final = "anew"
-#: Starts from one image. A process that has crashed so often with no newer one behind it may do so
-#: for what it remembers: then it begins anew.
+#: Most starts from one image. A process that crashes more often without a newer image may crash
+#: because of its restored memory, so it then starts without an image.
 _MOST_STARTS: Final = 2
 
 
 @dataclass(frozen=True)
 class Rejoin:
-    """How a node that was restored from an image is told to join the ROS graph.
+    """Parameters for the rejoin of a node that is restored from an image.
 
     Attributes:
-        control: directory in which it is spoken to.
-        request: id by which it was asked to leave.
-        uid: of the user that it runs as.
+        control: its control directory.
+        request: id of the request to leave.
+        uid: the user that it runs as.
     """
 
     control: str
@@ -42,13 +42,13 @@ class Rejoin:
 
 
 def new_slot(parent: Path) -> Path:
-    """Where the next image goes; nothing is there."""
+    """Return the path of the next image, which does not exist yet."""
     numbers = [int(path.name) for path in _slots(parent)]
     return parent / str(max(numbers, default=0) + 1)
 
 
 def complete(slot: Path, rejoin: Rejoin) -> None:
-    """From now on the process starts from this image; older ones go."""
+    """Make an image valid: from now on the process starts from it. Remove older images."""
     new = slot / f"{_REJOIN}.new"
     new.touch(mode=0o600)
     new.write_text(json.dumps(asdict(rejoin)), encoding="utf-8")
@@ -59,23 +59,23 @@ def complete(slot: Path, rejoin: Rejoin) -> None:
 
 
 def discard_unfinished(parent: Path) -> None:
-    """Remove what a dump that was cut off has left."""
+    """Remove the images of interrupted dumps."""
     for slot in _slots(parent):
         if not (slot / _REJOIN).exists():
             shutil.rmtree(slot, ignore_errors=True)
 
 
 def begin_anew(parent: Path) -> None:
-    """The next start is from no image, nor from one that is being made just now."""
+    """Make the next start ignore all images, including one that is being made."""
     if parent.exists():
         (parent / _ANEW).touch()
 
 
 def newest(parent: Path) -> tuple[Path, Rejoin] | None:
-    """The image to start from, which counts as a start; None: begin anew.
+    """Return the image to start from, and count this start; None: start without an image.
 
     Raises:
-        CriuError: what is there cannot be read, or not be counted.
+        CriuError: an image cannot be read, or its start cannot be counted.
     """
     if (parent / _ANEW).exists():
         shutil.rmtree(parent, ignore_errors=True)
@@ -84,7 +84,7 @@ def newest(parent: Path) -> tuple[Path, Rejoin] | None:
         try:
             rejoin = Rejoin(**json.loads((slot / _REJOIN).read_text(encoding="utf-8")))
         except FileNotFoundError:
-            continue  # a dump that is under way, or was cut off
+            continue  # the dump is under way, or was interrupted
         except (OSError, ValueError, TypeError) as error:
             raise CriuError(f"the periodic image {slot} is damaged: {_REJOIN}: {error}") from None
         return (slot, rejoin) if _count_start(slot) <= _MOST_STARTS else None
@@ -92,7 +92,7 @@ def newest(parent: Path) -> tuple[Path, Rejoin] | None:
 
 
 def _count_start(slot: Path) -> int:
-    """One byte for each: that cannot be half written."""
+    """Append one byte per start, which cannot be half written; return the number of starts."""
     try:
         with (slot / _STARTS).open("ab") as file:
             file.write(b".")
@@ -103,7 +103,7 @@ def _count_start(slot: Path) -> int:
 
 
 def _slots(parent: Path) -> list[Path]:
-    """The newest first."""
+    """Return the images, newest first."""
     found: list[Path] = []
     with contextlib.suppress(FileNotFoundError):
         found = [path for path in parent.iterdir() if path.name.isdigit()]

@@ -1,9 +1,9 @@
-"""Keeps the UDP ports of a process free while it waits in its image.
+"""Reservation of a process's UDP ports while the process exists only as an image.
 
-Fast DDS takes the lowest ports that are free on a host, so the next participant there (a node, or a
-`rosrm` that asks for the restore) would take those of the process, and CRIU could not bind its
-sockets any more. What is reserved here is bound first, as Fast DDS binds it, and only then allows
-others beside it that say so themselves (SO_REUSEADDR): CRIU's sockets do, and multicast sockets.
+Fast DDS takes the lowest free ports of a host. So the next participant there (a node, or a `rosrm`
+that requests the restore) would take the ports of the process, and CRIU could not bind its sockets.
+A reserved port is first bound without SO_REUSEADDR, like Fast DDS does it, and set to SO_REUSEADDR
+only then. After that, only sockets with SO_REUSEADDR can share it: CRIU's, and multicast sockets.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _TABLES: Final = (("udp", socket.AF_INET), ("udp6", socket.AF_INET6))
 
 
 class Port(NamedTuple):
-    """Where a UDP socket is bound.
+    """Address of a bound UDP socket.
 
     Attributes:
         family: AF_INET or AF_INET6.
@@ -36,7 +36,7 @@ class Port(NamedTuple):
 
 
 def bound(pids: Iterable[int]) -> list[Port]:
-    """What the UDP sockets of some processes are bound to."""
+    """Return the bound addresses of the UDP sockets of some processes."""
     found: set[Port] = set()
     for pid in pids:
         own = {one.target for one in descriptors([pid]) if one.target.startswith("socket:")}
@@ -46,10 +46,10 @@ def bound(pids: Iterable[int]) -> list[Port]:
 
 
 def _table(pid: int, name: str, family: int) -> Iterator[tuple[str, Port]]:
-    """Each socket in the network of a process, as /proc names it in its descriptors."""
+    """Yield each socket in the network of a process, by the name that its descriptors show."""
     try:
         lines = Path(f"/proc/{pid}/net/{name}").read_text().splitlines()[1:]
-    except OSError:  # it has ended, or the kernel has no IPv6
+    except OSError:  # the process has ended, or the kernel has no IPv6
         return
     for line in lines:
         words = line.split()
@@ -58,30 +58,30 @@ def _table(pid: int, name: str, family: int) -> Iterator[tuple[str, Port]]:
 
 
 def _address(text: str, family: int) -> str:
-    """An address from the kernel's words, each in the byte order of this machine."""
+    """Return an address from the kernel's hexadecimal words, each in this machine's byte order."""
     words = [int(text[at : at + 8], 16) for at in range(0, len(text), 8)]
     return socket.inet_ntop(family, struct.pack(f"={len(words)}I", *words))
 
 
 def write(path: Path, ports: Iterable[Port]) -> None:
-    """Remember them."""
+    """Write ports to a file."""
     path.write_text(json.dumps([list(one) for one in ports]), encoding="utf-8")
 
 
 def read(path: Path) -> list[Port]:
-    """What was remembered; nothing where that cannot be read."""
+    """Return the ports in a file; none if it cannot be read."""
     with contextlib.suppress(OSError, ValueError, TypeError):
         return [Port(*one) for one in json.loads(path.read_text(encoding="utf-8"))]
     return []
 
 
 def reserve(ports: Iterable[Port]) -> list[socket.socket]:
-    """Sockets that keep these ports until they are closed; none for a port that is in use."""
+    """Return sockets that reserve these ports until they are closed; none for a port in use."""
     held = []
     for one in ports:
         try:
             held.append(_reserved(one))
-        except OSError:  # shared with others, or taken meanwhile: the restore will tell
+        except OSError:  # shared, or taken since the dump: the restore will report it
             continue
     return held
 
@@ -91,7 +91,7 @@ def _reserved(port: Port) -> socket.socket:
     try:
         if port.family == socket.AF_INET6:
             one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)  # nobody reads what comes
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)  # the socket is never read
         one.bind((port.address, port.port))
         one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     except OSError:

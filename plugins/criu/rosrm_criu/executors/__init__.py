@@ -1,1 +1,1 @@
-"""What slaves do in the plans of `criu`: each function is an executor."""
+"""Executors of the plan steps of `criu`, run by slaves."""

@@ -1,8 +1,8 @@
-"""What a slave holds of moves by `criu`: images and the ends of transfers, which go by themselves.
+"""A slave's images and transfer ends of migrations by `criu`, with automatic cleanup.
 
-A master may ask for a step a second time, and turn a move back while a step is under way; a slave
-may be killed and be started again. So steps are known by the attempt, and things by the number of
-an instance; what nobody uses any more is removed after a time.
+A master may request a step twice, or undo a migration while a step is under way. A slave may be
+killed and restarted. So steps are identified by the attempt, and artifacts by the number of an
+instance. Unused artifacts are removed after a time.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from rosrm_criu.transfer import Fetcher, Sender
 
 Answer = Mapping[str, Any]
 
-#: Of an image that a killed slave has left: seconds after which nobody will start from it.
+#: Seconds after which an image that a killed slave has left is no longer needed for a start.
 _LEFT_BEHIND: Final = 120.0
-#: Steps whose answers are remembered; far more than there are moves at a time.
+#: Steps whose answers are kept; far more than there are migrations at a time.
 _REMEMBERED: Final = 50
 
-#: Below an image that was laid out to be restored: of which instance it is kept.
+#: File below an image copied for a restore: number of the instance whose checkpoint it is.
 _ORIGIN: Final = "of"
 
 _changing: Final = threading.Lock()
@@ -44,12 +44,12 @@ _dumping: Final[defaultdict[int, threading.Lock]] = defaultdict(threading.Lock)
 
 
 def once(step: str, attempt: str, work: Callable[[], Answer]) -> Answer:
-    """Do a step; who asks for it again while it is done, or afterwards, gets the same answer.
+    """Run a step once per attempt; repeated calls, also concurrent ones, get the same answer.
 
     Args:
         step: its name.
-        attempt: of the move.
-        work: the step. When it raises it is forgotten, and done anew when it is asked for again.
+        attempt: id of the migration attempt.
+        work: the step. If it raises, its result is dropped, and the next call runs it again.
     """
     with _changing:
         flight = _flights.get((step, attempt))
@@ -72,7 +72,7 @@ def once(step: str, attempt: str, work: Callable[[], Answer]) -> Answer:
 
 
 def after(step: str, attempt: str, timeout: float) -> None:
-    """Wait until a step that is under way is over; raises CriuError after so many seconds."""
+    """Wait for the end of a step under way; raise CriuError after `timeout` seconds."""
     with _changing:
         flight = _flights.get((step, attempt))
     if flight is None:
@@ -85,10 +85,10 @@ def after(step: str, attempt: str, timeout: float) -> None:
 
 @contextlib.contextmanager
 def alone(number: int, timeout: float) -> Iterator[None]:
-    """Nobody else dumps an instance meanwhile.
+    """Exclude other dumps of an instance.
 
     Raises:
-        CriuError: somebody does, for longer than so many seconds.
+        CriuError: another dump is still under way after `timeout` seconds.
     """
     with _changing:
         lock = _dumping[number]
@@ -101,7 +101,7 @@ def alone(number: int, timeout: float) -> Iterator[None]:
 
 
 def is_busy(number: int) -> bool:
-    """Whether an instance is being dumped for this slave."""
+    """Return True if this slave is dumping an instance."""
     with _changing:
         return _dumping[number].locked()
 
@@ -110,7 +110,7 @@ def is_busy(number: int) -> bool:
 
 
 def open_sender(number: int) -> Sender:
-    """The end of a transfer, ready for the image of an instance; a former one of it is over."""
+    """Open the sending end for the image of an instance, and close a former one of it."""
     sender = Sender()
     with _changing:
         former = _senders.get(number)
@@ -122,13 +122,13 @@ def open_sender(number: int) -> Sender:
 
 
 def remove_when_over(state: Path, number: int, sender: Sender, seconds: float) -> None:
-    """Remove an image that was offered when it was taken, or its time is over."""
+    """Remove an offered image once it was fetched or its offer has expired."""
 
     def wait() -> None:
         sender.wait(seconds + 5.0)
         with _changing:
             if _senders.get(number) is not sender:
-                return  # withdrawn: there may be another image by now
+                return  # withdrawn: there may already be another image
             del _senders[number]
             discard(outgoing(state, number))
         sender.close()
@@ -137,7 +137,7 @@ def remove_when_over(state: Path, number: int, sender: Sender, seconds: float) -
 
 
 def withdraw(state: Path, number: int) -> None:
-    """There is no offer any more, nor an image."""
+    """Withdraw the offer of an instance, and remove its image."""
     with _changing:
         sender = _senders.pop(number, None)
     if sender is not None:
@@ -149,11 +149,11 @@ def withdraw(state: Path, number: int) -> None:
 
 
 def open_fetcher(number: int, keep: float) -> str:
-    """The end of a transfer for an instance that is to be; the certificate that it will show."""
+    """Open the receiving end for a future instance, and return its certificate."""
     fetcher = Fetcher()
     try:
         certificate = fetcher.introduce()
-    except BaseException:  # whatever it was: nobody else knows of this end
+    except BaseException:  # any error: no other code would close this end
         fetcher.close()
         raise
     with _changing:
@@ -166,13 +166,13 @@ def open_fetcher(number: int, keep: float) -> str:
 
 
 def take_fetcher(number: int) -> Fetcher | None:
-    """That end, for the one fetch that it makes; None: it is gone, or never was."""
+    """Return the receiving end, for its only fetch; None: it is closed or was never opened."""
     with _changing:
         return _fetchers.pop(number, None)
 
 
 def close_soon(fetcher: Fetcher) -> None:
-    """End it; somebody stands still until the image is restored, and does not wait for that."""
+    """Close the receiving end in the background, because a node is frozen until the restore."""
     _later(0.0, fetcher.close)
 
 
@@ -185,10 +185,10 @@ def _dismiss(number: int, fetcher: Fetcher) -> None:
 
 
 def await_restored(asked: Asked) -> Outcome:
-    """Wait until the image that came here is a process again; that alone stays to be known then.
+    """Wait until the received image is restored; then remove it, except the result of the restore.
 
     Raises:
-        CriuError: it has become none.
+        CriuError: the restore failed.
     """
     pid, directory = asked.pid(asked.destination), incoming(asked.state, asked.destination)
     with without_log_names():
@@ -197,25 +197,25 @@ def await_restored(asked: Asked) -> Outcome:
             timeout=asked.timeout,
             ended=lambda: not pid or not process_tree.is_alive(pid),
         )
-    image.remove(directory)  # its hold may have been killed before it did
+    image.remove(directory)  # its shim may have been killed before it removed the image
     return found
 
 
 def remove_unused_later(directory: Path, keep: float) -> None:
-    """As `remove_unused`, after so many seconds."""
+    """Call `remove_unused` after `keep` seconds."""
     _later(keep, remove_unused, directory)
 
 
 def remove_unused(directory: Path) -> None:
-    """Remove an image; where a process was restored from it, that stays to be known."""
+    """Remove an image; if a process was restored from it, keep the result of the restore."""
     if was_restored(directory):
-        image.remove(directory)  # its hold may have been killed before it did
+        image.remove(directory)  # its shim may have been killed before it removed the image
     else:
         discard(directory)
 
 
 def was_restored(directory: Path) -> bool:
-    """Whether an image has become a process, which may have ended since."""
+    """Return True if a process was restored from an image, even if it has ended since."""
     try:
         told = restore_result.read(directory)
     except CriuError:
@@ -227,16 +227,16 @@ def was_restored(directory: Path) -> bool:
 
 
 def discard(directory: Path) -> None:
-    """Nothing of an image is left."""
+    """Remove an image completely."""
     shutil.rmtree(directory, ignore_errors=True)
 
 
 def sweep(state: Path, instances: Iterable[str]) -> None:
-    """Remove what a former slave of this host has left.
+    """Remove the artifacts of a former slave of this host.
 
     Args:
-        state: of the slave.
-        instances: `process#number` of each that has not ended here.
+        state: directory of the slave.
+        instances: `process#number` of each instance on this host that has not ended.
     """
     with _changing:
         for number in _numbers(state, "out"):
@@ -250,10 +250,10 @@ def sweep(state: Path, instances: Iterable[str]) -> None:
 
 
 def forget_restored(state: Path, instances: Iterable[str]) -> None:
-    """Remove what says of instances that were restored, and have ended, that they were.
+    """Remove the restore results of instances that have ended.
 
-    Their supervisor needs it to start them again; so does who asks whether a kept image was used
-    up, as long as that lies there. As `sweep`.
+    The supervisor needs a result to restart an instance. So does the question of whether a
+    checkpoint was used, as long as its image exists. Arguments as for `sweep`.
     """
     here = set(map(number_of, instances))
     for number in _numbers(state, "in"):
@@ -263,7 +263,7 @@ def forget_restored(state: Path, instances: Iterable[str]) -> None:
 
 
 def note_origin(directory: Path, number: int) -> None:
-    """An image was laid out from that which is kept of an instance."""
+    """Record in a copied image the instance whose checkpoint it is."""
     (directory / _ORIGIN).write_text(str(number), encoding="utf-8")
 
 
@@ -276,7 +276,7 @@ def _is_awaited(state: Path, directory: Path) -> bool:
 
 
 def number_of(instance: str) -> int:
-    """Of `process#number`."""
+    """Return the number in `process#number`."""
     return int(instance.rpartition("#")[2])
 
 
@@ -287,7 +287,7 @@ def _numbers(state: Path, way: str) -> list[int]:
 
 
 def _later(seconds: float, do: Callable[..., None], *arguments: Any) -> None:
-    """In a thread that keeps no slave from ending."""
+    """Call a function later, in a thread that does not keep the slave from ending."""
     timer = threading.Timer(seconds, do, arguments)
     timer.daemon = True
     timer.start()

@@ -1,8 +1,8 @@
-"""What a slave does for checkpoints and restores by `criu`: each function is an executor.
+"""Executors of a slave for checkpoints and their restores by `criu`.
 
-Every one may be asked for twice, as those of `move`. The image of a checkpoint lies apart
-from those of moves. What a restore uses up is a second name of it (hard links): until the process
-is there again, whatever fails on the way leaves the image as it was.
+Each may be called twice, like those of `move`. Images of checkpoints lie apart from those of
+migrations. A restore uses up only a copy made of hard links. So the original image stays intact
+after any failure until the process is restored.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from rosrm_criu.executors import artifacts
 from rosrm_criu.executors.request import Asked, check_wanted, turn_back, without_log_names
 from rosrm_criu.plans import KEEP, TAKE
 
-#: Sockets that keep the ports of processes that wait in their images, by the instance's number.
+#: Sockets that reserve the ports of checkpointed processes, by the number of the instance.
 _reserved: Final[dict[int, list[socket.socket]]] = {}
 _changing: Final = threading.Lock()
-#: Seconds between two looks at what nothing tells of.
+#: Seconds between two polls of a condition that causes no event.
 _LOOK: Final = 0.005
 
 
@@ -37,7 +37,7 @@ _LOOK: Final = 0.005
 
 
 def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Dump the process into an image; it stands still from then on."""
+    """Dump the process into an image; the process stays stopped."""
     asked = Asked.of(arguments)
     return artifacts.once(KEEP, asked.attempt, lambda: _keep(asked))
 
@@ -50,7 +50,7 @@ def _keep(asked: Asked) -> Mapping[str, Any]:
 def _keep_alone(asked: Asked) -> Mapping[str, Any]:
     pid = asked.leader(asked.source)
     root = process_tree.root_of(pid)
-    if process_tree.is_stopped(root):  # by an earlier asking, whose slave was killed
+    if process_tree.is_stopped(root):  # by an earlier call, whose slave was killed
         dump.resume(pid)
     pids = process_tree.tree(root)
     trouble = external_resources.shared_memory(pids)
@@ -66,7 +66,7 @@ def _keep_alone(asked: Asked) -> Mapping[str, Any]:
                 process=asked.process, instance=asked.source,
             )  # fmt: skip
         udp_ports.write(ports_of_kept(asked.state, asked.source), udp_ports.bound(pids))
-    except BaseException:  # whatever it was, the process goes on and nothing is left behind
+    except BaseException:  # any error: the process continues, and nothing is left behind
         _discard(asked.state, asked.source)
         dump.resume(pid)
         raise
@@ -74,7 +74,7 @@ def _keep_alone(asked: Asked) -> Mapping[str, Any]:
 
 
 def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The checkpoint has failed: the process goes on, unless it has ended."""
+    """Undo a failed checkpoint: continue the process, unless it has ended."""
     asked = Asked.of(arguments)
     turn_back(asked.attempt)
     artifacts.after(KEEP, asked.attempt, asked.timeout)
@@ -86,7 +86,7 @@ def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The image owns the name: the process ends at once, and its ports are kept for it."""
+    """Kill the process after the commit, and reserve its ports for the image that owns the name."""
     asked = Asked.of(arguments)
     pid = asked.pid(asked.source)
     if pid:
@@ -105,12 +105,12 @@ def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Lay the image out for the start that follows."""
+    """Copy the image by hard links, for the start that follows."""
     asked = Asked.of(arguments)
     if asked.pid(asked.destination):
-        return {"taken": True}  # by an earlier asking: it is being restored
+        return {"taken": True}  # an earlier call took it, and the restore is under way
     if artifacts.was_restored(incoming(asked.state, asked.destination)):
-        return {"taken": True}  # likewise, and it has ended since: an image is for one life
+        return {"taken": True}  # restored once already; the process has ended since
     source, target = kept(asked.state, asked.source), incoming(asked.state, asked.destination)
     image.read(source)
     artifacts.discard(target)
@@ -128,12 +128,12 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 def _link(source: str, target: str) -> None:
     try:
         os.link(source, target)
-    except OSError:  # a file system without
+    except OSError:  # a file system without hard links
         shutil.copy2(source, target)
 
 
 def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Wait until the image is a process again; it is used up then."""
+    """Wait until the image is restored, and remove it."""
     asked = Asked.of(arguments)
     found = artifacts.await_restored(asked)
     _discard(asked.state, asked.source)
@@ -141,9 +141,9 @@ def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The restore is to be undone: the image is as it was, unless the process is there again.
+    """Undo a restore: keep the original image, unless the process is already restored.
 
-    A restore under way is waited for: it is not ended while it may succeed.
+    A restore under way is awaited, because it must not be killed while it may succeed.
     """
     asked = Asked.of(arguments)
     directory = incoming(asked.state, asked.destination)
@@ -155,7 +155,7 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         artifacts.await_restored(asked)
     except CriuError:
         if asked.pid(asked.destination):
-            process_tree.send([pid], signal.SIGKILL)  # the shim, and so what it holds
+            process_tree.send([pid], signal.SIGKILL)  # the shim, and so the process that it holds
             raise
         artifacts.discard(directory)
         return {}
@@ -167,7 +167,7 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def drop(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Nobody wants the image any more."""
+    """Remove images that are no longer needed."""
     state = Path(arguments["here"]["state"])
     for number in map(int, arguments["numbers"]):
         _discard(state, number)
@@ -176,7 +176,7 @@ def drop(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def reserve_all(state: Path) -> None:
-    """A slave has come up: the ports of what waits in images here are kept again."""
+    """Reserve the ports of all checkpointed processes again, after the start of a slave."""
     for number in kept_numbers(state):
         _reserve(state, number)
 
@@ -188,7 +188,7 @@ def _reserve(state: Path, number: int) -> None:
 
 
 def _discard(state: Path, number: int) -> None:
-    """Nothing is left of an image, and its ports are anybody's."""
+    """Remove a checkpoint and release its ports."""
     artifacts.discard(kept(state, number))
     with contextlib.suppress(FileNotFoundError, NotADirectoryError):
         ports_of_kept(state, number).unlink()

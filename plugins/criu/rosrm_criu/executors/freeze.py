@@ -1,4 +1,4 @@
-"""Has a portable node leave the ROS graph, and come back where it stands still."""
+"""Graph departure of a portable node for a dump, and its rejoin on the same host."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from rosrm_criu.executors.request import check_wanted
 
 
 def leave(pid: int, control: Path, attempt: str, timeout: float) -> float:
-    """Have it leave, so that it can be dumped; returns the seconds that it says it took.
+    """Make the node leave, so that it can be dumped; return its own measured duration in seconds.
 
     Args:
-        pid: of the instance's leader.
-        control: directory in which the node is spoken to.
-        attempt: by which it is asked.
+        pid: the instance's leader.
+        control: the node's control directory.
+        attempt: id of the request to leave.
         timeout: seconds.
 
     Raises:
-        CriuError, PortableError: it does not leave.
+        CriuError, PortableError: the node does not leave.
     """
     root = process_tree.root_of(pid)
-    if process_tree.is_stopped(root):  # an earlier asking of this very step has dumped it
+    if process_tree.is_stopped(root):  # an earlier call of the same step has dumped it
         dump.resume(pid)
     check_wanted(attempt)
     ask_prepare(control, root, attempt)
@@ -42,31 +42,33 @@ def leave(pid: int, control: Path, attempt: str, timeout: float) -> float:
 
 
 def call_back(pid: int, control: Path, attempt: str) -> bool:
-    """Let it go on where it stands still, and ask it to join; that is not waited for.
+    """Continue the node on its host, and request a rejoin without waiting for it.
 
-    False: it listens to nobody, so it is no portable node, and never was asked to leave.
+    Returns:
+        False if the process does not handle requests. Then it is no portable node, and was never
+        asked to leave.
 
     Raises:
-        PortableError: it cannot be asked now, as where the disk is full.
+        PortableError: the request cannot be written, e.g. because the disk is full.
     """
     dump.resume(pid)
     root = process_tree.root_of(pid)
     if not listens(root):
         return False
-    if not control.exists():  # a copy of it that has ended took it along, where hosts share /tmp
+    if not control.exists():  # where hosts share /tmp, a copy of the node that ended has removed it
         make_directory(control, owner_of(pid))
     ask_resume(control, root, attempt)
     return True
 
 
 def has_failed(control: Path) -> bool:
-    """Whether the node says that it can never join again."""
+    """Return True if the node reports that it can never rejoin."""
     found = status_of(control)
     return found is not None and found.state is State.FAILED
 
 
 def control_of(pid: int) -> Path:
-    """Where the node is spoken to: it was told at its start, and keeps it through a move."""
+    """Return the control directory of the node, fixed at its start and unchanged by migrations."""
     try:
         found = directory_of(process_tree.root_of(pid))
     except OSError as error:
@@ -77,14 +79,14 @@ def control_of(pid: int) -> Path:
             f"`migration: criu` in its file"
         )
     owner = owner_of(pid)
-    # The environment is the process's own: who writes there for another user chooses the place.
+    # A process chooses its environment: another user could name a place for root to write to.
     if owner != os.geteuid() and found != control_directory(found.name, owner):
         raise CriuError(f"process {pid} of user {owner} names {found}: that is no place for it")
     return found
 
 
 def owner_of(pid: int) -> int:
-    """The user whom the process belongs to; raises `CriuError` where it has ended."""
+    """Return the uid of the process; raise `CriuError` if it has ended."""
     try:
         return Path(f"/proc/{process_tree.root_of(pid)}").stat().st_uid
     except OSError:

@@ -1,7 +1,7 @@
-"""What the slaves do for `criu`: each function is an executor, given JSON and answering with it.
+"""Executors of the slaves for migrations by `criu`: JSON in, JSON out.
 
-Every one may be asked for twice: a master that was killed gives the step in hand once more, and so
-does one whose slave was started again. `artifacts` has what is kept from one to the next.
+Each may be called twice, because a restarted master repeats the current step, and so does a master
+whose slave was restarted. `artifacts` has the state that is kept between the calls.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from rosrm_criu.transfer import Offer, Sender, missing
 
 
 def say_ability(arguments: Answer) -> Answer:
-    """Whether CRIU works here, and what an image of this host needs elsewhere.
+    """Return the facts of this host that decide about restores; raise `CriuError` without CRIU.
 
-    A slave is asked for it when it has registered: what one before it has left, goes.
+    A slave gets this call after its registration, so the rest of its predecessor is removed here.
     """
     here = arguments["here"]
     state = Path(here["state"])
@@ -54,9 +54,9 @@ def say_ability(arguments: Answer) -> Answer:
 
 
 def checkpoint(arguments: Answer) -> Answer:
-    """Have the node leave the ROS graph, dump it, and offer the image.
+    """Make the node leave the ROS graph, dump it, and offer the image.
 
-    It stands still from then on; whatever fails, it is asked to go on.
+    The node is frozen from then on; after any failure it is asked to continue.
     """
     asked = Asked.of(arguments)
     return artifacts.once(CHECKPOINT, asked.attempt, lambda: _checkpoint(asked))
@@ -78,7 +78,7 @@ def _checkpoint_alone(asked: Asked) -> Answer:
         directory = _dump(pid, asked)
         offered = time.monotonic()
         offer = _offer(sender, directory, asked)
-    except Exception:  # whatever it was, the node comes back
+    except Exception:  # any error: the node rejoins
         artifacts.withdraw(asked.state, asked.source)
         call_back(pid, control, asked.attempt)
         raise
@@ -92,9 +92,9 @@ def _checkpoint_alone(asked: Asked) -> Answer:
 
 
 def go_on(arguments: Answer) -> Answer:
-    """The move has failed: the node goes on where it stands still.
+    """Undo a failed migration: the node continues where it is frozen.
 
-    One that has ended meanwhile does not: its restart policy says what follows.
+    If the node has ended since, its restart policy applies.
     """
     asked = Asked.of(arguments)
     turn_back(asked.attempt)
@@ -110,13 +110,13 @@ def go_on(arguments: Answer) -> Answer:
         return {}
     before = status_of(control)
     if not call_back(pid, control, asked.attempt) or (before and before.state is State.RUNNING):
-        return {}  # it had not left: what it does just now, it does to its end
+        return {}  # it had not left, and completes its current action
     status = await_joined(control, asked.attempt, asked.timeout, process_tree.root_of(pid))
     return {"missing": list(status.missing)}
 
 
 def end(arguments: Answer) -> Answer:
-    """The destination owns the name: what is left of the source goes."""
+    """Remove the rest of the source after the commit to the destination."""
     asked = Asked.of(arguments)
     artifacts.withdraw(asked.state, asked.source)
     pid = asked.pid(asked.source)
@@ -124,7 +124,7 @@ def end(arguments: Answer) -> Answer:
         control = control_of(pid)
         status = status_of(control)
         dump.kill(pid)
-        # Where both hosts share it, it says by now that the node runs.
+        # If both hosts share the directory, its status already says that the node runs.
         if status is not None and status.state is State.LEFT:
             remove_directory(control)
     return {}
@@ -158,7 +158,7 @@ def _offer(sender: Sender, directory: Path, asked: Asked) -> Offer:
 
 
 def introduce(arguments: Answer) -> Answer:
-    """Be ready for the image, before anything stands still; say who alone may fetch it."""
+    """Prepare the fetch before the node is frozen; return the only certificate that may fetch."""
     asked = Asked.of(arguments)
     named = arguments.get("working_directory")
     if named and not Path(named).expanduser().is_dir():
@@ -168,7 +168,7 @@ def introduce(arguments: Answer) -> Answer:
 
 
 def fetch_image(arguments: Answer) -> Answer:
-    """Bring the image here, for the start that follows."""
+    """Fetch the image to this host, for the start that follows."""
     asked = Asked.of(arguments)
     return artifacts.once(FETCH, asked.attempt, lambda: _fetch(asked))
 
@@ -200,7 +200,7 @@ def _fetch(asked: Asked) -> Answer:
 
 
 def await_restored(arguments: Answer) -> Answer:
-    """Wait until the image is a process again; there is nothing left of one that cannot be."""
+    """Wait until the image is restored; remove an image whose restore fails."""
     asked = Asked.of(arguments)
     try:
         found = artifacts.await_restored(asked)
@@ -211,7 +211,7 @@ def await_restored(arguments: Answer) -> Answer:
 
 
 def join(arguments: Answer) -> Answer:
-    """Have the node join the ROS graph here; one that never can is ended: its policy goes on."""
+    """Make the node rejoin the ROS graph here; kill one that never can, for its restart policy."""
     asked = Asked.of(arguments)
     pid = asked.pid(asked.destination)
     root, began = process_tree.root_of(pid), time.monotonic()

@@ -1,8 +1,8 @@
-"""What a slave does for periodic checkpoints by `criu`: each function is an executor.
+"""Executors of a slave for periodic checkpoints by `criu`.
 
-The node leaves the ROS graph, is dumped, and joins again at once. An image counts as soon as the
-node has joined after it; until then there is the one before. Whoever is killed meanwhile, the next
-slave has the node join again.
+The node leaves the ROS graph, is dumped, and rejoins at once. An image becomes valid as soon as the
+node has rejoined after it; until then the previous one is valid. If the slave is killed on the way,
+the next slave makes the node rejoin.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from rosrm_criu.executors import artifacts
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
 from rosrm_criu.executors.request import Asked, without_log_names
 
-#: Below the images of an instance: holds the id of its absence, as long as it is away.
+#: File beside the images of an instance, with the id of its absence while the node is away.
 _AWAY: Final = "away"
-#: Seconds for a dump to end that a killed slave has begun, and between two looks at it.
+#: Seconds for the end of a dump that a killed slave has begun, and between two polls of it.
 _PATIENCE: Final = 20.0
 _LOOK: Final = 0.01
 
 
 def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Have the node leave, dump it, and have it join again."""
+    """Make the node leave, dump it, and make it rejoin."""
     asked = Asked.of(arguments)
     parent = paths.periodic(asked.state, asked.source)
     with artifacts.alone(asked.source, asked.timeout):
@@ -44,7 +44,7 @@ def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def why_not_written(parent: Path, error: OSError) -> str:
-    """In words: a process that was started anew meanwhile has taken its images away."""
+    """Explain a failed write; the images are missing if the process was restarted since."""
     if isinstance(error, FileNotFoundError) and not parent.exists():
         return "the process was started anew meanwhile, and its images are removed"
     return f"no image can be made in {parent}: {error.strerror}"
@@ -64,9 +64,9 @@ def _dump(asked: Asked, parent: Path) -> Mapping[str, Any]:
         status = await_joined(control, asked.attempt, _seconds(asked, "join"), root)
         joined = time.monotonic()
         _add_checksums(slot, manifest)
-    except BaseException:  # whatever it was: the image is of no use
+    except BaseException:  # any error: the image is useless
         shutil.rmtree(slot, ignore_errors=True)
-        if has_failed(control):  # it can never join: its policy goes on, from the image before
+        if has_failed(control):  # its restart policy starts it from the previous image
             dumping.kill(pid)
         raise
     finally:
@@ -81,7 +81,7 @@ def _dump(asked: Asked, parent: Path) -> Mapping[str, Any]:
 
 
 def _dump_away(asked: Asked, pid: int, control: Path, slot: Path) -> tuple[Manifest, float]:
-    """The dump, and when the node had left for it; whatever fails, it is called back."""
+    """Dump the node; return the manifest and the time of departure. The node always rejoins."""
     try:
         leave(pid, control, asked.attempt, _seconds(asked, "leave"))
         left = time.monotonic()
@@ -96,7 +96,7 @@ def _dump_away(asked: Asked, pid: int, control: Path, slot: Path) -> tuple[Manif
 
 
 def _add_checksums(slot: Path, manifest: Manifest) -> None:
-    """It reads the whole image: nobody is away for that."""
+    """Add checksums while the node runs again, because this reads the whole image."""
     checksums = image.file_checksums(slot, manifest.sizes)
     image.write(slot, replace(manifest, checksums=checksums))
 
@@ -119,11 +119,11 @@ def sweep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
-    """Whom a former slave has left away from the ROS graph joins again.
+    """Request a rejoin from the nodes that a former slave has left out of the ROS graph.
 
     Args:
         state: directory of the slave.
-        pids: of the leaders of the instances that run here, by `process#number`.
+        pids: leaders of the instances that run here, by `process#number`.
 
     Raises:
         CriuError: one of them is still being dumped.
@@ -138,7 +138,7 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
 
 
 def _await_end_of_dump(instance: str, pid: int) -> None:
-    """CRIU goes on without the slave that began it, and in the end stops what it has dumped."""
+    """Wait for a CRIU that outlived its slave, because it stops the process when it finishes."""
     deadline = time.monotonic() + _PATIENCE
     while tracer := external_resources.tracer(process_tree.root_of(pid)):
         if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""What an executor of `criu` is asked, and what all of them need."""
+"""Common arguments and helpers of the executors of `criu`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Final
 from rosrm.errors import CriuError
 from rosrm_criu.engine import process_tree
 
-#: CRIU's logs go with the image; what matters of them is in the message.
+#: References to CRIU's logs, which are removed with the image; the message has the cause.
 _LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
 
 _turned_back: Final[set[str]] = set()
@@ -22,19 +22,19 @@ _turning: Final = threading.Lock()
 
 @dataclass(frozen=True)
 class Asked:
-    """What every step is told.
+    """Arguments of every step.
 
     Attributes:
-        process: name of it.
+        process: its name.
         source, destination: numbers of its instances.
-        attempt: of the plan, also in what the node is asked.
+        attempt: id of the plan's attempt, also used in requests to the node.
         timeout: seconds for this step.
-        host: name of this one.
-        state: directory of its slave.
-        pids: of the leaders of the instances that run here, by `process#number`.
-        instances: so named, all that have not ended here.
-        results: what the executors of earlier steps have answered, by their names.
-        arguments: all that was told.
+        host: name of this host.
+        state: directory of the slave.
+        pids: leaders of the instances that run here, by `process#number`.
+        instances: all instances that have not ended here, in the same form.
+        results: results of the executors of earlier steps, by executor name.
+        arguments: all arguments.
     """
 
     process: str
@@ -51,7 +51,7 @@ class Asked:
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> Asked:
-        """From what the slave has handed over."""
+        """Return the arguments that the slave passed, parsed."""
         here = arguments["here"]
         return cls(
             str(arguments["process"]), int(arguments["source"]), int(arguments["destination"]),
@@ -61,12 +61,12 @@ class Asked:
         )  # fmt: skip
 
     def pid(self, number: int) -> int:
-        """Of the leader of an instance that lives here; 0: none does."""
+        """Return the pid of the leader of an instance that lives here; 0: there is none."""
         pid = self.pids.get(f"{self.process}#{number}", 0)
         return pid if pid and process_tree.is_alive(pid) else 0
 
     def leader(self, number: int) -> int:
-        """As `pid`; raises `CriuError` where there is none."""
+        """Return the same as `pid`; raise `CriuError` if there is none."""
         pid = self.pid(number)
         if not pid:
             raise CriuError(f"{self.process}#{number} does not run on {self.host}")
@@ -74,13 +74,13 @@ class Asked:
 
 
 def turn_back(attempt: str) -> None:
-    """The master has given an attempt up: what is under way for it goes no further."""
+    """Mark an attempt as given up by the master, so that its steps under way stop."""
     with _turning:
         _turned_back.add(attempt)
 
 
 def check_wanted(attempt: str) -> None:
-    """Raise `CriuError` where an attempt was given up meanwhile."""
+    """Raise `CriuError` if the attempt was given up."""
     with _turning:
         if attempt in _turned_back:
             raise CriuError("the move was undone")
@@ -88,7 +88,7 @@ def check_wanted(attempt: str) -> None:
 
 @contextlib.contextmanager
 def without_log_names() -> Iterator[None]:
-    """What CRIU says goes to people without the names of its logs, which go with the image."""
+    """Remove the names of CRIU's logs from its errors, because the logs vanish with the image."""
     try:
         yield
     except CriuError as error:

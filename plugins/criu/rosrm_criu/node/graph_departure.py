@@ -1,4 +1,4 @@
-"""What a node takes through the time in which it has no part in the ROS graph."""
+"""State that a node keeps while it is out of the ROS graph."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from rclpy.parameter import Parameter
 
 from rosrm.node.entities import TimerOf
 
-#: Of every node; nobody's cycle depends on who listens there.
+#: Topics of every node, which no node's work depends on.
 _INTERNAL: Final = frozenset({"/parameter_events", "/rosout", "/clock"})
-#: Seconds between two looks at the counts of peers.
+#: Seconds between two reads of the numbers of peers.
 _LOOK: Final = 0.005
 
 
 @dataclass(frozen=True)
 class Declared:
-    """A parameter as it stands, and as it was declared."""
+    """A parameter with its current value and its descriptor."""
 
     parameter: Parameter
     descriptor: Any
 
     def declare(self, node: Any) -> None:
-        """Declare it in a node that does not have it."""
+        """Declare the parameter in a node that does not have it."""
         name, value = self.parameter.name, self.parameter.value
         if value is None and not self.descriptor.dynamic_typing:
             value = Parameter.Type(self.descriptor.type)  # a type, and no value yet
@@ -37,13 +37,13 @@ class Declared:
 
 @dataclass(frozen=True)
 class Absence:
-    """A node as it was when it left.
+    """The state of a node at its graph departure.
 
     Attributes:
         parameters: by name.
         timers: period and nanoseconds until due (-1: cancelled) of each, in order of creation.
-        peers: how many each of its ends had, by what a user knows it by.
-        others: ends of other nodes on its topics, and servers of its clients.
+        peers: number of matched peers of each endpoint, by its description for users.
+        others: numbers of other nodes' endpoints on its topics, and of servers of its clients.
     """
 
     parameters: Mapping[str, Declared]
@@ -52,10 +52,10 @@ class Absence:
     others: Mapping[tuple[str, str], int]
 
     def overrides(self, given: Iterable[Parameter] | None) -> list[Parameter]:
-        """What parameters begin with when they are declared anew.
+        """Return the initial parameter values for the rejoin.
 
         Args:
-            given: that the author gave; what was set since then goes before it.
+            given: overrides by the author; values that were set later take precedence.
         """
         found = {one.name: one for one in given or ()}
         found |= {
@@ -66,24 +66,24 @@ class Absence:
         return list(found.values())
 
     def declare_missing(self, node: Any, names: Iterable[str] | None = None) -> None:
-        """Declare what the author declared elsewhere than in `join`.
+        """Declare parameters that the author declared outside `join`.
 
         Args:
-            node: that has joined.
-            names: of these alone; None: of all.
+            node: the node, which has rejoined.
+            names: only these parameters; None: all.
         """
         for name in list(self.parameters if names is None else names):
             if name in self.parameters and not node.has_parameter(name):
                 self.parameters[name].declare(node)
 
     def start_timers(self, node: Any) -> None:
-        """Each timer goes on where it was in its period: the time away does not count.
+        """Resume each timer at its position in the period; the absence does not count.
 
-        They are matched by the order of creation; one with another period is a new one.
+        Timers are matched by order of creation; a timer with another period is a new one.
         """
         for timer, (period, due) in zip(list(node.timers), self.timers, strict=False):
             one = TimerOf(timer, True)
-            # A simulation's seconds are not ours; a coroutine cannot be stood before.
+            # Simulated time is independent of the absence; coroutines cannot be wrapped below.
             if timer.timer_period_ns != period or one.follows_ros_time():
                 continue
             if due < 0:
@@ -105,7 +105,7 @@ def _first_in(one: TimerOf, due_ns: int) -> None:
 
 
 def absence_of(node: Any) -> Absence:
-    """A node as it stands, between two of its callbacks."""
+    """Return the state of a node, between two of its callbacks."""
     parameters = {
         name: Declared(parameter, node.describe_parameter(name))
         for name, parameter in node.get_parameters_by_prefix("").items()
@@ -115,11 +115,11 @@ def absence_of(node: Any) -> Absence:
 
 
 def await_readers(node: Any, patience: float) -> None:
-    """Wait until reliable readers have what was published: they forget a writer that goes.
+    """Wait until reliable readers have all samples, because they drop a writer that leaves.
 
     Args:
-        node: that is about to leave.
-        patience: seconds for all of them; a reader that is stopped holds nobody up.
+        node: the node, which is about to leave.
+        patience: seconds for all of them together, so that a stopped reader delays nothing more.
     """
     deadline = time.monotonic() + patience
     for one in node.publishers:
@@ -128,7 +128,7 @@ def await_readers(node: Any, patience: float) -> None:
 
 
 def others_of(node: Any) -> Counter[tuple[str, str]]:
-    """How many ends of other nodes a node's topics and clients have, as the graph knows them."""
+    """Return how many endpoints of other nodes the graph has on a node's topics and clients."""
     own = Counter(
         [
             *(("publishers", one.topic_name) for one in node.publishers),
@@ -150,12 +150,12 @@ def _count(node: Any, end: tuple[str, str]) -> int:
 
 
 def sees_again(node: Any, others: Mapping[tuple[str, str], int], patience: float) -> bool:
-    """Whether a node that has entered the graph sees as many ends of others as before. Polled, too.
+    """Return True once a node that rejoins sees as many endpoints of others as before. Polls.
 
     Args:
-        node: that has nothing of its own there yet.
-        others: what `others_of` was.
-        patience: seconds at most.
+        node: the node, which has no endpoints of its own in the graph yet.
+        others: result of `others_of` before the departure.
+        patience: most seconds to wait.
     """
     deadline = time.monotonic() + patience
     while any(_count(node, end) < count for end, count in others.items()):
@@ -166,7 +166,7 @@ def sees_again(node: Any, others: Mapping[tuple[str, str], int], patience: float
 
 
 def peers_of(node: Any) -> dict[str, int]:
-    """How many peers each end of a node has matched."""
+    """Return the number of peers that each endpoint of a node has matched."""
     found = [
         *(("readers of", one.topic_name, one.get_subscription_count()) for one in node.publishers),
         *(("writers of", one.topic_name, one.get_publisher_count()) for one in node.subscriptions),
@@ -183,18 +183,18 @@ def peers_of(node: Any) -> dict[str, int]:
 
 
 def await_peers(node: Any, before: Mapping[str, int], patience: float) -> tuple[str, ...]:
-    """Wait until a node has matched as many peers as it had before it left.
+    """Wait until a node has matched as many peers as before its departure.
 
-    Polled: rclpy tells of a match by a callback in the executor, which has to rest just now; the
-    author's own callbacks would go on with it.
+    This polls, because rclpy reports a match by a callback in the executor. The executor must not
+    run yet, since it would also run the author's callbacks.
 
     Args:
-        node: that has joined anew.
-        before: what `peers_of` was.
-        patience: seconds at most.
+        node: the node, which has rejoined.
+        before: result of `peers_of` before the departure.
+        patience: most seconds to wait.
 
     Returns:
-        What is missing; nothing, or a sentence each.
+        A description of each missing peer; empty if all are matched.
     """
     deadline = time.monotonic() + patience
     while node.context.ok():

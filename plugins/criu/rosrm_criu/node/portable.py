@@ -1,6 +1,6 @@
-"""`PortableNode`: a node that can leave the ROS graph and join it again, with its memory as it was.
+"""`PortableNode`: a node that can leave the ROS graph and rejoin it, with its memory intact.
 
-Between the two the process may be dumped by CRIU and restored on another host.
+Between departure and rejoin, CRIU may dump the process and restore it on another host.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from rosrm.ros.graph_remains import close_leaked, open_sockets
 from rosrm_criu.control import VARIABLE
 from rosrm_criu.node.graph_departure import Absence, absence_of, await_peers, await_readers
 
-#: Seconds in which what was published arrives at its readers, before the node leaves.
+#: Seconds for published samples to reach their readers, before the node leaves.
 _READERS: Final = 0.5
 
 
 class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
-    """rclpy's `Node`, whose part in the ROS graph can be made anew: run it with `run_portable`.
+    """rclpy's `Node`, able to leave and rejoin the ROS graph; run it with `run_portable`.
 
-    What it keeps in its attributes stays through a move. What it has of ROS is made in `join`, and
-    nowhere else, as it is gone after a move: publishers, subscriptions, timers, services, clients,
-    callbacks for parameters. Parameters keep their values, whoever set them.
+    Attributes of the node survive a migration, but ROS entities do not. So create all entities in
+    `join` and nowhere else: publishers, subscriptions, timers, services, clients, parameter
+    callbacks. Parameters keep their current values.
 
     Args:
-        arguments, named: as rclpy's node has them, but for `context`.
+        arguments, named: those of rclpy's node, except `context`.
 
     Raises:
-        TypeError: a `context` was given; a portable node is of the default one.
+        TypeError: a `context` was given; a portable node uses the default one.
     """
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
@@ -50,25 +50,25 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         self._portable_given = dict(self._parameter_overrides)
 
     def join(self) -> None:
-        """Make all that this node has of ROS: at the start, and anew after each move."""
+        """Create all ROS entities of this node: called at the start, and after each migration."""
         raise NotImplementedError(
             f"{type(self).__name__} has no method join(self): there it makes its publishers, "
             f"subscriptions, timers, services and clients"
         )
 
     def leave(self) -> None:
-        """Let go of what is neither memory nor a ROS entity: devices, sockets, threads.
+        """Release everything that is neither memory nor a ROS entity: devices, sockets, threads.
 
-        Called between two callbacks, before the node leaves; `join` follows, whatever happens.
+        Called between two callbacks, before the node leaves; `join` always follows.
         """
 
     # --- for run_portable ------------------------------------------------------------------
 
     def _portable_join_first(self) -> None:
-        """The constructor is done.
+        """Join for the first time, after the constructor.
 
         Raises:
-            TypeError: it made what has to be made in `join`.
+            TypeError: the constructor created an entity that belongs into `join`.
         """
         for entity in self._portable_entities():
             if id(entity) not in self._portable_made:
@@ -80,7 +80,7 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         self.join()
 
     def _portable_leave(self) -> tuple[Absence, str]:
-        """Leave the graph: how the node was, and what was wrong about leaving ("": nothing)."""
+        """Leave the graph; return the node's state, and the fault of `leave` ("": none)."""
         absence = absence_of(self)
         fault = ""
         try:
@@ -93,9 +93,9 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         return absence, fault
 
     def _portable_enter_again(self, absence: Absence) -> None:
-        """Be in the graph, with nothing but a name and parameters."""
+        """Enter the graph again, with only a name and parameters."""
         named = dict(self._portable_arguments[1])
-        # Files of parameters need not be at the new host: what they said counts nevertheless.
+        # Parameter files may be missing on the new host, so their values are passed as overrides.
         given = [*self._portable_given.values(), *(named.get("parameter_overrides") or ())]
         named["parameter_overrides"] = absence.overrides(given)
         self._portable_enter(named)
@@ -106,14 +106,14 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         absence.declare_missing(self)
 
     def _portable_go_on(self, absence: Absence, patience: float) -> tuple[str, ...]:
-        """Wait for the peers, and start the timers; returns the peers that are missing."""
+        """Wait for the peers and start the timers; return the peers that are missing."""
         missing = await_peers(self, absence.peers, patience)
         absence.start_timers(self)
         return missing
 
     def _portable_enter(self, named: dict[str, Any]) -> None:
         controlled = VARIABLE in os.environ
-        # Shared memory of a participant would lie in the dumped process; over UDP none is left.
+        # Shared memory of a participant would be dumped with the process; UDP leaves nothing.
         profile = announcing(os.environ, "steady", udp=True)
         before = open_sockets()
         with profile if controlled else contextlib.nullcontext():
@@ -128,17 +128,17 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         yield from self.waitables
 
     def destroy_node(self) -> None:
-        """As rclpy's; and with it action servers and clients, which would hold the node."""
+        """Destroy the node, and its action servers and clients, which would keep the node alive."""
         for waitable in list(self.waitables):
             destroy = getattr(waitable, "destroy", None)
-            # Event handlers go with their publishers and inputs; an author's own may have nothing.
+            # Event handlers end with their publishers; an author's own may lack `destroy`.
             if destroy is not None and not isinstance(waitable, EventHandler):
                 destroy()
         super().destroy_node()
 
 
 def _described(entity: Any) -> str:
-    """What a user knows it by."""
+    """Describe an entity in the user's terms."""
     name = getattr(entity, "topic_name", "") or getattr(entity, "srv_name", "")
     kind = type(entity).__name__.lower()
     return f"a {kind} of {name}" if name else f"a {kind}"

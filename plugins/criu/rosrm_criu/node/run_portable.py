@@ -1,4 +1,4 @@
-"""`run_portable`: runs a portable node, and has it leave and join again when rosrm asks for it."""
+"""`run_portable`: runs a portable node, which leaves and rejoins at rosrm's request."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from rosrm_criu.control.listener import Listener
 from rosrm_criu.node.graph_departure import Absence, sees_again
 from rosrm_criu.node.portable import PortableNode
 
-#: Seconds between two looks at what is asked: while it runs, and while it is away. An idle node is
-#: woken as often; one that works notices the signal after its callback.
+#: Seconds between two reads of the request file: while the node runs, and while it is away. The
+#: first also wakes an idle node; a busy one notices the signal after its callback.
 _LOOK: Final = 0.25
 _LOOK_AWAY: Final = 0.01
-#: What ends a process; rclpy takes these while there is a context.
+#: Signals that end a process; rclpy handles them while there is a context.
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
-#: Seconds in which a participant is greeted by its neighbours, if it hears them at all.
+#: Seconds for the neighbours to announce themselves to a participant that can hear them.
 _GREETED: Final = 0.3
-#: Most entries: who is not seen then may have gone, and others have found the node meanwhile.
+#: Most attempts to enter. After that, a missing peer may have left, and others may see the node.
 _ENTRIES: Final = 4
-#: Seconds within which what the callbacks have begun (threads, coroutines) has to end.
+#: Seconds for pending work of callbacks (threads, coroutines) to end.
 _REST: Final = 5.0
 
 
@@ -47,22 +47,22 @@ def run_portable(
     executor: Callable[[], Executor] = SingleThreadedExecutor,
     patience: float = 2.0,
 ) -> None:
-    """Run a node until the process is told to end; call it last, in the main thread.
+    """Run a node until the process receives a signal to end; call this last, in the main thread.
 
-    Started by hand, it is `rclpy.init`, the node, `rclpy.spin`. Under rosrm it leaves the ROS graph
-    between two callbacks when it is asked to, and joins again when it is asked to.
+    Without rosrm this is `rclpy.init`, creation of the node and `rclpy.spin`. Under rosrm, the node
+    leaves the ROS graph between two callbacks on request, and rejoins on request.
 
     Args:
         make: returns the node, a `PortableNode`; called once.
         args: command line; None: the process's own.
-        executor: makes what runs the callbacks, anew after each move.
-        patience: seconds that a node waits after a move, before its callbacks go on, until it has
-            found as many readers and writers of its topics as it had before.
+        executor: creates the executor of the callbacks, again after each migration.
+        patience: seconds to wait after a migration, before callbacks run again, until the node has
+            matched as many readers and writers of its topics as before.
 
     Raises:
-        PortableError: it cannot join again, or its control directory cannot be used.
-        TypeError: the node makes in its constructor what belongs into `join`.
-        Exception: what a callback raised.
+        PortableError: the node cannot rejoin, or its control directory cannot be used.
+        TypeError: the constructor of the node creates an entity that belongs into `join`.
+        Exception: raised by a callback.
     """
     given = list(sys.argv if args is None else args)
     directory = os.environ.get(VARIABLE, "")
@@ -82,11 +82,11 @@ def run_portable(
 
 
 class _Ended(Exception):
-    """The process was told to end while its node was away."""
+    """The process received a signal to end while its node was away."""
 
 
 class _Run:
-    """One portable node in its process."""
+    """A portable node in its process."""
 
     def __init__(
         self,
@@ -102,14 +102,14 @@ class _Run:
         self._woken = False
         self._looked = 0.0
         self._node: Any = None
-        self._is_in = False  # the node has its part in the graph
-        self._signals: dict[int, Any] = {}  # handlers, while ours are in their place
+        self._is_in = False  # the node is in the graph
+        self._signals: dict[int, Any] = {}  # rclpy's handlers, while replaced during an absence
         self._executor: Any = None
         if self._listener is not None:
             signal.signal(SIGNAL, self._wake)
 
     def _wake(self, *_: object) -> None:
-        """The signal came, between any two steps of the main thread: note it, and no more."""
+        """Note the signal, and do no more: it may come between any two steps of the main thread."""
         self._woken = True
 
     # --- the course of a life --------------------------------------------------------------
@@ -125,7 +125,7 @@ class _Run:
             self._listener.say(Status(State.RUNNING))
 
     def until_the_end(self) -> None:
-        """Run, leave, wait and join again, until the context is shut down."""
+        """Run, leave, wait and rejoin, until the context is shut down."""
         with contextlib.suppress(_Ended):
             while (request := self._spin()) is not None:
                 absence, fault = self._leave(request)
@@ -134,7 +134,7 @@ class _Run:
                 self._join(request, absence, fault)
 
     def end(self) -> None:
-        """The process ends; the log says why, where it is not in good order."""
+        """Shut down; keep the control directory of a failed node, whose status has the fault."""
         if self._is_in:
             self._node.destroy_node()
         if self._executor is not None:
@@ -144,11 +144,11 @@ class _Run:
             self._listener.close()
 
     def was_ended_in(self, error: Exception) -> bool:
-        """A signal took the context away under a callback that was about to publish."""
+        """Return True if the error came from a signal that shut the context down in a callback."""
         return isinstance(error, RCLError) and self._is_in and not rclpy.ok()
 
     def say_failed(self, error: Exception) -> None:
-        """Tell whoever waits; the traceback is in the log."""
+        """Report the failure to waiting clients; the traceback is in the log."""
         if self._listener is not None:
             said = str(error) if isinstance(error, PortableError) else _said(error)
             self._listener.say(Status(State.FAILED, self._listener.status.request, said))
@@ -160,7 +160,7 @@ class _Run:
         self._executor.add_node(self._node)
 
     def _spin(self) -> Request | None:
-        """Run callbacks until the node shall leave; None: it is over."""
+        """Run callbacks until the node is to leave; None: the context is shut down."""
         timeout = None if self._listener is None else _LOOK
         while self._executor.context.ok():
             self._executor.spin_once(timeout_sec=timeout)
@@ -179,9 +179,9 @@ class _Run:
     # --- leaving ---------------------------------------------------------------------------
 
     def _leave(self, request: Request) -> tuple[Absence | None, str]:
-        """Leave the graph: how the node was, and why it cannot stay away ("": it can).
+        """Leave the graph; return the node's state, and why it cannot stay away ("": it can).
 
-        Nothing was done (and no absence is returned) where that is known beforehand.
+        If that is known in advance, the node does not leave, and no state is returned.
         """
         began = time.monotonic()
         listener = self._its_listener()
@@ -199,7 +199,7 @@ class _Run:
         return absence, fault
 
     def _come_to_rest(self) -> None:
-        """Wait for what the callbacks have begun: none is cut in half."""
+        """Wait for the end of pending callbacks, so that the departure interrupts none."""
         deadline = time.monotonic() + _REST
         while unfinished := _unfinished(self._executor):
             if time.monotonic() > deadline:
@@ -208,7 +208,7 @@ class _Run:
                     f"functions that wait, or goals that are executed); the node stays as it was"
                 )
             if any(one.executing() for one in unfinished):
-                time.sleep(0.001)  # another thread's: rclpy has nothing to wait on
+                time.sleep(0.001)  # runs in another thread; rclpy offers nothing to wait on
             else:
                 self._executor.spin_once(timeout_sec=0.01)
 
@@ -216,13 +216,13 @@ class _Run:
         node = self._node
         absence, fault = node._portable_leave()  # noqa: SLF001 - the other half of one thing
         self._is_in = False
-        ended = not self._executor.context.ok()  # by a signal; ROS answers it up to here
+        ended = not self._executor.context.ok()  # by a signal, which ROS handles up to here
         self._executor.shutdown()
         self._executor = None
         rclpy.try_shutdown()
         if ended:
             raise _Ended
-        uninstall_signal_handlers()  # they need a context; in between there are ours
+        uninstall_signal_handlers()  # they need a context; until the rejoin, `_end` is used
         self._signals = {one: signal.signal(one, _end) for one in _ENDING}
         return absence, fault
 
@@ -234,24 +234,24 @@ class _Run:
     # --- away ------------------------------------------------------------------------------
 
     def _wait_away(self) -> Request:
-        """Nothing of ROS is here, until the node shall join again."""
+        """Wait without any ROS entity, until the node is to rejoin."""
         listener = self._its_listener()
         while True:
             request = listener.asked()
             if request is not None and request.want is Want.JOIN:
                 return request
-            # Not SimpleQueue.get, which a signal handler may fill: where its time-out passes
-            # while the process is dumped, CPython before 3.13 waits for ever after the restore.
+            # Not SimpleQueue.get, filled by a signal handler: if its timeout passes while the
+            # process is dumped, CPython before 3.13 waits for ever after the restore.
             time.sleep(_LOOK_AWAY)
 
     # --- joining ---------------------------------------------------------------------------
 
     def _join(self, request: Request, absence: Absence | None, fault: str) -> None:
-        """Join again: because it is asked for, or because the node cannot leave.
+        """Rejoin: on request, or because the node cannot leave.
 
         Args:
-            request: that is answered by it.
-            absence: what the node was; None: it never left.
+            request: the request that this answers.
+            absence: the node's state at its departure; None: it never left.
             fault: why it cannot leave; "": it had left.
         """
         listener = self._its_listener()
@@ -290,11 +290,12 @@ class _Run:
         return missing
 
     def _enter(self, absence: Absence) -> int:
-        """Be in the graph, and see the other ends again; returns how many entries it took.
+        """Enter the graph until the other endpoints are visible; return the number of attempts.
 
-        A neighbour answers the first word of a participant within 0.1 ms. Fast DDS 2.14 may not be
-        ready to hear it then, and is told again only after the neighbour's period of 3 s: a new
-        participant, which everybody greets anew, is there in 0.02 s (docs/decisions/0024).
+        A neighbour answers a participant's first announcement within 0.1 ms. Fast DDS 2.14 may
+        not be ready to receive that answer, and gets the next one only after the neighbour's
+        period of 3 s. But all neighbours greet a new participant, so another attempt takes only
+        0.02 s (docs/decisions/0024).
         """
         entries = 0
         deadline = time.monotonic() + self._patience
@@ -311,20 +312,20 @@ class _Run:
             rclpy.try_shutdown()
 
     def _its_listener(self) -> Listener:
-        assert self._listener is not None  # nobody else asks
+        assert self._listener is not None  # called only if there is one
         return self._listener
 
 
 def _unfinished(executor: Any) -> list[Any]:
-    """What an executor of rclpy has begun; rclpy has no public way to ask."""
+    """Return the pending tasks of rclpy's executor, which has no public interface for them."""
     return [task for task, *_ in getattr(executor, "_tasks", ()) if not task.done()]
 
 
 def _not_clean() -> str:
-    """What would keep this process from being dumped; "": nothing."""
+    """Return the obstacle to a dump of this process; "": there is none."""
     if not what_is_left():
         return ""
-    gc.collect()  # an entity in a cycle of references
+    gc.collect()  # frees entities in reference cycles
     return what_is_left()
 
 
@@ -333,7 +334,7 @@ def _end(*_: object) -> None:
 
 
 def without_parameter_files(args: Sequence[str]) -> list[str]:
-    """A command line without `--params-file FILE`: at another host the file may be missing."""
+    """Return a command line without `--params-file FILE`, which may be missing on another host."""
     kept: list[str] = []
     words = iter(args)
     for word in words:

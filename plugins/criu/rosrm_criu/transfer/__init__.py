@@ -1,18 +1,18 @@
-"""Moves a directory of files from one host to another: over TLS, compressed, checked, once.
+"""Transfer of a directory from one host to another: over TLS, compressed, checksummed, once.
 
-Knows nothing of what is in the files. The source *offers* a directory: a process of its own serves
-it to the destination that was introduced, until it was taken or its time is over; nothing listens
-before and afterwards. The destination *fetches* it by that offer, in a process of its own too, so
-that neither a slave's memory nor its loop has anything of it. Both take and give JSON.
+The contents of the files do not matter here. The source *offers* a directory: a separate process
+serves it to one known destination, until it is fetched or the offer expires; no port is open before
+and afterwards. The destination *fetches* it by that offer, also in a separate process, so that the
+transfer affects neither a slave's memory nor its event loop. Both sides use JSON.
 
     fetcher = Fetcher()                                       # at the destination, ahead of time
-    to = fetcher.introduce()                                  # goes by the master
+    to = fetcher.introduce()                                  # sent via the master
     sender = Sender()                                         # at the source, ahead of time too
-    offer = sender.offer(directory, seconds=60.0, to=to)      # as_json() goes by the master
+    offer = sender.offer(directory, seconds=60.0, to=to)      # as_json() is sent via the master
     fetched = fetcher.fetch(Offer.from_json(told), target, timeout=30.0)
     sender.close()
 
-docs/decisions/0025-image-transfer.md says why it is as it is.
+docs/decisions/0025-image-transfer.md gives the reasons for this design.
 """
 
 from rosrm_criu.transfer.form import Fetched, Offer, Sent

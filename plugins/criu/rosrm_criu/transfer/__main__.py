@@ -1,9 +1,9 @@
-"""The process of one transfer: `python -m rosrm_criu.transfer send` or `… fetch`.
+"""Process of one transfer: `python -m rosrm_criu.transfer send` or `… fetch`.
 
 It reads a line of JSON from standard input, works, and answers with lines of JSON on standard
-output. Before that it may be asked whether it is ready, and before it fetches it is asked for the
-certificate that it will show. It ends when standard input does: so it outlives neither its work nor
-who started it.
+output. An optional first request asks whether it is ready. Before a fetch, another one asks for the
+certificate that it will show. It ends when standard input does, so it outlives neither its work nor
+its parent.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from rosrm_criu.transfer.form import Offer
 
 
 def main() -> int:
-    """Do what is asked for; the exit status says whether it worked."""
+    """Execute the request; return 0 on success and 1 on failure."""
     os.umask(0o077)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for who started this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is meant for the parent
     work = {"send": _send, "fetch": _fetch}[sys.argv[1]]
-    # Started before there is anything to do, a process has its libraries by the time there is.
+    # Import early: a process that is started in advance has its libraries when work arrives.
     if sys.argv[1] == "send":
         import rosrm_criu.transfer.serving  # noqa: PLC0415
     else:
@@ -41,7 +41,7 @@ def main() -> int:
     try:
         _say(work(json.loads(line)))
     except TransferError as error:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # who has heard it ends this
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent ends this after the error
         _say({"error": str(error)})
         return 1
     return 0
@@ -52,7 +52,7 @@ def _say(answer: Mapping[str, Any]) -> None:
         sys.stdout.write(json.dumps(answer) + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
-        os._exit(1)  # nobody is there to hear it
+        os._exit(1)  # the parent has gone and reads no answer
 
 
 def _send(asked: dict[str, Any]) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""Under which addresses a host is reached, and which of them a peer should try first."""
+"""Addresses of a host, and the order in which a peer should try them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import psutil
 
 
 def own_addresses() -> tuple[str, ...]:
-    """IPv4 addresses of this host's interfaces that are up, those of loopback last."""
+    """Return the IPv4 addresses of this host's active interfaces, loopback last."""
     found = dict.fromkeys(str(interface.ip) for interface in _interfaces())
     return tuple(sorted(found, key=lambda one: ipaddress.IPv4Address(one).is_loopback))
 
 
 def nearest_first(addresses: Iterable[str]) -> Sequence[str]:
-    """Those that share a network with this host before the others, loopback last."""
+    """Return addresses on this host's networks first, then others, loopback last."""
     networks = [interface.network for interface in _interfaces()]
 
     def distance(text: str) -> int:

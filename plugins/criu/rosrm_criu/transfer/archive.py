@@ -1,8 +1,8 @@
-"""Reads a directory as one stream of bytes: a tar archive, then its checksum.
+"""A directory as one stream of bytes: a tar archive, then its checksum.
 
-Two readings of an unchanged directory give the same bytes, so a stream that broke can be gone on
-with from any byte. It holds directories and regular files, and of these their names and contents
-alone: neither owners nor times, and every mode is 0600 or 0700.
+Two reads of an unchanged directory give the same bytes, so a broken stream can resume at any byte.
+The archive holds only directories and regular files, with names and contents: no owners and no
+times, and every mode is 0600 or 0700.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from typing import Final
 from rosrm.errors import TransferError
 from rosrm_criu.transfer.form import DIGEST_SIZE, new_digest
 
-#: Bytes that are read at a time.
+#: Bytes per read.
 PIECE: Final = 1 << 18
-#: Bytes from one remembered state of the checksum to the next: at most so many are read once more
-#: to go on, which takes a fraction of a second.
+#: Bytes between two saved states of the checksum: a resume reads at most this many bytes again,
+#: which takes a fraction of a second.
 MARK: Final = 64 << 20
 _BLOCK: Final = tarfile.BLOCKSIZE
 _END: Final = bytes(2 * _BLOCK)
@@ -52,25 +52,25 @@ class _Entry:
 
 @dataclass(frozen=True)
 class _Mark:
-    """The checksum of all before a byte of the archive."""
+    """The checksum of all bytes before a position in the archive."""
 
     position: int
     digest: hashlib.blake2b
 
 
 class Archive:
-    """A directory as it is now.
+    """A directory in its current state.
 
     Args:
-        directory: it and all that is in it must be directories and regular files.
+        directory: may contain only directories and regular files.
 
     Attributes:
         size: bytes of all files.
-        files: how many there are.
+        files: number of files.
         length: bytes of the archive, without the checksum.
 
     Raises:
-        TransferError: it is not there, cannot be read, or holds something else.
+        TransferError: it is missing, cannot be read, or contains something else.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -86,10 +86,9 @@ class Archive:
         self._marks = [_Mark(0, new_digest())]
 
     def pieces(self, start: int = 0) -> Iterator[bytes]:
-        """Archive and checksum from a byte on.
+        """Yield the archive and its checksum, from a byte position on.
 
-        Of what comes before, which an earlier reading has given, at most `MARK` bytes are read once
-        more, for the checksum.
+        At most `MARK` bytes before that position are read again, for the checksum.
 
         Raises:
             TransferError: a file has changed, or is gone.
@@ -108,7 +107,7 @@ class Archive:
         yield digest.digest()[max(0, start - position) : DIGEST_SIZE]
 
     def _archive(self, start: int) -> Iterator[bytes]:
-        """Without the checksum, from a byte on."""
+        """Yield the archive without the checksum, from a byte position on."""
         for entry in self._entries:
             if start < entry.length:
                 yield from self._entry(entry, max(0, start))

@@ -1,4 +1,4 @@
-"""Certificates for one transfer, that nobody has signed: the master tells whose they are."""
+"""Self-signed certificates for one transfer; the master tells each side the other's certificate."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-#: Robots without a clock of their own begin in 1970: any time is right.
+#: Always valid, because the clock of a robot without a real-time clock starts in 1970.
 _FROM: Final = dt.datetime(1970, 1, 1, tzinfo=dt.timezone.utc)
 _TO: Final = dt.datetime(9999, 12, 31, tzinfo=dt.timezone.utc)
 
 
 @dataclass(frozen=True)
 class Identity:
-    """A certificate and its key, in memory alone.
+    """A certificate and its key, in memory only.
 
     Attributes:
-        certificate: to be shown to anybody, in PEM.
-        fingerprint: SHA-256 of it, in hexadecimal digits.
-        key: the secret, in PEM.
+        certificate: public, in PEM.
+        fingerprint: SHA-256 of the certificate, in hexadecimal digits.
+        key: secret, in PEM.
     """
 
     certificate: str
@@ -35,7 +35,7 @@ class Identity:
     key: bytes = field(repr=False)
 
     def load_into(self, context: ssl.SSLContext) -> None:
-        """Have a connection show it. `ssl` takes nothing but a file: here one in memory."""
+        """Use the identity for connections, by a file in memory: `ssl` accepts only files."""
         memory = os.memfd_create("rosrm-transfer", os.MFD_CLOEXEC)
         with os.fdopen(memory, "wb") as file:
             file.write(self.certificate.encode() + self.key)
@@ -44,9 +44,9 @@ class Identity:
 
 
 def new_identity() -> Identity:
-    """Another one each time."""
+    """Create a new identity."""
     key = ec.generate_private_key(ec.SECP256R1())
-    # No two of one name: a peer would look for the signer of the one in the other.
+    # The name is unique; otherwise a peer would take one certificate for the signer of another.
     own = f"rosrm {secrets.token_hex(8)}"
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, own)])
     certificate = (
@@ -69,6 +69,6 @@ def new_identity() -> Identity:
 
 
 def fingerprint_of(certificate: str) -> str:
-    """SHA-256 of a certificate in PEM, in hexadecimal digits; raises `ValueError`."""
+    """Return the SHA-256 of a PEM certificate in hexadecimal digits; raise `ValueError`."""
     x509.load_pem_x509_certificate(certificate.encode())
     return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate)).hexdigest()

@@ -1,4 +1,4 @@
-"""What travels between the hosts of a transfer, and what becomes of one. Pure."""
+"""Data that the hosts of a transfer exchange, and its results. Pure."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rosrm.errors import TransferError
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-#: Grows when a peer of another version could not understand it.
+#: Raised for a change that a peer of another version could not understand.
 VERSION: Final = 1
-#: Of the archive; its bytes follow the archive in the stream.
+#: Algorithm of the archive's checksum, whose bytes follow the archive in the stream.
 DIGEST: Final = "blake2b-256"
 DIGEST_SIZE: Final = 32
 
-#: Carries the number that a reader has drawn: the first reader of an offer is its only one.
+#: Carries a random number of the reader: only the first reader of an offer is accepted.
 READER_HEADER: Final = "Rosrm-Reader"
 
 _HEX: Final = re.compile(r"[0-9a-f]{64}")
@@ -28,25 +28,25 @@ _MOST: Final = 1 << 60
 
 
 def new_digest() -> hashlib.blake2b:
-    """BLAKE2: half the work of SHA-256 where the processor has no instructions for that one."""
+    """Return a BLAKE2 hash: half the work of SHA-256 on CPUs without SHA instructions."""
     return hashlib.blake2b(digest_size=DIGEST_SIZE)
 
 
 @dataclass(frozen=True)
 class Offer:
-    """A directory that waits to be fetched, as its source describes it.
+    """A directory that is ready to be fetched, as its source describes it.
 
     Attributes:
-        addresses: of the source, IPv4, those of loopback last.
-        port: that it listens on.
-        fingerprint: SHA-256 of the certificate that the source shows, in hexadecimal digits.
-        token: opens it, once. A secret: it is in no log and no representation.
+        addresses: IPv4 addresses of the source, loopback last.
+        port: TCP port of the source.
+        fingerprint: SHA-256 of the source's certificate, in hexadecimal digits.
+        token: authorises one fetch. A secret: it is in no log and no representation.
         size: bytes of all files.
-        files: how many there are.
-        length: bytes of the archive, uncompressed: what has to have room.
-        seconds: that it stands from when it was made.
+        files: number of files.
+        length: bytes of the archive, uncompressed; the destination needs this much space.
+        seconds: validity, from the creation of the offer.
         to: SHA-256 of the certificate of the only destination that may fetch it.
-        digest: how the archive's checksum is computed.
+        digest: algorithm of the archive's checksum.
         version: of this description and of the stream.
     """
 
@@ -63,12 +63,12 @@ class Offer:
     version: int = VERSION
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the offer as plain values."""
         return {**asdict(self), "addresses": list(self.addresses)}
 
     @classmethod
     def from_json(cls, told: Mapping[str, Any]) -> Self:
-        """Raises `TransferError` for anything but an offer of this version."""
+        """Return the offer; raise `TransferError` for anything but a valid one of this version."""
         version = told.get("version")
         if version != VERSION:
             raise TransferError(
@@ -109,19 +109,19 @@ def _is_address(text: str) -> bool:
 
 @dataclass(frozen=True)
 class Sent:
-    """What became of an offer.
+    """Result of an offer.
 
     Attributes:
-        outcome: "taken": fetched and found whole; "expired": nobody did in time; "withdrawn":
+        outcome: "taken": fetched and verified; "expired": not fetched in time; "withdrawn":
             ended by the source; "failed": its process died.
-        bytes: that went out, as compressed, those of broken connections included.
+        bytes: compressed bytes that were sent, including those of broken connections.
     """
 
     outcome: str
     bytes: int
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the result as plain values."""
         return asdict(self)
 
 
@@ -130,12 +130,12 @@ class Fetched:
     """A directory that was fetched.
 
     Attributes:
-        address: of the source that was spoken with last.
+        address: last address of the source that was used.
         size: bytes of all files.
-        files: how many there are.
-        received: bytes that came in, as compressed.
-        resumed: times that a broken connection was made again.
-        seconds: from the request to the directory being in its place.
+        files: number of files.
+        received: compressed bytes that were received.
+        resumed: number of broken connections that were resumed.
+        seconds: from the request until the directory was in its place.
         checksum: of the archive, in hexadecimal digits.
     """
 
@@ -148,5 +148,5 @@ class Fetched:
     checksum: str
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the result as plain values."""
         return asdict(self)

@@ -1,7 +1,7 @@
-"""Where a directory is put together before it appears, whole, under its name.
+"""Temporary directory that collects a fetched directory and then becomes the target, atomically.
 
-A hidden directory beside the target, locked while its fetch lives: what a killed one has left has
-no lock and is removed by the next fetch beside it.
+It is hidden, beside the target, and locked while its fetch lives. A killed fetch leaves one without
+a lock, which the next fetch beside it removes.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ class Landing:
     """A new directory beside the target; it is removed at the end, unless it became the target.
 
     Args:
-        target: a path where nothing is; its parent is made where it does not exist.
+        target: a path that does not exist; its parent is created if it is missing.
 
     Attributes:
-        path: to write to; for its owner alone.
+        path: directory to write to; accessible to its owner alone.
 
     Raises:
-        TransferError: there is something, or nothing can be made there.
+        TransferError: the target exists, or nothing can be created there.
     """
 
     def __init__(self, target: Path) -> None:
@@ -51,7 +51,7 @@ class Landing:
             raise TransferError(f"nothing can be made in {parent}: {error.strerror}") from None
 
     def require(self, size: int, reserve: int) -> None:
-        """Raise `TransferError` unless so many bytes fit, with the reserve still free then."""
+        """Raise `TransferError` unless `size` bytes fit and leave `reserve` bytes free."""
         usage = os.statvfs(self.path)
         free = usage.f_bavail * usage.f_frsize
         if size + reserve > free:
@@ -61,7 +61,7 @@ class Landing:
             )
 
     def become_target(self) -> None:
-        """Put it in its place at once; raises `TransferError`."""
+        """Rename the directory to the target; raise `TransferError`."""
         try:
             self.path.rename(self._target)
         except OSError as error:
@@ -70,14 +70,14 @@ class Landing:
             ) from None
 
     def close(self) -> None:
-        """Remove it, unless it became the target."""
+        """Remove the directory, unless it became the target."""
         shutil.rmtree(self.path, ignore_errors=True)
         os.close(self._lock)
 
 
 @contextlib.contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """One at a time: else a new directory could be taken for a stale one before it is locked."""
+    """Lock a directory; else a new one in it could be removed as stale before it is locked."""
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -1,4 +1,4 @@
-"""Fetches what a source offers: reads it, checks it, puts it in its place; or leaves nothing."""
+"""Fetch of an offered directory: read, verify and place it; on failure leave nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosrm_criu.transfer.unpacking import unpack
 if TYPE_CHECKING:
     from rosrm_criu.transfer.certificate import Identity
 
-#: Bytes that a file may take beyond its content, rounded up.
+#: Bytes that a file may occupy beyond its content, rounded up.
 _ROUNDING: Final = 4096
 
 
@@ -30,14 +30,14 @@ def receive(
 
     Args:
         offer: of the source.
-        target: where it shall be; nothing may be there.
-        timeout: seconds for all of it.
-        reserve: bytes that stay free on the file system.
-        identity: that the source was told of.
-        before_placing: called when all is here and whole, before the target appears.
+        target: path of the new directory, which must not exist yet.
+        timeout: seconds for the whole fetch.
+        reserve: bytes that must stay free on the file system.
+        identity: the one whose certificate the source knows.
+        before_placing: called after complete verification, before the target appears.
 
     Raises:
-        TransferError: it cannot be had, or not whole; nothing of it is left.
+        TransferError: the directory cannot be fetched completely; nothing of it is left.
     """
     began = time.monotonic()
     if identity.fingerprint != offer.to:

@@ -1,11 +1,11 @@
-"""Serves one directory to one reader, over HTTPS, until it was taken or its time is over.
+"""HTTPS server of one directory for one reader, until it is fetched or the offer expires.
 
     GET /archive?from=N   archive and checksum from byte N on, compressed
-    POST /taken           the reader has all of it, and it is whole: the end
+    POST /taken           the reader has received and verified everything: ends the offer
 
-Both with `Authorization: Bearer TOKEN` and a number that the reader has drawn (`Rosrm-Reader`). The
-first reader that brings the token is the only one: it may go on where its connection broke, and
-nobody else begins again. No other than the destination that was introduced is spoken with.
+Both need `Authorization: Bearer TOKEN` and a random number of the reader (`Rosrm-Reader`). Only the
+first reader with the token is accepted: it may resume a broken connection, and all others are
+refused. TLS admits only the destination whose certificate is known.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from rosrm_criu.transfer.rate import Pace
 from rosrm_criu.transfer.zstd import compressed
 
 _LOOPBACK: Final = "127.0.0.1"
-#: Seconds for the answer to the last request to go out.
+#: Seconds to send the answer to the last request.
 _FAREWELL: Final = 2.0
 
 
 class _Refusal(Exception):
-    """Why a request is turned down, as the reader is told."""
+    """Refusal of a request; its text is sent to the reader."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -44,11 +44,11 @@ class _Refusal(Exception):
 
 
 class _Desk:
-    """Hands the archive out.
+    """Handlers that send the archive.
 
     Attributes:
-        taken: set once the reader has it.
-        sent: bytes that went out.
+        taken: set once the reader has received everything.
+        sent: bytes that were sent.
     """
 
     def __init__(self, archive: Archive, token: str, max_rate: float) -> None:
@@ -62,30 +62,30 @@ class _Desk:
         self.sent = 0
 
     async def archive(self, request: web.Request) -> web.StreamResponse:
-        """Send the archive, from where the reader wants it."""
+        """Send the archive, from the byte that the reader requests."""
         try:
             start = self._start(request)
         except _Refusal as refusal:
             return web.Response(status=refusal.status, text=str(refusal))
-        self.stop()  # the reader has given that connection up
+        self.stop()  # the reader has given up that connection
         self._sending = own = asyncio.current_task()
         response = web.StreamResponse(headers={"Content-Type": "application/zstd"})
         try:
             await response.prepare(request)
             await self._send(response, start)
         except ConnectionError:
-            return response  # the reader may come again
+            return response  # the reader may reconnect
         except TransferError as error:
-            self._fault = str(error)  # the reader hears it when it comes again
+            self._fault = str(error)  # sent to the reader when it reconnects
             if request.transport is not None:
                 request.transport.abort()
         finally:
-            if self._sending is own:  # its connection may serve another request yet
+            if self._sending is own:  # its connection may serve another request later
                 self._sending = None
         return response
 
     async def take(self, request: web.Request) -> web.Response:
-        """The reader has all."""
+        """Accept the reader's confirmation that it has received everything."""
         try:
             self._admit(request)
         except _Refusal as refusal:
@@ -117,7 +117,7 @@ class _Desk:
             raise _Refusal(403, "another reader fetches it already, and an offer can be used once")
 
     def stop(self) -> None:
-        """End the sending that is under way, if one is."""
+        """Cancel the transmission under way, if there is one."""
         if self._sending is not None:
             self._sending.cancel()
 
@@ -130,7 +130,7 @@ class _Desk:
 
 
 def _bytes(header: str) -> bytes:
-    """As they came."""
+    """Return the bytes of a header as they were received."""
     return header.encode("utf-8", "surrogateescape")
 
 
@@ -147,15 +147,15 @@ async def serve(
     directory: Path, *, seconds: float, max_rate: float, to: str,
     announce: Callable[[Offer], None], withdrawn: asyncio.Event,
 ) -> Sent:  # fmt: skip
-    """Offer a directory, and wait until that is over.
+    """Offer a directory, and wait for the end of the offer.
 
     Args:
-        directory: all of it is offered, as it is now.
-        seconds: after which the offer ends.
-        max_rate: bytes a second that go out, as compressed; 0: there is no bound.
-        to: the certificate of the only one who may fetch it, in PEM.
-        announce: told of the offer once it can be fetched.
-        withdrawn: set to end it.
+        directory: offered completely, in its current state.
+        seconds: validity of the offer.
+        max_rate: most compressed bytes per second to send; 0: no bound.
+        to: certificate of the only destination that may fetch it, in PEM.
+        announce: receives the offer once it can be fetched.
+        withdrawn: set to end the offer.
 
     Raises:
         TransferError: the directory cannot be offered.
@@ -169,7 +169,7 @@ async def serve(
     desk = _Desk(archive, token := secrets.token_urlsafe(32), max_rate)
     application = web.Application()
     application.add_routes([web.get("/archive", desk.archive), web.post("/taken", desk.take)])
-    # No access log: nobody needs one, and what is not written keeps its secrets.
+    # No access log, because it is not needed and could leak secrets.
     runner = web.AppRunner(application, access_log=None, shutdown_timeout=_FAREWELL)
     await runner.setup()
     try:
@@ -190,7 +190,7 @@ async def serve(
         )
         over = [asyncio.create_task(one.wait()) for one in (desk.taken, withdrawn)]
         await asyncio.wait(over, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        is_withdrawn = withdrawn.is_set()  # not later: an offer that has expired stays expired
+        is_withdrawn = withdrawn.is_set()  # read now: an offer that has expired stays expired
         for task in over:
             task.cancel()
     finally:

@@ -1,4 +1,4 @@
-"""The two ends of a transfer, each a process of its own, as who starts them has them."""
+"""Handles of the two ends of a transfer, each of which is a separate process."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from rosrm_criu.transfer.form import Fetched, Offer, Sent
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-#: Bytes a second: a transfer leaves something of a gigabit network to others.
+#: Bytes per second; leaves part of a gigabit network to others.
 DEFAULT_RATE: Final = 100e6
-#: Bytes that stay free on the file system of a target.
+#: Bytes that must stay free on the file system of a target.
 DEFAULT_RESERVE: Final = 256 << 20
 #: Seconds for a process to start and answer, and to end, on a busy machine.
 _START: Final = 30.0
@@ -30,7 +30,7 @@ _NEEDED: Final = ("aiohttp", "cryptography", "urllib3")
 
 
 def missing() -> str:
-    """What this Python lacks for a transfer, and what to do; "": nothing."""
+    """Return what this Python lacks for a transfer, with the remedy; "": nothing."""
     names = [*_NEEDED, "compression" if sys.version_info >= (3, 14) else "backports.zstd"]
     absent = [name for name in names if not _is_there(name)]
     if absent:
@@ -44,16 +44,16 @@ def _is_there(name: str) -> bool:
     try:
         return importlib.util.find_spec(name) is not None
     except ModuleNotFoundError:
-        return False  # of backports.zstd, where there is no backports
+        return False  # a submodule of backports, where that package is missing
 
 
 class _End:
-    """The process of one end; it ends with this one, however that ends.
+    """The process of one end; it ends together with this process, even after a crash.
 
-    It may be started before there is anything to do: its libraries take a while to load.
+    It may be started in advance, because its libraries take a while to load.
 
     Raises:
-        TransferError: something is missing here.
+        TransferError: a library is missing here.
     """
 
     def __init__(self, kind: str) -> None:
@@ -76,7 +76,7 @@ class _End:
         self._end()
 
     def ready(self) -> None:
-        """Wait until it has its libraries, before anything is to be quick.
+        """Wait until the process has loaded its libraries, before a step where time matters.
 
         Raises:
             TransferError: it has ended, or is not ready in time.
@@ -89,9 +89,9 @@ class _End:
         self._begun = True
 
     def _ask(self, asked: Mapping[str, Any], timeout: float) -> dict[str, Any]:
-        """The process's next answer; raises `TransferError` for an error and for none."""
+        """Send a request and return the answer; raise `TransferError` for an error or no answer."""
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError, ValueError):  # it has ended: then there is no answer
+        with contextlib.suppress(OSError, ValueError):  # it has ended: no answer will come
             self._process.stdin.write(json.dumps(asked).encode() + b"\n")
             self._process.stdin.flush()
         answer = self._answer(timeout)
@@ -117,7 +117,7 @@ class _End:
         return answer
 
     def _end(self) -> None:
-        """Have it end, and wait for that. From any thread, also while another one waits."""
+        """End the process and wait; callable from any thread, also while another thread waits."""
         with self._closing:
             assert self._process.stdin is not None
             with contextlib.suppress(OSError):
@@ -130,9 +130,9 @@ class _End:
 
 
 class Sender(_End):
-    """The source's end: nothing listens before `offer` and after `close`.
+    """The sending end: it listens only between `offer` and `close`.
 
-    Keep it: an offer ends when its sender is forgotten.
+    Keep a reference: the offer ends when its sender is garbage-collected.
     """
 
     def __init__(self) -> None:
@@ -145,10 +145,10 @@ class Sender(_End):
         """Offer a directory, once.
 
         Args:
-            directory: of files and directories; it stays, and must not change meanwhile.
-            seconds: after which the offer ends.
-            to: what the destination's `Fetcher.introduce` said: it alone may fetch.
-            max_rate: bytes a second that go out, as compressed; 0: there is no bound.
+            directory: contains files and directories; it must not change until the offer ends.
+            seconds: validity of the offer.
+            to: result of the destination's `Fetcher.introduce`: only this one may fetch.
+            max_rate: most compressed bytes per second to send; 0: no bound.
 
         Raises:
             TransferError: the directory cannot be offered.
@@ -161,7 +161,7 @@ class Sender(_End):
         return Offer.from_json(self._ask(asked, _START))
 
     def wait(self, timeout: float) -> Sent | None:
-        """What became of the offer, once it is over; None: it is not, after so many seconds."""
+        """Return the result of the offer; None: it still stands after `timeout` seconds."""
         try:
             self._process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -169,7 +169,7 @@ class Sender(_End):
         return self.close()
 
     def close(self) -> Sent:
-        """End the offer, if it stands, and say what became of it."""
+        """End the offer, if it still stands, and return its result."""
         self._end()
         with self._closing:
             if self._sent is None:
@@ -185,15 +185,15 @@ class Sender(_End):
 
 
 class Fetcher(_End):
-    """The destination's end, for one fetch."""
+    """The receiving end, for one fetch."""
 
     def __init__(self) -> None:
         super().__init__("fetch")
 
     def introduce(self) -> str:
-        """A certificate, which only this fetch can show: for `Sender.offer`, to be called before.
+        """Return a certificate that only this fetch can show, for `Sender.offer`; call this first.
 
-        It is no secret; the key stays in the process.
+        The certificate is no secret; its key stays in the process.
 
         Raises:
             TransferError: the process has ended.
@@ -203,18 +203,18 @@ class Fetcher(_End):
     def fetch(
         self, offer: Offer, target: Path, *, timeout: float, reserve: int = DEFAULT_RESERVE
     ) -> Fetched:
-        """Fetch what a source offers; for the owner alone (0700, 0600), or nothing of it.
+        """Fetch an offered directory, readable by its owner alone (0700, 0600); or leave nothing.
 
-        The source was told of this end by what `introduce` gave.
+        The source must have got the result of `introduce`.
 
         Args:
-            offer: as the source has made it.
-            target: where the directory shall be; nothing may be there.
-            timeout: seconds for all of it.
-            reserve: bytes that stay free on the file system of the target.
+            offer: the source's offer.
+            target: path of the new directory, which must not exist yet.
+            timeout: seconds for the whole fetch.
+            reserve: bytes that must stay free on the file system of the target.
 
         Raises:
-            TransferError: it cannot be had, not whole, not in time, or there is no room.
+            TransferError: the directory cannot be fetched completely or in time, or lacks space.
         """
         self._begin()
         asked = {
@@ -224,5 +224,5 @@ class Fetcher(_End):
         return Fetched(**self._ask(asked, timeout + _START))
 
     def close(self) -> None:
-        """Stop it; a fetch under way raises `TransferError` and leaves nothing."""
+        """Stop the process; a fetch under way raises `TransferError` and leaves nothing."""
         self._end()

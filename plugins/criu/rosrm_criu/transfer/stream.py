@@ -1,4 +1,4 @@
-"""The archive as it comes from its source, over as many connections as that takes."""
+"""Archive received from its source, over as many connections as necessary."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ if TYPE_CHECKING:
 
 #: Seconds for one address to answer.
 _CONNECT: Final = 2.0
-#: Seconds without a byte after which a connection is given up.
+#: Seconds without a byte until a connection is given up.
 _SILENCE: Final = 5.0
-#: Seconds for a source that was cut off to be there again.
+#: Seconds to wait for the return of a source after a broken connection.
 _PATIENCE: Final = 10.0
-#: Seconds between two rounds of asking at all its addresses.
+#: Seconds between two rounds of connection attempts to all its addresses.
 _PAUSE: Final = 0.2
-#: Most connections that may break in one transfer.
+#: Most broken connections in one transfer.
 _MOST_BREAKS: Final = 10
 _PIECE: Final = 1 << 16
-#: Bytes of an answer that says why not.
+#: Bytes to read of an error response.
 _WORDS: Final = 1000
 _OK: Final = 200
 
 
 class _Broken(Exception):
-    """A connection ended before the archive did: why."""
+    """A connection that ended before the archive did; its text is the cause."""
 
 
 class Stream:
-    """Reads the archive of an offer; a broken connection is made again, and gone on with.
+    """Reader of an offered archive, which resumes broken connections.
 
     Args:
         offer: of the source.
-        timeout: seconds for all of it.
-        identity: to show to the source, which was told of it.
+        timeout: seconds for the whole transfer.
+        identity: to show to the source, which knows its certificate.
 
     Attributes:
         address: of the source, once it was reached.
-        received: bytes that came in, as compressed.
-        resumed: times that a broken connection was made again.
+        received: compressed bytes that were received.
+        resumed: number of broken connections that were resumed.
     """
 
     def __init__(self, offer: Offer, *, timeout: float, identity: Identity) -> None:
@@ -75,7 +75,7 @@ class Stream:
         self.resumed = 0
 
     def read(self, size: int, /) -> bytes:
-        """At most so many bytes of the archive; none at its end. Raises `TransferError`."""
+        """Return at most `size` bytes of the archive; none at its end. Raise `TransferError`."""
         size = min(size, self._offer.length - self._offset)
         if size <= 0:
             return b""
@@ -84,10 +84,10 @@ class Stream:
         return data
 
     def check(self) -> str:
-        """The checksum of the archive, which was read to its end.
+        """Return the checksum of the archive, after the archive was read to its end.
 
         Raises:
-            TransferError: the source says another one.
+            TransferError: the source sent a different checksum.
         """
         told = b""
         while len(told) < DIGEST_SIZE:
@@ -100,7 +100,7 @@ class Stream:
         return told.hex()
 
     def say_taken(self) -> None:
-        """Tell the source that all is here. Where that is lost, its offer ends by its time."""
+        """Confirm complete reception to the source; if this is lost, the offer ends in time."""
         assert self._pool is not None
         assert self._response is not None
         self._response.drain_conn()
@@ -108,7 +108,7 @@ class Stream:
             self._pool.urlopen("POST", "/taken", headers=self._headers, retries=False)
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         if self._response is not None:
             self._response.close()
             self._response = None
@@ -133,7 +133,7 @@ class Stream:
                 return data
 
     def _decompressed(self, size: int) -> bytes:
-        """The next bytes, one at least."""
+        """Return the next bytes, at least one."""
         while True:
             packed = self._packed() if self._decompressor.needs_input else b""
             try:
@@ -163,7 +163,7 @@ class Stream:
         return packed
 
     def _connect(self) -> None:
-        """Find the source, and have it go on with the byte that is wanted next."""
+        """Connect to the source, and request the stream from the next byte on."""
         until = min(self._deadline, time.monotonic() + _PATIENCE)
         while True:
             faults = []
@@ -189,7 +189,7 @@ class Stream:
             timeout=urllib3.Timeout(
                 connect=self._patience(_CONNECT), read=self._patience(_SILENCE)
             ),
-            # Whoever shows this certificate has the key that was made for this offer.
+            # A peer with this certificate has the key that was created for this offer.
             assert_fingerprint=self._offer.fingerprint,
             assert_hostname=False,
             ssl_context=self._context,
@@ -231,7 +231,7 @@ class Stream:
 def _context(identity: Identity) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False  # urllib3 compares the fingerprint before it says anything
+    context.check_hostname = False  # urllib3 checks the fingerprint before it sends anything
     context.verify_mode = ssl.CERT_NONE
     identity.load_into(context)
     return context
@@ -245,7 +245,7 @@ def _answer(response: urllib3.BaseHTTPResponse) -> str:
 
 
 def _is_final(error: Exception) -> bool:
-    """Nobody listens, or somebody else: neither changes by waiting."""
+    """Return True if waiting is useless: no server listens, or another server answers."""
     if isinstance(error, SSLError):
         return "ingerprint" in str(error)
     return isinstance(error, NewConnectionError) and isinstance(

@@ -1,7 +1,7 @@
-"""Writes an archive into a directory: what is in it may come from anybody.
+"""Extraction of an untrusted archive into a directory.
 
-Nothing is written outside of the directory, and nothing but directories and regular files, which
-their owner alone can read. Python's own filter for archives sees each entry as well.
+Only directories and regular files are written, only inside the directory, and readable by their
+owner alone. Python's own filter for archives also checks each entry.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ _NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXE
 
 
 class Readable(Protocol):
-    """Gives the archive, some bytes at a time; none at its end."""
+    """Source of an archive, some bytes per call; none at its end."""
 
     def read(self, size: int, /) -> bytes:
-        """At most so many."""
+        """Return at most `size` bytes."""
 
 
 def unpack(archive: Readable, directory: Path) -> int:
-    """Write what an archive holds into an empty directory; how many files there were.
+    """Write the content of an archive into an empty directory; return the number of files.
 
     Raises:
-        TransferError: it is no archive, is damaged, or holds what it must not.
+        TransferError: it is no archive, is damaged, or contains something forbidden.
         OSError: something cannot be written.
     """
     files = 0
     try:
-        # No more than read(size) is asked of it.
+        # tarfile calls only read(size).
         source: Any = archive
         with tarfile.open(fileobj=source, mode="r|", bufsize=_PIECE) as tar:
             for entry in tar:
                 files += _write(tar, entry, directory)
         while archive.read(_PIECE):
-            pass  # tarfile stops at the archive's end mark; the checksum is of all of it
+            pass  # tarfile stops at the archive's end mark, but the checksum covers all bytes
     except (tarfile.TarError, EOFError) as error:
         raise TransferError(f"what came is no sound archive: {error}") from None
     return files
@@ -53,7 +53,7 @@ def _write(tar: tarfile.TarFile, entry: tarfile.TarInfo, directory: Path) -> int
             path.mkdir(mode=0o700)
             return 0
         content = tar.extractfile(entry)
-        assert content is not None  # as it is a regular file
+        assert content is not None  # because it is a regular file
         with os.fdopen(os.open(path, _NEW, 0o600), "wb", buffering=0) as file:
             _copy(content, file, entry)
     except (FileExistsError, FileNotFoundError, NotADirectoryError):
@@ -68,7 +68,7 @@ def _copy(content: IO[bytes], file: IO[bytes], entry: tarfile.TarInfo) -> None:
 
 
 def _checked(entry: tarfile.TarInfo, directory: Path) -> PurePosixPath:
-    """The path of an entry below the directory, where it is allowed."""
+    """Return the path of an entry below the directory; raise `TransferError` if it is forbidden."""
     path = PurePosixPath(entry.name)
     if path.is_absolute() or ".." in path.parts or not path.parts:
         raise TransferError(f"the archive holds {entry.name!r}, which lies outside of it: refused")

@@ -1,4 +1,4 @@
-"""Zstandard: Python's own module from 3.14 on, and before that its backport."""
+"""Zstandard: Python's own module from 3.14 on, otherwise its backport."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ else:
 
 __all__ = ["ZstdDecompressor", "ZstdError", "compressed"]
 
-#: The fastest of the ordinary levels: a higher one is slower than a gigabit network.
+#: The fastest regular level; a higher one is slower than a gigabit network.
 _LEVEL: Final = 1
 
 
 def compressed(pieces: Iterable[bytes]) -> Iterator[bytes]:
-    """The pieces as one frame, in pieces of no particular size."""
+    """Yield the pieces as one compressed frame, in pieces of any size."""
     compressor = ZstdCompressor(level=_LEVEL)
     for piece in pieces:
         if packed := compressor.compress(piece):
