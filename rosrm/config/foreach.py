@@ -31,7 +31,22 @@ _TOO_WIDE: Final = re.compile(r"\d{4}")
 _WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
 
 
-def rows_of(foreach: Node, problems: Problems) -> list[Row]:
+def expanded(entry: Node, problems: Problems) -> Iterator[Node]:
+    """Yield the entry itself or, with `foreach`, one entry for each row."""
+    foreach = entry.get("foreach")
+    if foreach is None:
+        yield entry
+        return
+    alike = Node({k: v for k, v in entry.items.items() if k != "foreach"}, entry.place)
+    for row in _checked_rows(foreach, problems):
+        faults = Problems()
+        made = _substituted(alike, row, faults)
+        problems.found.update(faults.found)
+        if not faults:
+            yield made
+
+
+def _checked_rows(foreach: Node, problems: Problems) -> list[Row]:
     """Return the values for each process; none if there are problems, all of which are noted."""
     faults = Problems()
     rows = _rows(foreach, faults)
@@ -54,16 +69,16 @@ def _rows(foreach: Node, problems: Problems) -> list[Row]:
     return []
 
 
-def substituted(node: Node, row: Row, problems: Problems) -> Node:
+def _substituted(node: Node, row: Row, problems: Problems) -> Node:
     """Return a document with the values of one row substituted in all its texts and keys."""
     if isinstance(node.value, str):
         return Node(_text(node, node.value, row, problems), node.place, node.key_place)
     if isinstance(node.value, tuple):
-        items = tuple(substituted(item, row, problems) for item in node.value)
+        items = tuple(_substituted(item, row, problems) for item in node.value)
         return Node(items, node.place, node.key_place)
     if isinstance(node.value, Mapping):
         members = {
-            str(_text(item, key, row, problems)): substituted(item, row, problems)
+            str(_text(item, key, row, problems)): _substituted(item, row, problems)
             for key, item in node.items.items()
         }
         return Node(members, node.place, node.key_place)

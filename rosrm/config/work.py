@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from rosrm.config.checking import near, salvaged
 from rosrm.config.documents import Node, Place, Problems, node_of, read
-from rosrm.config.foreach import rows_of, substituted
+from rosrm.config.foreach import expanded
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.namesakes import refuse_namesakes
@@ -56,7 +56,7 @@ def _specs(root: Node, path: str | Path, registry: Registry | None) -> tuple[Pro
     nodes = [
         node
         for entry in entries
-        for node in _expanded(merged(defaults, written_out(entry)), problems)
+        for node in expanded(merged(defaults, written_out(entry)), problems)
     ]
     specs = [_process(node, path, plugins, problems) for node in nodes]
     refuse_namesakes(nodes, "process", problems)
@@ -96,21 +96,6 @@ def _defaults(root: Node, problems: Problems) -> Node:
         if node is not None:
             problems.add(node.key_place or node.place, f"defaults: {name} belongs to one process")
     return written_out(defaults)
-
-
-def _expanded(entry: Node, problems: Problems) -> Iterator[Node]:
-    """Yield the entry itself or, with `foreach`, one entry for each row."""
-    foreach = entry.get("foreach")
-    if foreach is None:
-        yield entry
-        return
-    alike = Node({k: v for k, v in entry.items.items() if k != "foreach"}, entry.place)
-    for row in rows_of(foreach, problems):
-        faults = Problems()
-        made = substituted(alike, row, faults)
-        problems.found.update(faults.found)
-        if not faults:
-            yield made
 
 
 def _process(

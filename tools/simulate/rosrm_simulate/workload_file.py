@@ -12,7 +12,7 @@ import numpy as np
 
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems, read
-from rosrm.config.foreach import rows_of, substituted
+from rosrm.config.foreach import expanded
 from rosrm.config.kinds import SIMULATION_KEYS, check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.namesakes import refuse_namesakes
@@ -215,17 +215,7 @@ def _listed(root: Node, section: str, problems: Problems) -> Iterator[Node]:
         if not isinstance(entry.value, Mapping):
             problems.add(entry.place, f"{section}: each of the list is a mapping, with a `name`")
             continue
-        foreach = entry.get("foreach")
-        if foreach is None:
-            yield entry
-            continue
-        alike = Node({k: v for k, v in entry.items.items() if k != "foreach"}, entry.place)
-        for row in rows_of(foreach, problems):
-            faults = Problems()
-            made = substituted(alike, row, faults)
-            problems.found.update(faults.found)
-            if not faults:
-                yield made
+        yield from expanded(entry, problems)
 
 
 def _host(node: Node, problems: Problems) -> HostPlan | None:
