@@ -337,7 +337,7 @@ class MigrationOffer:
 
 @dataclass(frozen=True)
 class LauncherContext:
-    """What a launcher may know of its host when it is made.
+    """The facts about its host that a launcher gets when it is made.
 
     Attributes:
         state: directory of the slave; executors get it as `here.state`.

@@ -227,7 +227,7 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     if not callable(getattr(offer, "create", None)):
         return f"{name!r}: `create` cannot be called"
     if isinstance(offer, LauncherOffer):
-        return ""  # nobody chooses it by name, so it has no options
+        return ""  # the configuration does not choose it, so it has no options
     options: object = getattr(offer, "options", None)
     if not (isinstance(options, type) and is_dataclass(options)):
         return f"{name!r}: `options` is not a dataclass but {options!r}"

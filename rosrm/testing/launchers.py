@@ -1,4 +1,4 @@
-"""What the slave relies on in a launcher."""
+"""The contract of a launcher: the behaviour that the slave relies on."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from rosrm.testing.calls import ContractBroken, call
 
 
 class LauncherContract:
-    """What the slave relies on in a launcher.
+    """The behaviour of a launcher that the slave relies on.
 
     Attributes:
         offer: what is tested.

@@ -441,7 +441,7 @@ KNOWS = ("sh", "-c", 'echo "knows ${IMAGER_KNOWS-no launcher}"; exec sleep 1000'
 def test_a_third_party_s_launcher_restores_from_its_image(
     make_cluster, third_party, strategy, first
 ) -> None:
-    """It starts the processes whose strategy declares it, and what any process is restored to."""
+    """The launcher starts processes whose strategy declares it, and restores any process."""
     cluster = make_cluster(host("h0"), migration=MigrationSettings({"imager": {}, "relaunch": {}}))
 
     def knows(said: str) -> None:

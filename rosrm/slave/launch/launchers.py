@@ -38,7 +38,7 @@ def _no_log(_message: str) -> None:
 
 @dataclass
 class Launchers:
-    """What starts instances in another way than by their plain command.
+    """The launchers, which start instances in another way than by their plain command.
 
     Attributes:
         made: by name.

@@ -50,7 +50,7 @@ def cluster_with(capabilities: Capabilities, *machines: str | Machine) -> Cluste
 
 
 def test_snapshots_are_kept_of_a_state_on_topics():
-    """The slave is told to keep them, replicas are ordered, and the next start is given them."""
+    """The slave keeps them, the master orders replicas, and the next start gets the newest."""
     policy = Asked()
     cluster = cluster_with(Capabilities(state="topics"), "a", "b", "c")
     cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "asked"

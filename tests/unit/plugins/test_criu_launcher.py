@@ -1,4 +1,4 @@
-"""What the launcher of `criu` makes of a start."""
+"""The start of an instance as the launcher of `criu` changes it."""
 
 from __future__ import annotations
 
@@ -49,6 +49,6 @@ def test_a_program_that_is_to_be_checkpointed_is_looked_for(tmp_path, program):
 
 
 def test_a_restored_instance_without_an_image_here_is_left_to_other_launchers(tmp_path):
-    """Of a process that moves by another strategy, the image may be of another launcher."""
+    """The image of a process that moves by another strategy may be of another launcher."""
     asked = {"restored": True, "migration": MigrationPolicy("relaunch")}
     assert prepared(tmp_path, **asked) is None

@@ -164,7 +164,7 @@ def registry(create) -> Registry:
 
 
 def test_a_plugin_brings_a_launcher_that_its_strategy_declares():
-    """It is listed like any offer."""
+    """The registry lists the launcher like any other offer."""
     known = registry(lambda context: Wrapper())
     made = known.launchers(None).made
     own = Launchers(made, {}, known.capabilities_of())
