@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fcntl
 import io
 import os
@@ -353,7 +352,3 @@ def test_who_starts_a_transfer_loads_nothing_of_its_libraries():
 def test_a_python_that_cannot_check_archives_is_refused(monkeypatch):
     monkeypatch.delattr(tarfile, "data_filter")
     assert "needs 3.10.12" in starting.missing()
-
-
-def test_every_field_of_an_offer_travels():
-    assert set(OFFER.as_json()) == {field.name for field in dataclasses.fields(Offer)}

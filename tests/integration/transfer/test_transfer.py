@@ -34,6 +34,8 @@ def test_100_mb_arrive_as_they_were(tmp_path, target, sender, fetcher):
     """All files arrive unchanged, readable by their owner alone, and the port is closed then."""
     source = tmp_path / "source"
     fill(source, megabytes=100, random_share=0.5)
+    for end in (sender, fetcher):
+        end.ready()  # its libraries may be loaded in advance
     offer = sender.offer(source, seconds=PATIENCE, max_rate=0, to=fetcher.introduce())
     told = Offer.from_json(json.loads(json.dumps(offer.as_json())))
 

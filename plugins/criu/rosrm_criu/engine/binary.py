@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine.log_reader import causes, first_words
+from rosrm_criu.engine.criu_log import causes, first_words
 
 #: Environment variable with the path of the program; if it is set, nothing else is searched.
 PROGRAM_VARIABLE: Final = "ROSRM_CRIU"

@@ -45,7 +45,12 @@ class Pace:
         self._due = 0.0
 
     def wait(self, size: int, now: float) -> float:
-        """Return the seconds to pause after sending `size` bytes."""
+        """Return the seconds to pause.
+
+        Args:
+            size: bytes that were just sent.
+            now: monotonic time in seconds.
+        """
         if not self._rate:
             return 0.0
         self._due = max(self._due, now - _SLACK) + size / self._rate
