@@ -142,7 +142,7 @@ class Scene:
         """Return a blow that kills the victim with SIGKILL."""
         return lambda: self._send(victim, signal.SIGKILL)
 
-    def shim(self, victim: str) -> Blow:
+    def hold(self, victim: str) -> Blow:
         """Return a blow that pauses the victim with SIGSTOP."""
         return lambda: self._send(victim, signal.SIGSTOP)
 
@@ -155,8 +155,8 @@ class Scene:
 
     def source_held(self) -> list[tuple[str, Blow]]:
         """Return blows that pause the source at the destination's READY, unseen by the master."""
-        ready = all_of(self.shim("source"), self.let_go("master"))
-        return [("SHADOWING", self.shim("master")), ("READY", ready)]
+        ready = all_of(self.hold("source"), self.let_go("master"))
+        return [("SHADOWING", self.hold("master")), ("READY", ready)]
 
     def _send(self, victim: str, number: int) -> None:
         pid = self._pid_of(victim)

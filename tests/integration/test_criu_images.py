@@ -353,7 +353,7 @@ def test_who_ends_at_once_was_restored_all_the_same(theatre, option):
 
 
 def test_signals_come_through_the_shim(theatre, counter):
-    """What the process handles it handles; what kills it, the shim dies of too."""
+    """The restored process handles its signals; the shim ends by the signal that kills it."""
     restored = theatre.restore(theatre.dump(counter))
     os.killpg(restored.pid, signal.SIGUSR1)
     restored.says("usr1")
@@ -496,7 +496,7 @@ def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
 
 
 def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
-    """The stop policy and the fences come to a SIGKILL of the shim's group, which leaves nobody."""
+    """The stop policy ends in a SIGKILL of the shim's group, which leaves no process."""
     ignoring = "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     code = COUNTER.replace("count = 0", f"{ignoring}count = 0").replace("sys.exit(7)", "None")
     actor = theatre.start(code)

@@ -25,7 +25,7 @@ def with_packages(cached, tmp_path) -> Path:
 
 
 def test_the_installed_program_works_by_its_own_libraries(with_packages, criu):
-    """It loads not even the system's C library; a second run and a repair need no network."""
+    """The program loads not even the system's C library; later runs need no network."""
     done = install_criu(with_packages, MIRROR=UNREACHABLE)
     assert (done.returncode, done.stderr) == (0, "")
     program = with_packages / "bin/criu"
