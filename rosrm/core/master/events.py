@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.core.master.commands import OrderId
 from rosrm.model.plan import ReportPhase
 from rosrm.model.values import (
     EMPTY,
@@ -218,12 +219,12 @@ class PruneRequested:
 
 @dataclass(frozen=True, slots=True)
 class OrderAnswered:
-    """A slave answered an `Order`, or did not in time (code "timeout").
+    """A slave answered a `SendOrder`, or did not in time (code "timeout").
 
     The code `BAD_RESULT`: an executor ran to its end, but answered no JSON object.
     """
 
-    order: int
+    order: OrderId
     accepted: bool
     code: str = ""
     message: str = ""

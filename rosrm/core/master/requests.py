@@ -10,7 +10,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.checkpoint import image_requests, images, replication
-from rosrm.core.master.commands import Order, Reply
+from rosrm.core.master.commands import Reply
 from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase, Wanted
@@ -22,6 +22,7 @@ from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RestartInstance
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import counted, listed, no_such
 
@@ -294,7 +295,7 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
         # An instance that its slave has not accepted yet starts anyway. An order to restart that
         # arrives before the assignment would prevent the start for good.
         owner.restarting = True
-        state.emit(Order(state.order_id(), owner.host.host_id, "restart", owner.id))
+        state.send(owner.host, RestartInstance(owner.id))
     state.save(process)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
+from rosrm.model.orders import FenceInstance
 from rosrm.model.plan import ReportPhase
 from rosrm.model.values import HostLossPolicy, InstanceState, RestartPolicy, StandbyPolicy
 from tests.unit.core.cluster import Cluster, Machine
@@ -228,7 +229,7 @@ def test_a_primary_that_is_heard_while_its_standby_takes_over_is_fenced() -> Non
     assert (cluster.phase("p"), cluster["p"].owner) == ("migrating", 1)
     cluster.machines["a"].connected = True
     cluster.wait(0.3)
-    assert [order.instance.number for order in cluster.orders("fence")] == [1]
+    assert [order.instance.number for order in cluster.orders(FenceInstance)] == [1]
 
 
 def test_an_ended_process_is_not_pruned_before_its_standby_is_given_up() -> None:

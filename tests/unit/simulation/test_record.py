@@ -120,7 +120,12 @@ EVENTS = {
         happened.PruneRequested, INT, *2 * [st.lists(TEXT).map(tuple)], TEXT
     ),
     happened.OrderAnswered: st.builds(
-        happened.OrderAnswered, INT, st.booleans(), TEXT, TEXT, st.one_of(st.none(), JSON)
+        happened.OrderAnswered,
+        st.one_of(INT, st.tuples(TEXT, INT)),
+        st.booleans(),
+        TEXT,
+        TEXT,
+        st.one_of(st.none(), JSON),
     ),
     happened.AssignmentWithdrawn: st.builds(happened.AssignmentWithdrawn, INSTANCE),
     happened.HandoffReported: st.builds(

@@ -19,15 +19,16 @@ from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.state.hosts import Host, HostCondition
-from rosrm.core.master.state.periodic import BEFORE_FIRST, Dumped
+from rosrm.core.master.state.pending_orders import PeriodicCheckpoint
+from rosrm.core.master.state.periodic import Dumped
 from rosrm.core.master.state.process import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import MemoryPacing, MemoryView, PeriodicImaging
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RunExecutor
 from rosrm.model.plan import Execute
 from rosrm.model.plan_json import checked_step
 from rosrm.wording import size
@@ -48,7 +49,7 @@ def review(state: MasterState, now: float) -> None:
         return
     known.looked = now
     for number in [number for number in known.of if number not in state.instances]:
-        if _remove(state, known.of[number]):
+        if _remove(state, number, known.of[number]):
             del known.of[number]
     if any(implements(one, PeriodicImaging) for one in state.strategies.values()):
         for process in state.processes.values():
@@ -56,14 +57,11 @@ def review(state: MasterState, now: float) -> None:
                 _review(state, process, now)
 
 
-def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
-    """Handle the answer to an order of this module; return True if it was one."""
-    if event.order <= BEFORE_FIRST:
-        return False
-    for dumped in state.periodic.of.values():
-        if dumped.order == event.order:
-            _note(state, dumped, event, now)
-    return True
+def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
+    """Note the result of the dump under way of an instance."""
+    dumped = state.periodic.of.get(number)
+    if dumped is not None and dumped.order == event.order:
+        _note(state, dumped, event, now)
 
 
 def of_process(state: MasterState, process: Process, now: float) -> Mapping[str, Any] | None:
@@ -91,9 +89,9 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         name = process.spec.migration.strategy or ""
         discard = _discard_of(state, name)
         dumped = state.periodic.of[number] = Dumped(process.name, host.name, name, discard, now)
-    if dumped.order and dumped.asked != host.description.incarnation:
-        dumped.order, dumped.since = 0, now  # the dump ended with the slave that made it
-    if dumped.order or not _may_be_dumped(state, process, owner):
+    if dumped.order is not None and dumped.asked != host.description.incarnation:
+        dumped.order, dumped.since = None, now  # the dump ended with the slave that made it
+    if dumped.order is not None or not _may_be_dumped(state, process, owner):
         return
     pace, trouble = _pace(state, process, strategy, host, dumped)
     if pace is not None:
@@ -178,21 +176,16 @@ def _order(
     except PluginError as error:
         _say_trouble(state, dumped, str(error), now)
         return
-    state.periodic.last_order += 1
-    dumped.order, dumped.asked = state.periodic.last_order, owner.host.description.incarnation
-    state.emit(
-        Order(
-            dumped.order, owner.host.host_id, "execute", executor=step.executor,
-            arguments=step.arguments, timeout=step.timeout,
-        )
-    )  # fmt: skip
+    dump = RunExecutor(step.executor, step.arguments, step.timeout)
+    dumped.order = state.send(owner.host, dump, PeriodicCheckpoint(owner.id.number))
+    dumped.asked = owner.host.description.incarnation
 
 
 # --- results ----------------------------------------------------------------------------------
 
 
 def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
-    dumped.order, dumped.since = 0, now
+    dumped.order, dumped.since = None, now
     if not event.accepted:
         _say_trouble(state, dumped, event.message or event.code, now)
         return
@@ -228,7 +221,7 @@ def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -
     )  # fmt: skip
 
 
-def _remove(state: MasterState, dumped: Dumped) -> bool:
+def _remove(state: MasterState, number: int, dumped: Dumped) -> bool:
     """Order the removal of images; return False if the strategy must be asked again first.
 
     A host that is not up removes them when it registers.
@@ -240,11 +233,5 @@ def _remove(state: MasterState, dumped: Dumped) -> bool:
         dumped.discard = _discard_of(state, dumped.strategy)
     if not dumped.discard:
         return dumped.discard is not None
-    state.periodic.last_order += 1
-    state.emit(
-        Order(
-            state.periodic.last_order, host.host_id, "execute", executor=dumped.discard,
-            timeout=_PATIENCE,
-        )
-    )  # fmt: skip
+    state.send(host, RunExecutor(dumped.discard, timeout=_PATIENCE), PeriodicCheckpoint(number))
     return True

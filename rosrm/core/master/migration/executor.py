@@ -24,18 +24,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Final
 
-from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
-from rosrm.core.master.checkpoint import image_requests, images, periodic, replication
-from rosrm.core.master.events import BAD_RESULT
-from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.migration.steps import (
     DONE,
     give_order,
     give_order_again,
-    note_result,
     outcome_of,
     timed_out,
     title,
@@ -61,24 +57,6 @@ def advance_all(state: MasterState, now: float) -> None:
     for run in list(state.runs.values()):
         while run.process in state.runs and _advance(state, run, now):
             pass
-
-
-def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
-    """Handle the answer of a slave to an order: accepted, refused, or none in time."""
-    if (
-        periodic.order_answered(state, event, now)
-        or replication.order_answered(state, event)
-        or capabilities.order_answered(state, event, now)
-        or images.order_answered(state, event, now)
-    ):
-        return
-    name = state.runs_by_order.pop(event.order, None)
-    run = state.runs.get(name) if name is not None else None
-    if run is not None and run.order == event.order and event.code != "timeout":
-        run.answer = (event.accepted, event.message or event.code)
-        run.bad_result = event.code == BAD_RESULT
-        if event.accepted and event.result:
-            note_result(run, event.result)
 
 
 def _advance(state: MasterState, run: Run, now: float) -> bool:

@@ -8,11 +8,13 @@ from functools import singledispatch
 from typing import Any, Final
 
 from rosrm.core.master import lifecycle
-from rosrm.core.master.commands import Order
+from rosrm.core.master.events import BAD_RESULT, OrderAnswered
 from rosrm.core.master.master_state import MasterState, Run
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.migration.handoff import DONE
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.pending_orders import MigrationStep
+from rosrm.model.orders import Order, RunExecutor, SetRestartPolicy, StartInstance, StopInstance
 from rosrm.model.plan import (
     Aim,
     AwaitReady,
@@ -32,7 +34,7 @@ __all__ = [
     "give_order",
     "give_order_again",
     "nobody_there",
-    "note_result",
+    "note_answer",
     "outcome_of",
     "timed_out",
     "title",
@@ -52,52 +54,56 @@ _AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
     """Send the order of a step to its slave, or in a handoff to the nodes themselves."""
+    run.order = None
     if isinstance(step, Commit | AwaitReady | AwaitReleased):
         return
     if isinstance(step, Configure):
-        run.order, run.order_at = 0, now
+        run.order_at = now
         handoff.publish(state, run, step.phase)
         return
     if isinstance(step, Start) and _in_the_way(state, run, step, now):
-        run.order = 0
         return
     host = state.hosts.by_name[step.host]
-    run.order, run.order_at = state.order_id(), now
-    state.runs_by_order[run.order] = run.process
+    order = _order_of(state, run, step, host, now)
+    run.order, run.order_at = state.send(host, order, MigrationStep(run.process)), now
+
+
+def _order_of(
+    state: MasterState, run: Run, step: Start | Stop | Execute | SetRestart, host: Host, now: float
+) -> Order:
+    """Return the order of a step; note in its migration what the order changes."""
     if isinstance(step, Stop):
-        state.emit(Order(run.order, host.host_id, "stop", step.instance))
-    elif isinstance(step, Execute):
-        state.emit(
-            Order(
-                run.order, host.host_id, "execute", executor=step.executor,
-                arguments=_arguments(run, step), timeout=step.timeout,
-            )
-        )  # fmt: skip
-    elif isinstance(step, SetRestart):
-        _order_restart_policy(state, run, step, host)
-    else:
-        _order_start(state, run, step, host, now)
+        return StopInstance(step.instance)
+    if isinstance(step, Execute):
+        return RunExecutor(step.executor, _arguments(run, step), step.timeout)
+    if isinstance(step, SetRestart):
+        if step.restart != state.processes[run.process].spec.restart:
+            run.suspended.add(step.instance.number)
+            state.save_run(run)
+        return SetRestartPolicy(step.instance, step.restart)
+    return _start(state, run, step, host, now)
 
 
 def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
     return {**step.arguments, "results": run.results} if run.results else step.arguments
 
 
-def note_result(run: Run, result: Mapping[str, Any]) -> None:
-    """Keep the result of an executor for those of later steps."""
+def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
+    """Note the answer to the order of the current step of a migration.
+
+    The result of an executor is kept for those of later steps.
+    """
+    run = state.runs.get(process)
+    if run is None or run.order != event.order or event.code == "timeout":
+        return
+    run.answer = (event.accepted, event.message or event.code)
+    run.bad_result = event.code == BAD_RESULT
     step = run.step_in_hand
-    if isinstance(step, Execute):
-        run.results[step.executor] = result
+    if event.accepted and event.result and isinstance(step, Execute):
+        run.results[step.executor] = event.result
 
 
-def _order_restart_policy(state: MasterState, run: Run, step: SetRestart, host: Host) -> None:
-    if step.restart != state.processes[run.process].spec.restart:
-        run.suspended.add(step.instance.number)
-        state.save_run(run)
-    state.emit(Order(run.order, host.host_id, "set_restart", step.instance, restart=step.restart))
-
-
-def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> None:
+def _start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> StartInstance:
     process = state.processes[run.process]
     spec, number = process.spec, step.instance.number
     run.launched.add(number)
@@ -112,10 +118,11 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
         instance.node_name = step.node_name
         state.save(process)
     remapped = replace(spec, remappings={**spec.remappings, **step.remappings})
-    assignment = state.assignment(
-        step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
+    return StartInstance(
+        state.assignment(
+            step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
+        )
     )
-    state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
 
 
 def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
