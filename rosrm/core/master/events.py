@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -198,7 +198,7 @@ class HostStateRequested:
 
     request: int
     host: str
-    action: str
+    action: Literal["cordon", "uncordon", "drain"]
     by: str = ""
 
 

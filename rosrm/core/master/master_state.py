@@ -11,7 +11,7 @@ import numpy as np
 
 from rosrm.core.master.commands import Command, OrderId, SendOrder
 from rosrm.core.master.hosts.fencing import fence_of
-from rosrm.core.master.scheduling.decision import Decision
+from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Abilities
@@ -423,7 +423,9 @@ class MasterState:
             restored,
         )  # fmt: skip
 
-    def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
+    def note_decision(
+        self, process: Process, decision: Decision, kind: DecisionKind, now: float
+    ) -> None:
         """Remember the newest decision about a process, for `explain`."""
         decision.kind = kind
         process.decision = decision

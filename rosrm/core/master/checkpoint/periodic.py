@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.pending_orders import PeriodicCheckpoint
 from rosrm.core.master.state.periodic import Dumped
@@ -93,27 +94,27 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         dumped.order, dumped.since = None, now  # the dump ended with the slave that made it
     if dumped.order is not None or not _may_be_dumped(state, process, owner):
         return
-    pace, trouble = _pace(state, process, strategy, host, dumped)
-    if pace is not None:
-        if now < dumped.since + pace:
-            return
+    pace = _pace(state, process, strategy, host, dumped)
+    if isinstance(pace, Rejected):
+        _say_trouble(state, dumped, pace.reason, now)
+    elif pace is not None and now >= dumped.since + pace:
         trouble = capabilities.fault(state, process.spec.migration.strategy or "", host, host)
-    if pace is None or trouble:
-        _say_trouble(state, dumped, trouble, now)
-    else:
-        _order(state, process, strategy, owner, dumped, now)
+        if trouble:
+            _say_trouble(state, dumped, trouble, now)
+        else:
+            _order(state, process, strategy, owner, dumped, now)
 
 
-def _discard_of(state: MasterState, name: str) -> str | None:
-    """Return the executor by which a strategy removes images; "": none; None: the call failed."""
+def _discard_of(state: MasterState, name: str) -> str | Rejected | None:
+    """Return the executor by which a strategy removes images; None: it has none."""
     strategy: object = state.strategies.get(name)
     if not implements(strategy, PeriodicImaging):
-        return ""
+        return None
     asked = strategy
     try:
         return state.plugins.ask("migration", name, "discard", lambda: required(asked.discard, str))
-    except PluginError:
-        return None
+    except PluginError as error:
+        return Rejected(str(error))
 
 
 def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
@@ -129,13 +130,13 @@ def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> boo
 
 def _pace(
     state: MasterState, process: Process, strategy: PeriodicImaging, host: Host, dumped: Dumped
-) -> tuple[float | None, str]:
-    """Return the seconds between two dumps (None: no dump), and the error if there is one."""
+) -> float | Rejected | None:
+    """Return the seconds between two dumps; None: no dump is wanted."""
     policy, name = state.keeping.policy, state.keeping.policy_name
     if policy is None:
-        return None, "no checkpoint policy is selected: name one in the cluster's file"
+        return Rejected("no checkpoint policy is selected: name one in the cluster's file")
     if not implements(policy, MemoryPacing):
-        return None, f"the checkpoint policy {name!r} makes none of memory"
+        return Rejected(f"the checkpoint policy {name!r} makes none of memory")
     pacing = policy
     asked_of = process.spec.migration.strategy or ""
     try:
@@ -144,14 +145,12 @@ def _pace(
             lambda: float(strategy.checkpoint_every(process.spec)),
         )  # fmt: skip
         if not asked > 0.0:
-            return None, ""
+            return None
         view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
         asked_of = name
-        return state.plugins.ask(
-            "checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view))
-        ), ""  # fmt: skip
+        return state.plugins.ask("checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view)))
     except PluginError as error:
-        return None, f"{asked_of!r} sets no pace: {error}"
+        return Rejected(f"{asked_of!r} sets no pace: {error}")
 
 
 def sound_pace(pace: float | None) -> float | None:
@@ -211,7 +210,7 @@ def _number(value: Any) -> float:
 
 def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
     """Record a failure of periodic checkpoints, once until the reason changes."""
-    if not trouble or trouble == dumped.trouble:
+    if trouble == dumped.trouble:
         return
     dumped.trouble = trouble
     state.record(
@@ -229,9 +228,11 @@ def _remove(state: MasterState, number: int, dumped: Dumped) -> bool:
     host = state.hosts.by_name.get(dumped.host)
     if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
         return True
-    if dumped.discard is None:
+    if isinstance(dumped.discard, Rejected):
         dumped.discard = _discard_of(state, dumped.strategy)
-    if not dumped.discard:
-        return dumped.discard is not None
-    state.send(host, RunExecutor(dumped.discard, timeout=_PATIENCE), PeriodicCheckpoint(number))
+    if isinstance(dumped.discard, Rejected):
+        return False
+    if dumped.discard:
+        remove = RunExecutor(dumped.discard, timeout=_PATIENCE)
+        state.send(host, remove, PeriodicCheckpoint(number))
     return True

@@ -29,13 +29,13 @@ from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.migration.steps import (
-    DONE,
     give_order,
     give_order_again,
     outcome_of,
     timed_out,
     title,
 )
+from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.migration import End
 from rosrm.model.event_kinds import EventKind
@@ -76,12 +76,12 @@ def _advance(state: MasterState, run: Run, now: float) -> bool:
         run.deadline = now + max(step.timeout, 0.0)
         give_order(state, run, step, now)
     outcome = _outcome(state, run, step, now)
-    if outcome is None:
+    if outcome is StepProgress.PENDING:
         return False
-    if outcome == DONE:
-        _next(state, run, step, now)
+    if isinstance(outcome, StepFailed):
+        _failed(state, run, step, outcome.reason, now)
     else:
-        _failed(state, run, step, outcome, now)
+        _next(state, run, step, now)
     return run.begun or not run.stuck
 
 
@@ -116,10 +116,10 @@ def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
     return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
 
 
-def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None:
+def _outcome(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
     """Return the outcome of the current step; repeat its order or end it at its time-out."""
     outcome = outcome_of(step, state, run, now)
-    if outcome is None:
+    if outcome is StepProgress.PENDING:
         give_order_again(state, run, step, now)
         if now >= run.deadline:
             outcome = timed_out(state, run, step, now)

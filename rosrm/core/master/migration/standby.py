@@ -24,6 +24,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover, handoff
 from rosrm.core.master.migration.start import plan_move, why_no_executor
 from rosrm.core.master.migration.steps import give_order
+from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.migration import Run
@@ -67,8 +68,8 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         return False
     host = state.hosts.hosts[column]
     run = plan_move(state, process, host, "standby", now)
-    why = run if isinstance(run, str) else why_no_executor(state, run)
-    if isinstance(run, str) or why or not _can_wait(run):
+    why = run.reason if isinstance(run, Rejected) else why_no_executor(state, run)
+    if isinstance(run, Rejected) or why or not _can_wait(run):
         why = why or "its migration strategy keeps no standby ready"
         _wait(state, process, f"it can have no standby: {why}", now)
         return False

@@ -11,7 +11,7 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.events import BAD_RESULT, OrderAnswered
 from rosrm.core.master.master_state import MasterState, Run
 from rosrm.core.master.migration import handoff
-from rosrm.core.master.migration.handoff import DONE
+from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress, done_if
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.pending_orders import MigrationStep
 from rosrm.model.orders import Order, RunExecutor, SetRestartPolicy, StartInstance, StopInstance
@@ -28,17 +28,6 @@ from rosrm.model.plan import (
     Stop,
 )
 from rosrm.model.values import InstanceState
-
-__all__ = [
-    "DONE",
-    "give_order",
-    "give_order_again",
-    "nobody_there",
-    "note_answer",
-    "outcome_of",
-    "timed_out",
-    "title",
-]
 
 _TITLES: Final[Mapping[type[Step], str]] = {
     Commit: "the commit",
@@ -162,86 +151,89 @@ def _has_waited(run: Run, step: Step) -> bool:
     return isinstance(step, Start) and step.instance.number not in run.launched
 
 
-def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | None:
+def timed_out(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
     """Return the outcome of a step after its time-out, as `outcome_of` does."""
     if isinstance(step, Configure):
         return handoff.timed_out(state, run, step, now)
     if isinstance(step, AwaitReleased):
-        return DONE
-    return f"{title(step)} took longer than {step.timeout:g} s"
+        return StepProgress.DONE
+    return StepFailed(f"{title(step)} took longer than {step.timeout:g} s")
 
 
 @singledispatch
-def outcome_of(step: Any, state: MasterState, run: Run, now: float) -> str | None:
-    """Return the outcome of the current step: None: pending; "": done; else the failure."""
+def outcome_of(step: Any, state: MasterState, run: Run, now: float) -> StepOutcome:
+    """Return the outcome of the current step."""
     raise TypeError(step)
 
 
 @outcome_of.register
-def _(step: Start, state: MasterState, run: Run, now: float) -> str | None:
+def _(step: Start, state: MasterState, run: Run, now: float) -> StepOutcome:
     if step.instance.number in run.ended:
-        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
+        return StepFailed(f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}")
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return None  # another instance has to end first
+        return StepProgress.PENDING  # another instance has to end first
     if run.answer is not None and not run.answer[0]:
-        return f"{step.host} refused to start {step.instance}: {run.answer[1]}"
-    return DONE if instance.runs else None
+        return StepFailed(f"{step.host} refused to start {step.instance}: {run.answer[1]}")
+    return done_if(instance.runs)
 
 
 @outcome_of.register
-def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> str | None:
+def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> StepOutcome:
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
+        return StepFailed(f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}")
     settled = instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
-    return DONE if settled else None
+    return done_if(settled)
 
 
 @outcome_of.register
-def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> str | None:
-    return DONE if handoff.is_released(state, run, step.instance) else None
+def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> StepOutcome:
+    return done_if(handoff.is_released(state, run, step.instance))
 
 
 @outcome_of.register
-def _(step: Stop, state: MasterState, run: Run, now: float) -> str | None:
-    return DONE if step.instance.number not in state.instances else None
+def _(step: Stop, state: MasterState, run: Run, now: float) -> StepOutcome:
+    return done_if(step.instance.number not in state.instances)
 
 
 @outcome_of.register
-def _(step: Configure, state: MasterState, run: Run, now: float) -> str | None:
+def _(step: Configure, state: MasterState, run: Run, now: float) -> StepOutcome:
     return handoff.outcome(step, state, run)
 
 
 @outcome_of.register
-def _(step: SetRestart, state: MasterState, run: Run, now: float) -> str | None:
+def _(step: SetRestart, state: MasterState, run: Run, now: float) -> StepOutcome:
     if step.instance.number not in state.instances:
-        return DONE  # it has ended: there is nothing to restart
+        return StepProgress.DONE  # it has ended: there is nothing to restart
     if run.answer is None:
-        return None
+        return StepProgress.PENDING
     accepted, message = run.answer
-    return (
-        DONE
-        if accepted
-        else f"{step.host} did not change the restart policy of {step.instance}: {message}"
-    )
+    if accepted:
+        return StepProgress.DONE
+    what = f"the restart policy of {step.instance}"
+    return StepFailed(f"{step.host} did not change {what}: {message}")
 
 
 @outcome_of.register
-def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
-    return DONE
+def _(step: Commit, state: MasterState, run: Run, now: float) -> StepOutcome:
+    return StepProgress.DONE
 
 
 @outcome_of.register
-def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
+def _(step: Execute, state: MasterState, run: Run, now: float) -> StepOutcome:
     if run.answer is None:
         away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
         # A frozen instance must not wait for a long time-out. A plan that may not stop waits for
         # the host as long as an instance of it may be there.
         turns = run.undo is None and not run.committed
-        return f"{step.host} {away}" if away and (turns or nobody_there(state, run, step)) else None
+        if away and (turns or nobody_there(state, run, step)):
+            return StepFailed(f"{step.host} {away}")
+        return StepProgress.PENDING
     accepted, message = run.answer
-    return DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
+    if accepted:
+        return StepProgress.DONE
+    return StepFailed(f"{step.executor} failed on {step.host}: {message}")
 
 
 def nobody_there(state: MasterState, run: Run, step: Execute) -> bool:

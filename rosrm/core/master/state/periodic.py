@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from math import inf
 
 from rosrm.core.master.commands import OrderId
+from rosrm.core.master.outcomes import Rejected
 
 
 @dataclass(slots=True)
@@ -15,7 +16,8 @@ class Dumped:
     Attributes:
         process, host: names.
         strategy: name of the strategy that makes them.
-        discard: the executor that removes its images; None: the strategy failed to name it.
+        discard: the executor that removes its images; None: none does; `Rejected`: the strategy
+            failed to name it.
         since: time of the last dump, or time since when the first is due.
         made: at least one exists.
         size: bytes of the newest.
@@ -28,7 +30,7 @@ class Dumped:
     process: str
     host: str
     strategy: str
-    discard: str | None
+    discard: str | Rejected | None
     since: float
     made: bool = False
     size: int = 0
