@@ -13,6 +13,7 @@ any       cannot be done      it is left out: an instance that has ended never s
                               An executor that ran and returned no object counts as done
 back      destination active  forward to the commit: in a handoff the destination itself decides;
                               in a restore an executor has found that the process runs
+standby   comes to SWITCH     it is paused, and goes forward once the source has ended
 ========  ==================  ==============================================================
 
 Cancelling a process turns its migration back; a stuck one is given up, and all its instances are
@@ -22,24 +23,32 @@ stopped. When neither source nor destination is left, the process returns to the
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 from typing import Any, Final
 
 from rosrm.core.master import lifecycle
 from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
-from rosrm.core.master.migration import handoff
+from rosrm.core.master.migration import failover, handoff
 from rosrm.core.master.migration.steps import (
-    give_order,
-    give_order_again,
+    begin,
     outcome_of,
-    timed_out,
     title,
 )
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
-from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.migration import End
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.plan import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
+from rosrm.model.plan import (
+    Aim,
+    AwaitReady,
+    Commit,
+    Configure,
+    Execute,
+    HandoffPhase,
+    Start,
+    Step,
+    Stop,
+)
 from rosrm.model.values import InstanceId, InstanceState
 
 #: Message of the record of a commit.
@@ -59,6 +68,30 @@ def advance_all(state: MasterState, now: float) -> None:
             pass
 
 
+def advance_standby(state: MasterState, run: Run, now: float) -> StepOutcome:
+    """Advance the migration of a standby up to its SWITCH step, where it is paused.
+
+    Only the standby is started and configured: the primary keeps running as before, with its
+    restarts. So the other steps before SWITCH are left out.
+
+    Returns:
+        The outcome of the current step; DONE: the migration is paused.
+    """
+    pause = failover.index_of(HandoffPhase.SWITCH, run.plan.steps)
+    while run.index < pause:
+        step = run.plan.steps[run.index]
+        if isinstance(step, Start) or (isinstance(step, Configure) and step.awaited):
+            if not begin(state, run, step, now):
+                return StepProgress.PENDING
+            if isinstance(step, Configure):
+                run.deadline = inf  # a primary that is silent for long is no fault of its standby
+            outcome = outcome_of(state, run, step, now)
+            if outcome is not StepProgress.DONE:
+                return outcome
+        _go_on(state, run, now)
+    return StepProgress.DONE
+
+
 def _advance(state: MasterState, run: Run, now: float) -> bool:
     """Handle the current step; return True if more may be done at once."""
     _choose_way(state, run, now)
@@ -69,13 +102,9 @@ def _advance(state: MasterState, run: Run, now: float) -> bool:
     if isinstance(step, Start) and run.undo is not None and not _goes_on(state, run):
         _go_on(state, run, now)
         return True
-    if not run.begun:
-        if now < run.retry_at or _is_expected(state, run, step):
-            return False
-        run.begun, run.answer, run.bad_result = True, None, False
-        run.deadline = now + max(step.timeout, 0.0)
-        give_order(state, run, step, now)
-    outcome = _outcome(state, run, step, now)
+    if not begin(state, run, step, now):
+        return False
+    outcome = outcome_of(state, run, step, now)
     if outcome is StepProgress.PENDING:
         return False
     if isinstance(outcome, StepFailed):
@@ -99,31 +128,6 @@ def _choose_way(state: MasterState, run: Run, now: float) -> None:
         reason = _why_turn_back(state, run)
         if reason:
             _turn_back(state, run, reason, now)
-
-
-def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
-    """Return True if a host that the step needs has not returned since the master started.
-
-    The step waits for it until its lease ends; then the step begins, and its own time-out decides.
-    """
-    if isinstance(step, Commit):
-        return False
-    if not isinstance(step, Configure):
-        concerned = [state.hosts.by_name[step.host]]
-    else:
-        both = (run.source.number, run.destination.number) if step.awaited else ()
-        concerned = [state.instances[one].host for one in both if one in state.instances]
-    return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
-
-
-def _outcome(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
-    """Return the outcome of the current step; repeat its order or end it at its time-out."""
-    outcome = outcome_of(step, state, run, now)
-    if outcome is StepProgress.PENDING:
-        give_order_again(state, run, step, now)
-        if now >= run.deadline:
-            outcome = timed_out(state, run, step, now)
-    return outcome
 
 
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:

@@ -41,7 +41,50 @@ _TITLES: Final[Mapping[type[Step], str]] = {
 _AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
 
 
-def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
+# --- execution --------------------------------------------------------------------------------
+
+
+def begin(state: MasterState, run: Run, step: Step, now: float) -> bool:
+    """Begin the current step, unless it has begun; return False if it must wait."""
+    if run.begun:
+        return True
+    if now < run.retry_at or _is_expected(state, run, step):
+        return False
+    run.begun, run.answer, run.bad_result = True, None, False
+    run.deadline = now + max(step.timeout, 0.0)
+    _give_order(state, run, step, now)
+    return True
+
+
+def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
+    """Return True if a host that the step needs has not returned since the master started.
+
+    The step waits for it until its lease ends; then the step begins, and its own time-out decides.
+    """
+    if isinstance(step, Commit):
+        return False
+    if not isinstance(step, Configure):
+        concerned = [state.hosts.by_name[step.host]]
+    else:
+        both = (run.source.number, run.destination.number) if step.awaited else ()
+        concerned = [state.instances[one].host for one in both if one in state.instances]
+    return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
+
+
+def outcome_of(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
+    """Return the outcome of the current step; repeat its order or end it at its time-out."""
+    outcome = _outcome(step, state, run, now)
+    if outcome is StepProgress.PENDING:
+        _give_order_again(state, run, step, now)
+        if now >= run.deadline:
+            outcome = _timed_out(state, run, step, now)
+    return outcome
+
+
+# --- orders -----------------------------------------------------------------------------------
+
+
+def _give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
     """Send the order of a step to its slave, or in a handoff to the nodes themselves."""
     run.order = None
     if isinstance(step, Commit | AwaitReady | AwaitReleased):
@@ -80,7 +123,8 @@ def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
 def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
     """Note the answer to the order of the current step of a migration.
 
-    The result of an executor is kept for those of later steps.
+    The result of an executor is kept for those of later steps. The start of a standby is repeated
+    whatever the answer.
     """
     run = state.runs.get(process)
     if run is None or run.order != event.order or event.code == "timeout":
@@ -132,7 +176,7 @@ def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
     return bool(others)
 
 
-def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
+def _give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
     """Repeat the order for a start, a stop or a restart policy, because orders may be lost.
 
     A second order does no harm. A start that another instance delayed is ordered as soon as that
@@ -143,7 +187,7 @@ def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> No
     elif isinstance(step, Execute | AwaitReady | AwaitReleased | Commit):
         return
     elif _has_waited(run, step) or now - run.order_at >= state.settings.order_retry:
-        give_order(state, run, step, now)
+        _give_order(state, run, step, now)
 
 
 def _has_waited(run: Run, step: Step) -> bool:
@@ -151,8 +195,11 @@ def _has_waited(run: Run, step: Step) -> bool:
     return isinstance(step, Start) and step.instance.number not in run.launched
 
 
-def timed_out(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
-    """Return the outcome of a step after its time-out, as `outcome_of` does."""
+# --- outcomes ---------------------------------------------------------------------------------
+
+
+def _timed_out(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
+    """Return the outcome of a step after its time-out, as `_outcome` does."""
     if isinstance(step, Configure):
         return handoff.timed_out(state, run, step, now)
     if isinstance(step, AwaitReleased):
@@ -161,12 +208,12 @@ def timed_out(state: MasterState, run: Run, step: Step, now: float) -> StepOutco
 
 
 @singledispatch
-def outcome_of(step: Any, state: MasterState, run: Run, now: float) -> StepOutcome:
+def _outcome(step: Any, state: MasterState, run: Run, now: float) -> StepOutcome:
     """Return the outcome of the current step."""
     raise TypeError(step)
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: Start, state: MasterState, run: Run, now: float) -> StepOutcome:
     if step.instance.number in run.ended:
         return StepFailed(f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}")
@@ -178,7 +225,7 @@ def _(step: Start, state: MasterState, run: Run, now: float) -> StepOutcome:
     return done_if(instance.runs)
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> StepOutcome:
     instance = state.instances.get(step.instance.number)
     if instance is None:
@@ -187,22 +234,22 @@ def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> StepOutcome
     return done_if(settled)
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> StepOutcome:
     return done_if(handoff.is_released(state, run, step.instance))
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: Stop, state: MasterState, run: Run, now: float) -> StepOutcome:
     return done_if(step.instance.number not in state.instances)
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: Configure, state: MasterState, run: Run, now: float) -> StepOutcome:
     return handoff.outcome(step, state, run)
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: SetRestart, state: MasterState, run: Run, now: float) -> StepOutcome:
     if step.instance.number not in state.instances:
         return StepProgress.DONE  # it has ended: there is nothing to restart
@@ -215,12 +262,12 @@ def _(step: SetRestart, state: MasterState, run: Run, now: float) -> StepOutcome
     return StepFailed(f"{step.host} did not change {what}: {message}")
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: Commit, state: MasterState, run: Run, now: float) -> StepOutcome:
     return StepProgress.DONE
 
 
-@outcome_of.register
+@_outcome.register
 def _(step: Execute, state: MasterState, run: Run, now: float) -> StepOutcome:
     if run.answer is None:
         away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
