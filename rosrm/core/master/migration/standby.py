@@ -1,7 +1,7 @@
 """Standbys: a second instance on another host follows the state of a process.
 
 A standby is the destination of a migration that `executor` carries out up to the SWITCH step, where
-it is paused. `failover` handles the end of the primary: the migration goes on.
+it is paused. `failover` resumes the migration when the primary has ended.
 
 ======================  =====================================================================
 the process             action on its standby

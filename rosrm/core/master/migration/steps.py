@@ -81,6 +81,22 @@ def outcome_of(state: MasterState, run: Run, step: Step, now: float) -> StepOutc
     return outcome
 
 
+def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
+    """Note the answer to the order of the current step of a migration.
+
+    The result of an executor is kept for those of later steps. The start of a standby is repeated
+    whatever the answer.
+    """
+    run = state.runs.get(process)
+    if run is None or run.order != event.order or event.code == "timeout":
+        return
+    run.answer = (event.accepted, event.message or event.code)
+    run.bad_result = event.code == BAD_RESULT
+    step = run.step_in_hand
+    if event.accepted and event.result and isinstance(step, Execute):
+        run.results[step.executor] = event.result
+
+
 # --- orders -----------------------------------------------------------------------------------
 
 
@@ -118,22 +134,6 @@ def _order_of(
 
 def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
     return {**step.arguments, "results": run.results} if run.results else step.arguments
-
-
-def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
-    """Note the answer to the order of the current step of a migration.
-
-    The result of an executor is kept for those of later steps. The start of a standby is repeated
-    whatever the answer.
-    """
-    run = state.runs.get(process)
-    if run is None or run.order != event.order or event.code == "timeout":
-        return
-    run.answer = (event.accepted, event.message or event.code)
-    run.bad_result = event.code == BAD_RESULT
-    step = run.step_in_hand
-    if event.accepted and event.result and isinstance(step, Execute):
-        run.results[step.executor] = event.result
 
 
 def _start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> StartInstance:
