@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from typing import Final, Literal
+from typing import Final
 
 from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 
@@ -16,18 +16,12 @@ FAILED: Final = "failed"
 REFUSED: Final = "refused"
 FENCED: Final = "fenced"
 WITHDRAWN: Final = "withdrawn"
-Phase = Literal[
-    "starting", "running", "backoff", "stopping", "exited", "failed", "refused", "fenced",
-    "withdrawn",
-]  # fmt: skip
-ENDED: Final = frozenset[Phase]({EXITED, FAILED, REFUSED, FENCED, WITHDRAWN})
+ENDED: Final = frozenset({EXITED, FAILED, REFUSED, FENCED, WITHDRAWN})
 
 #: Next action for a stopping instance once no process of it is left.
 THEN_END: Final = "end"
 THEN_RESTART: Final = "restart"
 THEN_POLICY: Final = "policy"
-#: "": no stop is under way.
-Then = Literal["", "end", "restart", "policy"]
 
 STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 _KILL: Final = len(STEPS) - 1
@@ -99,8 +93,8 @@ class Instance:
         self.fenced = ""
         self.kill_by: float | None = None
         self.withdrawn = False
-        self.phase: Phase = STARTING
-        self.then: Then = ""
+        self.phase = STARTING
+        self.then = ""
         self.pid = 0
         self.exit_code = 0
         self.exit_signal = 0
@@ -131,7 +125,7 @@ class Instance:
         return self.heard + self.fence.after
 
 
-def end(instance: Instance, phase: Phase, message: str) -> None:
+def end(instance: Instance, phase: str, message: str) -> None:
     """Set an instance to ended."""
     instance.phase = phase
     instance.then = ""

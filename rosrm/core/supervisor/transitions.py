@@ -39,7 +39,6 @@ from rosrm.core.supervisor.instance import (
     THEN_RESTART,
     WITHDRAWN,
     Instance,
-    Then,
     end,
     ending,
     stopping,
@@ -258,7 +257,7 @@ def _start_again(instance: Instance) -> list[Command]:
     return [Tell(instance.key), Spawn(instance.key)]
 
 
-def _begin_stop(instance: Instance, then: Then, now: float, first: int = 0) -> list[Command]:
+def _begin_stop(instance: Instance, then: str, now: float, first: int = 0) -> list[Command]:
     """Begin a stop with the step `first`."""
     instance.phase = STOPPING
     instance.then = then
