@@ -61,6 +61,8 @@ _ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
         ReportInstances: "report",
     }
 )
+#: Bits of an order's number to its series, in the records of rosrm 0.1.0.
+_SERIES_OF_0_1_0: Final = MappingProxyType({41: "replication", 42: "capability", 43: "periodic"})
 _KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {kind.__name__: kind for kind in get_args(happened.Event)}
 )
@@ -106,10 +108,19 @@ def decode(kind: FrameKind, content: bytes) -> Happened:
         if kind is FrameKind.USAGES:
             return Happened(now, wall, _decoded_usages(rest))
         plain = json.loads(rest)
-        event: happened.Event = from_plain(_KINDS[plain.pop("kind")], plain)
+        kind_of_event = _KINDS[plain.pop("kind")]
+        if kind_of_event is happened.OrderAnswered:
+            plain["order"] = _order_id(plain["order"])
+        event: happened.Event = from_plain(kind_of_event, plain)
     except (struct.error, KeyError, TypeError, AttributeError) as fault:
         raise ValueError(f"{type(fault).__name__}: {fault}") from None
     return Happened(now, wall, event)
+
+
+def _order_id(plain: Any) -> Any:
+    """Return the id of an order; rosrm 0.1.0 wrote those of a series as one large number."""
+    series = _SERIES_OF_0_1_0.get(plain.bit_length()) if isinstance(plain, int) else None
+    return plain if series is None else [series, plain - (1 << plain.bit_length() - 1)]
 
 
 def _encoded_readings(event: happened.ReadingsReceived) -> bytes:
