@@ -19,10 +19,10 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    Order,
     PublishStateConfig,
     Redeliver,
     Reply,
+    SendOrder,
     Withdraw,
 )
 from rosrm.core.master.master_state import MasterState
@@ -381,7 +381,7 @@ class MasterRuntime:
         for command in commands:
             if isinstance(command, Assign):
                 endpoint.assign(command)
-            elif isinstance(command, Order):
+            elif isinstance(command, SendOrder):
                 endpoint.order(command, now)
             elif isinstance(command, PublishStateConfig):
                 endpoint.handoffs.publish(command)

@@ -18,9 +18,11 @@ import numpy as np
 
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import reducer as core
+from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
+from rosrm.model.orders import RunExecutor, SetRestartPolicy
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
@@ -397,10 +399,10 @@ class SlaveRuntime:
         """Return all snapshots on this host."""
         return self._keeping.states()
 
-    def set_restart(self, instance: InstanceId, restart: RestartPolicy, settled: Settled) -> None:
+    def set_restart(self, order: SetRestartPolicy, settled: Settled) -> None:
         """Set the restart policy of an instance; call `settled` when the supervisor recorded it."""
-        self._unsettled.setdefault((instance, restart), []).append(settled)
-        self.take(core.RestartPolicySet(instance, restart))
+        self._unsettled.setdefault((order.instance, order.restart), []).append(settled)
+        self.take(event_of(order))
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
         """Replicate the snapshots of an instance to these hosts from now on."""
@@ -438,12 +440,13 @@ class SlaveRuntime:
             return InstanceId(process, max(held))
         return newest_instance(self._supervisor.state, process)
 
-    def execute(self, executor: str, arguments: dict[str, Any], timeout: float, done: Done) -> None:
+    def execute(self, order: RunExecutor, done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""
         held = self._state.held.items()
         pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
         here = Here(self._config.host, self._config.state, pids)
-        self._executors.execute(executor, arguments, timeout, here=here, done=done)
+        arguments = dict(order.arguments)
+        self._executors.execute(order.executor, arguments, order.timeout, here=here, done=done)
 
 
 def _random_number() -> int:

@@ -17,7 +17,7 @@ from typing import Final
 
 from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Assign, Order, Redeliver, Reply, Withdraw
+from rosrm.core.master.commands import Assign, Redeliver, Reply, SendOrder, Withdraw
 from rosrm.ros import names, qos
 from rosrm.ros.master.handoff import HandoffEndpoint
 from rosrm.ros.master.services import Identity, MasterServices, Queries
@@ -139,7 +139,7 @@ class MasterEndpoint:
         """Order the start of an assignment that was fetched already."""
         self._links.redeliver(command, now)
 
-    def order(self, command: Order, now: float) -> None:
+    def order(self, command: SendOrder, now: float) -> None:
         """Send an order to a slave; the answer, or its absence in time, becomes an event."""
         self._links.order(command, now)
 

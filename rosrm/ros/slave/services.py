@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from rosrm.core.slave import reducer as core
+from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
-from rosrm.model.values import InstanceId, InstanceStatus, KeptState, RestartPolicy
-from rosrm.ros import convert, names
+from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
+from rosrm.model.values import InstanceId, InstanceStatus, KeptState
+from rosrm.ros import names
 from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
+from rosrm.ros.orders import order_from_msg
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm_msgs import srv
 
@@ -55,9 +58,7 @@ class Host(Protocol):
     def read_log(self, query: LogQuery) -> LogSlice:
         """Return a part of a log; raises `Refused`."""
 
-    def set_restart(
-        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
-    ) -> None:
+    def set_restart(self, order: SetRestartPolicy, settled: Callable[[str], None]) -> None:
         """Replace the restart policy of an instance.
 
         Args:
@@ -65,13 +66,10 @@ class Host(Protocol):
                 process is killed, else with the reason why there is no such instance.
         """
 
-    def execute(
-        self, executor: str, arguments: dict[str, Any], timeout: float,
-        done: Callable[[str, str, str], None],
-    ) -> None:  # fmt: skip
+    def execute(self, order: RunExecutor, done: Callable[[str, str, str], None]) -> None:
         """Run an executor; `done(code, message, result)` is called in the loop's thread.
 
-        The code is "" after a success. If the executor takes longer than `timeout` seconds, its
+        The code is "" after a success. If the executor takes longer than the order allows, its
         strategy counts as failing.
         """
 
@@ -106,47 +104,40 @@ class SlaveServices:
         participant.serve(srv.ReadLog, path.of_host(name, names.READ_LOG), self._take_log)
 
     def _take_order(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        kind = srv.ControlHost.Request
+        """Carry out an order; the outcomes of executors and restart policies come later."""
         try:
-            if request.action == kind.EXECUTE:
-                self._execute(request, respond)
-                return
-            if request.action == kind.SET_RESTART:
-                self._set_restart(request, respond)
-                return
-            if request.action in (kind.KEEP, kind.DROP_KEPT):
-                self._keep_or_drop(request)
-            else:
-                self._host.take(_ordered(request))
+            order = order_from_msg(request)
+            match order:
+                case RunExecutor():
+                    self._execute(order, respond)
+                    return
+                case SetRestartPolicy():
+                    self._set_restart(order, respond)
+                    return
+                case ReplicateSnapshot(instance, hosts, every):
+                    self._host.keep(instance, hosts, every)
+                case DropReplica(instance):
+                    self._host.drop_kept(instance)
+                case _:
+                    self._host.take(event_of(order, request.envelope.receiver_beat / 1e9))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
 
-    def _keep_or_drop(self, request: srv.ControlHost.Request) -> None:
-        instance = convert.instance_from_msg(request.instance)
-        if request.action == request.KEEP:
-            self._host.keep(instance, tuple(request.keep_on), request.keep_every)
-        else:
-            self._host.drop_kept(instance)
-
-    def _set_restart(
-        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
-    ) -> None:
+    def _set_restart(self, order: SetRestartPolicy, respond: Callable[[Any], None]) -> None:
         def settled(refusal: str) -> None:
             answer = refused("unknown", refusal) if refusal else accepted()
             respond(srv.ControlHost.Response(answer=answer))
 
-        restart = convert.restart_from_msg(request.restart)
-        self._host.set_restart(convert.instance_from_msg(request.instance), restart, settled)
+        self._host.set_restart(order, settled)
 
-    def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
+    def _execute(self, order: RunExecutor, respond: Callable[[Any], None]) -> None:
         def done(code: str, message: str, result: str) -> None:
             answer = refused(code, message) if code else accepted()
             respond(srv.ControlHost.Response(answer=answer, result=result))
 
-        arguments = convert.json_object(request.arguments, "the arguments of an executor")
-        self._host.execute(request.executor, arguments, request.timeout, done)
+        self._host.execute(order, done)
 
     def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "a reader of logs")
@@ -173,23 +164,3 @@ class SlaveServices:
                 mark_pids=[mark[2] for mark in part.marks],
             )
         )  # fmt: skip
-
-
-def _ordered(request: srv.ControlHost.Request) -> core.Event:
-    """Return the core event of an order; raises `Refused`."""
-    kind = srv.ControlHost.Request
-    if request.action == kind.START:
-        given_at = request.envelope.receiver_beat / 1e9
-        return core.AssignmentsReceived(
-            (convert.assignment_from_msg(request.assignment),), given_at
-        )
-    instance = convert.instance_from_msg(request.instance)
-    orders: dict[int, core.Event] = {
-        kind.STOP: core.StopOrdered(instance),
-        kind.FENCE: core.FenceOrdered(instance),
-        kind.RESTART: core.RestartOrdered(instance),
-        kind.REPORT: core.ReportRequested(),
-    }
-    if request.action not in orders:
-        raise Refused(f"unknown action {request.action}")
-    return orders[request.action]
