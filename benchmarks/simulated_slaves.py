@@ -33,7 +33,15 @@ import numpy.typing as npt
 
 from benchmarks.machine import say
 from benchmarks.shared_participant import Berth, SharedParticipant, Tally
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, reducer
+from rosrm.core.slave.events import (
+    AssignmentsReceived,
+    Event,
+    MasterLost,
+    SupervisorReported,
+    TimePassed,
+)
+from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused, RosrmError
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import (
@@ -103,8 +111,8 @@ class SimulatedSlave:
     def __init__(self, berth: Berth, name: str, period: float, tally: Tally) -> None:
         self.name = name
         self._tally = tally
-        self._state = core.SlaveState()
-        self._events: list[core.Event] = []
+        self._state = SlaveState()
+        self._events: list[Event] = []
         resources = tuple(ResourceDescription(*one) for one in _RESOURCES)
         description = HostDescription(
             name, int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
@@ -122,21 +130,21 @@ class SimulatedSlave:
     ) -> None:
         """Do a slave's work of one period of `resource_info`."""
         self.endpoint.go_on(now)
-        accepting = core.under_limits(usage, limit, _PRESENT, 0)
+        accepting = under_limits(usage, limit, _PRESENT, 0)
         self.endpoint.publish_reading(
             usage, limit, _PRESENT, 0, accepting=accepting, processes=self._state.live()
         )
-        self._events.append(core.TimePassed())
+        self._events.append(TimePassed())
         self.work(now)
 
     def work(self, now: float) -> None:
         """Process the queued events; report each launched process as running, then as ended."""
         while self._events:
             events, self._events = self._events, []
-            for command in core.step_all(self._state, events, now):
-                if isinstance(command, core.Report):
+            for command in reducer.step_all(self._state, events, now):
+                if isinstance(command, commands.Report):
                     self.endpoint.publish_statuses(command.statuses, complete=command.complete)
-                elif isinstance(command, core.Launch):
+                elif isinstance(command, commands.Launch):
                     self._run([one.instance for one in command.assignments])
         self.endpoint.ask(now)
 
@@ -145,15 +153,15 @@ class SimulatedSlave:
             self._tally.taken[instance.process] = time.time()
             for state in (InstanceState.RUNNING, InstanceState.EXITED):
                 status = InstanceStatus(instance, state, pid=os.getpid())
-                self._events.append(core.SupervisorReported((status,)))
+                self._events.append(SupervisorReported((status,)))
 
     # --- callbacks of the endpoint --------------------------------------------------------
 
-    def take(self, event: core.Event) -> None:
+    def take(self, event: Event) -> None:
         """Queue an event; process assignments at once, as a slave's loop does."""
         self._events.append(event)
-        self._tally.lost += isinstance(event, core.MasterLost)
-        if isinstance(event, core.AssignmentsReceived):
+        self._tally.lost += isinstance(event, MasterLost)
+        if isinstance(event, AssignmentsReceived):
             self.work(time.monotonic())
 
     def statuses(self) -> Sequence[InstanceStatus]:

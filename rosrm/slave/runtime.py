@@ -17,7 +17,10 @@ from typing import Any, Final
 import numpy as np
 
 from rosrm.config.settings import HostConfig
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, reducer
+from rosrm.core.slave.events import Event, Registered, RestartPolicySet, TimePassed
+from rosrm.core.slave.health import LOOK_PERIOD
+from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
@@ -88,10 +91,10 @@ class SlaveRuntime:
         self._stopping = ""
         self._accepting = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
-        self._state = core.SlaveState(
+        self._state = SlaveState(
             max_processes=config.max_processes, max_starting=config.max_starting, max_age=max_age
         )
-        self._events: deque[core.Event] = deque()
+        self._events: deque[Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
         self._executors = Executors(
@@ -245,13 +248,13 @@ class SlaveRuntime:
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
                 self._usage.look(now)
-                self.take(core.TimePassed())  # `_cycle` may be rare, and fences need this
+                self.take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
                 self._starter.look_at_graph(awaited)
             if now >= next_health:
-                next_health = now + core.LOOK_PERIOD
+                next_health = now + LOOK_PERIOD
                 self._events.extend(self._health.look(self._state.watched(), now))
             searches = self._endpoint.link is Link.SEARCHING and not self._ending.has_begun
             if searches and now - told >= _PATIENCE_TOLD:
@@ -283,14 +286,14 @@ class SlaveRuntime:
             self._note_probes(sample.reports)
             self._endpoint.publish_statuses((), complete=False)
         present = self._sampler.present
-        under = core.under_limits(sample.usage, self._limit, present, sample.stale)
+        under = under_limits(sample.usage, self._limit, present, sample.stale)
         self._accepting = under and not (self._stopping or self._ending.has_begun)
         self._endpoint.publish_reading(
             sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),
         )  # fmt: skip
         self._say_usage()
-        self.take(core.TimePassed())
+        self.take(TimePassed())
 
     def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
         """Log which readings became stale or fresh again, and report that to the master."""
@@ -323,10 +326,10 @@ class SlaveRuntime:
 
     # --- core and supervisor -------------------------------------------------------------
 
-    def take(self, event: core.Event) -> None:
+    def take(self, event: Event) -> None:
         """Queue an event for the core."""
         self._events.append(event)
-        if isinstance(event, core.Registered):
+        if isinstance(event, Registered):
             self._keeping.say_again()
             if self._endpoint.failing:
                 self._endpoint.publish_statuses((), complete=False)
@@ -344,33 +347,33 @@ class SlaveRuntime:
             events = list(self._events)
             self._events.clear()
             reported: list[InstanceStatus] = []
-            for command in core.step_all(self._state, events, now):
-                if isinstance(command, core.Report) and not command.complete:
+            for command in reducer.step_all(self._state, events, now):
+                if isinstance(command, commands.Report) and not command.complete:
                     reported += command.statuses
                 else:
                     self._carry_out(command)
             if reported:
                 self._endpoint.publish_statuses(reported, complete=False)
 
-    def _carry_out(self, command: core.Command) -> None:
-        if isinstance(command, core.Launch):
+    def _carry_out(self, command: commands.Command) -> None:
+        if isinstance(command, commands.Launch):
             if not self._ending.keeps:  # the master expects no new start
                 self._starter.launch(command.assignments)
-        elif isinstance(command, core.Report):
+        elif isinstance(command, commands.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
-        elif isinstance(command, core.Settle):
+        elif isinstance(command, commands.Settle):
             for settled in self._unsettled.pop((command.instance, command.restart), []):
                 settled(command.refusal)
         else:
             self._have_supervisor(command)
 
-    def _have_supervisor(self, command: core.Command) -> None:
+    def _have_supervisor(self, command: commands.Command) -> None:
         """Send a command to the supervisor, unless the instance still waits for its start."""
         if self._starter.call_off(command):
             return
-        if isinstance(command, core.Fail):
+        if isinstance(command, commands.Fail):
             self.say(f"{command.instance} is {command.reason}")
-        if isinstance(command, core.Restart):  # on request of a user
+        if isinstance(command, commands.Restart):  # on request of a user
             self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
 
@@ -400,7 +403,7 @@ class SlaveRuntime:
     def set_restart(self, instance: InstanceId, restart: RestartPolicy, settled: Settled) -> None:
         """Set the restart policy of an instance; call `settled` when the supervisor recorded it."""
         self._unsettled.setdefault((instance, restart), []).append(settled)
-        self.take(core.RestartPolicySet(instance, restart))
+        self.take(RestartPolicySet(instance, restart))
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
         """Replicate the snapshots of an instance to these hosts from now on."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from rosrm.config.settings import HostConfig
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import InstanceState, InstanceStatus, StopPolicy
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.slave.launch.starter import Starter
@@ -46,7 +46,7 @@ class Ending:
     """
 
     config: HostConfig
-    state: core.SlaveState
+    state: SlaveState
     starter: Starter
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.config.settings import LogSettings
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, events
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.launch.environment import SHADOW
@@ -58,7 +58,7 @@ class SupervisorLink:
 
     def __init__(
         self, state: Path, logs: LogSettings, *, post: Callable[[Callable[[], None]], None],
-        take: Callable[[core.Event], None], follow: Callable[[InstanceStatus], None],
+        take: Callable[[events.Event], None], follow: Callable[[InstanceStatus], None],
         say: Callable[[str], None], ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.state = state
@@ -91,7 +91,7 @@ class SupervisorLink:
             self._client.start(orders)
         self._say_if_it_waits()
 
-    def carry_out(self, command: core.Command) -> None:
+    def carry_out(self, command: commands.Command) -> None:
         """Send a command of the core."""
         with contextlib.suppress(SupervisorGone):
             self._tell(command)
@@ -106,25 +106,25 @@ class SupervisorLink:
             )
         self._told_waits = waits > _TOLD_AFTER
 
-    def _tell(self, command: core.Command) -> None:
+    def _tell(self, command: commands.Command) -> None:
         client = self._client
-        if isinstance(command, core.Stop | core.Fence):
+        if isinstance(command, commands.Stop | commands.Fence):
             self._unanswered.pop(command.instance, None)
-        if isinstance(command, core.Stop):
+        if isinstance(command, commands.Stop):
             client.stop(command.instance)
-        elif isinstance(command, core.Fence):
+        elif isinstance(command, commands.Fence):
             client.fence(command.instance)
-        elif isinstance(command, core.Restart):
+        elif isinstance(command, commands.Restart):
             client.restart(command.instance)
-        elif isinstance(command, core.Renew):
+        elif isinstance(command, commands.Renew):
             client.heard(command.at, command.alive)
-        elif isinstance(command, core.Fail):
+        elif isinstance(command, commands.Fail):
             client.fail(command.instance, command.pid, command.reason, kill=command.kill)
-        elif isinstance(command, core.Amend):
+        elif isinstance(command, commands.Amend):
             client.amend(command.instance, command.restart, {SHADOW: None})
-        elif isinstance(command, core.Remember):
+        elif isinstance(command, commands.Remember):
             client.remember(command.instance, to_memo(command.memo))
-        elif isinstance(command, core.Forget):
+        elif isinstance(command, commands.Forget):
             client.forget(command.instances)
         else:
             raise TypeError(command)
@@ -184,10 +184,10 @@ class SupervisorLink:
         for status in statuses:
             self._unanswered.pop(status.instance, None)
             self._follow(status)
-        self._take(core.SupervisorReported(statuses))
+        self._take(events.SupervisorReported(statuses))
         for one in told:
             if isinstance(one, Amended):
-                self._take(core.RestartPolicyRecorded(one.instance, one.restart))
+                self._take(events.RestartPolicyRecorded(one.instance, one.restart))
 
     def take_over(self) -> int:
         """Re-adopt the supervisor's instances; instances unknown to the supervisor do not run.
@@ -203,7 +203,7 @@ class SupervisorLink:
         found = {one: from_memo(memo) for one, memo in client.memos.items()}
         memos = {one: memo for one, memo in found.items() if memo is not None}
         statuses = [*client.instances, *self._launch_again(client)]
-        self._take(core.SupervisorReplaced(tuple(statuses), memos, client.fenced))
+        self._take(events.SupervisorReplaced(tuple(statuses), memos, client.fenced))
         return len(client.instances)
 
     def _launch_again(self, client: SupervisorClient) -> list[InstanceStatus]:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rosrm.core.supervisor.reducer import (
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,

@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from rclpy.duration import Duration
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import events
+from rosrm.core.slave.master_clock import BeatClock
 from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.values import HostDescription, InstanceStatus, KeptState
@@ -93,7 +94,7 @@ class SlaveEndpoint:
         self._greeting = srv.Handshake.Response()
         self._greeted_at = 0.0
         self._asked_at = 0.0
-        self._beat_clock = core.BeatClock()
+        self._beat_clock = BeatClock()
         self._newest_beat: msg.MasterBeat | None = None
         self._incarnation = 0  # of the master of this registration, complete or in progress
         self._registered_with = 0  # incarnation of the last master that accepted the registration
@@ -223,8 +224,8 @@ class SlaveEndpoint:
         self._poll_anew = _FIRST_POLL_ANEW
         self._reporter.begin(self.host_id, self._beat_period)
         self.link = Link.REGISTERED
-        self._host.take(core.MasterHears(self._asked_at))
-        self._host.take(core.Registered(answer.epoch, renumbers))
+        self._host.take(events.MasterHears(self._asked_at))
+        self._host.take(events.Registered(answer.epoch, renumbers))
         greeting = self._greeting
         self._host.say(
             f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "
@@ -264,7 +265,7 @@ class SlaveEndpoint:
         self._poll_at = 0.0
         self._newest_beat = None
         self._control.forget()
-        self._host.take(core.MasterLost())
+        self._host.take(events.MasterLost())
         self._host.say(reason)
 
     def _take_beat(self, beat: msg.MasterBeat) -> None:
@@ -280,7 +281,7 @@ class SlaveEndpoint:
         if self.link is Link.REGISTERED:
             self._seen.note(Seen(beat.journal, beat.incarnation, self.cluster))
         if self.link is Link.REGISTERED and self.host_id not in beat.unheard:
-            self._host.take(core.MasterHears(said_at))
+            self._host.take(events.MasterHears(said_at))
         if self.link is Link.LISTENING:
             self._register_if_known()
 
@@ -334,7 +335,7 @@ class SlaveEndpoint:
             self._host.say(f"an assignment that makes no sense was refused: {refusal}")
             return
         given_at = response.slave_beat / 1e9 if response.slave_beat else None
-        self._host.take(core.AssignmentsReceived(work, given_at))
+        self._host.take(events.AssignmentsReceived(work, given_at))
 
     # --- reports ---------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ from rclpy.qos import (
     qos_profile_services_default,
 )
 
-from rosrm.core.slave.reducer import Watch
+from rosrm.core.slave.watches import Watch
 from rosrm.ros.slave.graph import GraphWatch
 
 #: Seconds between two checks of the graph while a topic is subscribed.

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import events
 from rosrm.errors import Refused
 from rosrm.model.values import InstanceId, InstanceStatus, KeptState, RestartPolicy
 from rosrm.ros import convert, names
@@ -43,7 +43,7 @@ class LogSlice:
 class Host(Protocol):
     """Interface of the slave's runtime for its endpoint."""
 
-    def take(self, event: core.Event) -> None:
+    def take(self, event: events.Event) -> None:
         """Handle an event."""
 
     def statuses(self) -> Sequence[InstanceStatus]:
@@ -175,20 +175,20 @@ class SlaveServices:
         )  # fmt: skip
 
 
-def _ordered(request: srv.ControlHost.Request) -> core.Event:
+def _ordered(request: srv.ControlHost.Request) -> events.Event:
     """Return the core event of an order; raises `Refused`."""
     kind = srv.ControlHost.Request
     if request.action == kind.START:
         given_at = request.envelope.receiver_beat / 1e9
-        return core.AssignmentsReceived(
+        return events.AssignmentsReceived(
             (convert.assignment_from_msg(request.assignment),), given_at
         )
     instance = convert.instance_from_msg(request.instance)
-    orders: dict[int, core.Event] = {
-        kind.STOP: core.StopOrdered(instance),
-        kind.FENCE: core.FenceOrdered(instance),
-        kind.RESTART: core.RestartOrdered(instance),
-        kind.REPORT: core.ReportRequested(),
+    orders: dict[int, events.Event] = {
+        kind.STOP: events.StopOrdered(instance),
+        kind.FENCE: events.FenceOrdered(instance),
+        kind.RESTART: events.RestartOrdered(instance),
+        kind.REPORT: events.ReportRequested(),
     }
     if request.action not in orders:
         raise Refused(f"unknown action {request.action}")

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from rosrm.config.settings import LogSettings
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, events
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.supervisor import send_buffer
@@ -29,7 +29,7 @@ class Loop:
 
     def __init__(self, host) -> None:
         self.posted: queue.Queue = queue.Queue()
-        self.events: list[core.Event] = []
+        self.events: list[events.Event] = []
         self.said: list[str] = []
         self.ended: list[str] = []
         self.host = host
@@ -56,11 +56,11 @@ class Loop:
             except queue.Empty:
                 continue
 
-    def replaced(self) -> list[core.SupervisorReplaced]:
-        return [one for one in self.events if isinstance(one, core.SupervisorReplaced)]
+    def replaced(self) -> list[events.SupervisorReplaced]:
+        return [one for one in self.events if isinstance(one, events.SupervisorReplaced)]
 
     def started(self) -> set[InstanceId]:
-        told = [one for one in self.events if isinstance(one, core.SupervisorReported)]
+        told = [one for one in self.events if isinstance(one, events.SupervisorReported)]
         return {status.instance for one in told for status in one.statuses if status.pid}
 
     def start_many(self) -> None:
@@ -96,7 +96,7 @@ def test_a_killed_supervisor_is_replaced_without_the_loop(loop, monkeypatch) -> 
     assert loop.said[-1] == f"a new supervisor (pid {next_pid}) manages 1 process"
     assert by
     assert threading.current_thread() not in by
-    loop.link.carry_out(core.Stop(InstanceId("one", 1)))
+    loop.link.carry_out(commands.Stop(InstanceId("one", 1)))
     loop.wait(lambda: not loop.host.alive(), "the next one takes orders")
 
 
@@ -119,8 +119,8 @@ def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
     """Orders beyond the socket's buffer do not block the loop, and all arrive in order."""
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
-    loop.link.carry_out(core.Fence(MANY[-1]))
-    loop.link.carry_out(core.Renew(time.monotonic(), time.monotonic()))
+    loop.link.carry_out(commands.Fence(MANY[-1]))
+    loop.link.carry_out(commands.Renew(time.monotonic(), time.monotonic()))
     os.kill(loop.pid, signal.SIGCONT)
     loop.wait(lambda: loop.started() >= set(MANY[:-1]), "all of them run")
     loop.wait(lambda: len(loop.host.alive()) == COUNT - 1, "the last one was fenced")
@@ -149,7 +149,7 @@ def test_a_launch_that_comes_between_two_supervisors_is_not_lost(loop) -> None:
     stopped = InstanceId("stopped", 1)
     loop.link.start([loop.host.order("one", "sleep", "1000")])
     loop.link.start([loop.host.order("stopped", "sleep", "1000")])
-    loop.link.carry_out(core.Stop(stopped))
+    loop.link.carry_out(commands.Stop(stopped))
     loop.wait(lambda: len(loop.replaced()) == 2, "another one has taken over")
     loop.supervisor()
     (status,) = loop.replaced()[1].statuses

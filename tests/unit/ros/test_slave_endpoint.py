@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import events
 from rosrm.model.values import HostDescription
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.slave import endpoint
@@ -105,7 +105,7 @@ class Host:
         return ()
 
     def take(self, event) -> None:
-        if isinstance(event, core.MasterHears):
+        if isinstance(event, events.MasterHears):
             self.heard.append(event.at)
         else:
             self.events.append(event)
@@ -203,7 +203,7 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     slave.pass_time(2.0, old)
     assert slave.link is Link.REGISTERED
     slave.pass_time(1.0, new)
-    assert core.MasterLost() in slave.host.events
+    assert events.MasterLost() in slave.host.events
     assert slave.link is Link.GREETING
 
     new.greet()
@@ -211,7 +211,7 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     new.take_in()
     asked = len(slave.sent(srv.RequestProcess))
     slave.pass_time(PERIOD, new)
-    assert slave.host.events[-1] == core.Registered(epoch, renumbers=epoch <= 2)
+    assert slave.host.events[-1] == events.Registered(epoch, renumbers=epoch <= 2)
     assert len(slave.sent(srv.RegisterHost)) == 2
     assert len(slave.sent(srv.RequestProcess)) == asked + 1
     assert slave.newest(srv.RequestProcess).request.envelope.epoch == epoch
@@ -239,7 +239,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     assert slave.link is Link.GREETING
     new.greet()
     new.take_in()
-    assert slave.host.events[-1] == core.Registered(1, renumbers=True)
+    assert slave.host.events[-1] == events.Registered(1, renumbers=True)
     slave.pass_time(5.0, new)
     assert slave.link is Link.REGISTERED
     assert len(slave.sent(srv.RegisterHost)) == 2
@@ -247,7 +247,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     slave.pass_time(PERIOD, new)
     new.greet()
     new.take_in()
-    assert slave.host.events[-1] == core.Registered(1, renumbers=False)
+    assert slave.host.events[-1] == events.Registered(1, renumbers=False)
 
 
 def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
@@ -305,7 +305,7 @@ def test_a_silent_master_is_lost(slave) -> None:
     assert slave.link is Link.REGISTERED
     slave.pass_time(0.6)
     assert slave.link is not Link.REGISTERED
-    assert core.MasterLost() in slave.host.events
+    assert events.MasterLost() in slave.host.events
 
 
 def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave) -> None:
@@ -355,12 +355,12 @@ def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
     first, second = slave.sent(srv.RequestProcess)
     answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True)
     first.answer(srv.RequestProcess.Response(answer=answer))
-    assert core.AssignmentsReceived((), None) in slave.host.events
+    assert events.AssignmentsReceived((), None) in slave.host.events
     slave.pass_time(PERIOD, master)
     assert len(slave.sent(srv.RequestProcess)) == 3  # the master keeps the newest of them open
     slave.pass_time(5.0, master)
     second.answer(srv.RequestProcess.Response(answer=answer))  # the slave has given it up by then
-    assert slave.host.events.count(core.AssignmentsReceived((), None)) == 1
+    assert slave.host.events.count(events.AssignmentsReceived((), None)) == 1
 
 
 def test_a_name_that_is_taken_is_said_at_once(slave) -> None:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave.state import Held, SlaveState
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, ProcessSpec, StopPolicy
 from rosrm.slave import shutdown
 from rosrm.slave.shutdown import Ending
@@ -25,7 +25,7 @@ class Slave:
             failure="", superseded=False, leave=lambda done, _kept: done(),
             wait_until_heard=lambda: None,
         )  # fmt: skip
-        self.state = core.SlaveState()
+        self.state = SlaveState()
         for name in "pq":
             self.report(name, InstanceState.RUNNING)
         self.ending = Ending(
@@ -45,7 +45,7 @@ class Slave:
     def report(self, name: str, state: InstanceState) -> None:
         instance = InstanceId(name, 1)
         spec = ProcessSpec(name, command=("sleep",), stop=STOP)
-        self.state.held[instance] = core.Held(InstanceStatus(instance, state), spec)
+        self.state.held[instance] = Held(InstanceStatus(instance, state), spec)
 
     def end(self) -> int:
         return self.ending.carry_out("SIGINT")
