@@ -25,8 +25,8 @@ import select
 import socket
 import sys
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import NoReturn, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -50,11 +50,11 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
-    KeptState,
     ResourceDescription,
-    RestartPolicy,
 )
-from rosrm.ros.slave.endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
+from rosrm.ros.participant import Participant
+from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
+from rosrm.ros.slave.services import Duties, SlaveServices
 from rosrm.testing.loopback import settings_on_this_machine
 
 #: Most seconds between two looks at standard input.
@@ -118,7 +118,10 @@ class SimulatedSlave:
             name, int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
             pid=os.getpid(), resources=resources, period=period,
         )  # fmt: skip
-        self.endpoint = SlaveEndpoint(berth, self, description, max_age=5.0)  # type: ignore[arg-type]
+        participant = cast("Participant", berth)
+        self.endpoint = SlaveEndpoint(participant, description, self._state, take=self.take)
+        duties = Duties(self.take, *[self._refuse] * 5)
+        SlaveServices(participant, duties, name, 5.0, lambda: self.endpoint.epoch)
 
     @property
     def registered(self) -> bool:
@@ -155,8 +158,6 @@ class SimulatedSlave:
                 status = InstanceStatus(instance, state, pid=os.getpid())
                 self._events.append(SupervisorReported((status,)))
 
-    # --- callbacks of the endpoint --------------------------------------------------------
-
     def take(self, event: Event) -> None:
         """Queue an event; process assignments at once, as a slave's loop does."""
         self._events.append(event)
@@ -164,34 +165,8 @@ class SimulatedSlave:
         if isinstance(event, AssignmentsReceived):
             self.work(time.monotonic())
 
-    def statuses(self) -> Sequence[InstanceStatus]:
-        """Return the statuses of all instances that this slave holds."""
-        return self._state.statuses()
-
-    def kept_states(self) -> Sequence[KeptState]:
-        """Return none: its processes have no state."""
-        return ()
-
-    # ruff: noqa: ARG002 - the endpoint passes these arguments in any case
-
-    def read_log(self, query: LogQuery) -> LogSlice:
-        """Refuse: there is no process, so no log."""
-        raise Refused(f"{self.name} is simulated: it has no logs", "unknown")
-
-    def set_restart(
-        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
-    ) -> None:
-        """Refuse: there is no process, so no policy."""
-        settled(f"{self.name} is simulated: {instance} does not run")
-
-    def execute(
-        self, executor: str, arguments: dict[str, Any], done: Callable[[str, str, str], None]
-    ) -> None:
-        """Refuse: there are no executors."""
-        raise Refused(f"{self.name} is simulated: it has no executor {executor!r}", "unknown")
-
-    def say(self, message: str) -> None:
-        """Drop a log line: thousands of slaves would flood the output."""
+    def _refuse(self, *_request: object) -> NoReturn:
+        raise Refused(f"{self.name} is simulated: it has no processes", "unknown")
 
 
 class Fleet:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from rosrm.errors import Refused
 from rosrm.model.values import InstanceId
-from rosrm.ros.slave.endpoint import LogQuery, LogSlice
+from rosrm.ros.slave.services import LogQuery, LogSlice
 from rosrm.supervisor import log_index
 from rosrm.supervisor.client import log_path, logged_instances, newest_log
 

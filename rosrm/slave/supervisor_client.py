@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -27,6 +28,8 @@ from rosrm.supervisor.client import (
 )
 from rosrm.wording import counted
 
+_log = logging.getLogger("rosrm.slave")
+
 #: Seconds for a new supervisor to be ready, or for a busy one to answer.
 _PATIENCE: Final = 30.0
 #: Seconds for which orders may wait before a message to the user.
@@ -48,7 +51,6 @@ class SupervisorLink:
         post: schedules a call in the loop; may be called from any thread.
         take: takes events for the core.
         follow: takes each new status of an instance.
-        say: logs a message for the user.
         ended: called once, when there is no supervisor any more, with the fault; "": the supervisor
             ended as requested.
 
@@ -59,12 +61,11 @@ class SupervisorLink:
     def __init__(
         self, state: Path, logs: LogSettings, *, post: Callable[[Callable[[], None]], None],
         take: Callable[[events.Event], None], follow: Callable[[InstanceStatus], None],
-        say: Callable[[str], None], ended: Callable[[str], None],
+        ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.state = state
         self._limits = LogLimits(logs.max_bytes, logs.keep)
-        self._post, self._take, self._follow = post, take, follow
-        self._say, self._ended = say, ended
+        self._post, self._take, self._follow, self._ended = post, take, follow, ended
         self._is_shutting_down = False
         self._is_closed = False
         self._told_waits = False
@@ -100,10 +101,11 @@ class SupervisorLink:
     def _say_if_it_waits(self) -> None:
         waits = self._client.waits
         if waits > _TOLD_AFTER and not self._told_waits:
-            self._say(
-                f"the supervisor (pid {self._client.pid}) has accepted no order for {waits:.0f} s: "
-                f"is it stopped? Orders wait until it continues"
-            )
+            _log.info(
+                "the supervisor (pid %d) has accepted no order for %.0f s: is it stopped? Orders "
+                "wait until it continues",
+                self._client.pid, waits,
+            )  # fmt: skip
         self._told_waits = waits > _TOLD_AFTER
 
     def _tell(self, command: commands.Command) -> None:
@@ -164,7 +166,7 @@ class SupervisorLink:
         except (SupervisorGone, SupervisorEnded) as gone:  # ended: by a SIGTERM to it alone
             if self._is_shutting_down or self._is_closed:
                 raise
-            self._post(partial(self._say, f"{gone}; connecting to the next one"))
+            _log.info("%s; connecting to the next one", gone)
 
     def _next(self) -> SupervisorClient:
         """Return a connection to the next supervisor, or to the same one if it was silent."""
@@ -176,7 +178,7 @@ class SupervisorLink:
                 if self._is_closed:
                     raise
                 if not told:
-                    self._post(partial(self._say, f"{silence}; waiting until it does"))
+                    _log.info("%s; waiting until it does", silence)
                 told = True
 
     def _take_told(self, told: Sequence[Told]) -> None:
@@ -197,7 +199,7 @@ class SupervisorLink:
         """
         client = self._client
         for note in client.notes:
-            self._say(note)
+            _log.info("%s", note)
         for status in client.instances:
             self._follow(status)
         found = {one: from_memo(memo) for one, memo in client.memos.items()}
@@ -226,7 +228,7 @@ class SupervisorLink:
         live = sum(not status.state.ended for status in client.instances) + len(self._unanswered)
         which = "the same" if client.pid == former.pid else "a new"
         manages = counted(live, "process", "processes")
-        self._say(f"{which} supervisor (pid {client.pid}) manages {manages}")
+        _log.info("%s supervisor (pid %d) manages %s", which, client.pid, manages)
         if self._is_shutting_down:  # the former one may have missed it
             self.shut_down()
 

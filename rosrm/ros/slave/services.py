@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from rosrm.core.slave import events
 from rosrm.errors import Refused
-from rosrm.model.values import InstanceId, InstanceStatus, KeptState, RestartPolicy
+from rosrm.model.values import InstanceId, RestartPolicy
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
 from rosrm.ros.participant import OpenRequest, Participant
@@ -40,49 +41,29 @@ class LogSlice:
     marks: Sequence[tuple[float, int, int]]
 
 
-class Host(Protocol):
-    """Interface of the slave's runtime for its endpoint."""
+@dataclass(frozen=True, slots=True)
+class Duties:
+    """Functions of a slave that execute requests; each is called in the loop's thread.
 
-    def take(self, event: events.Event) -> None:
-        """Handle an event."""
+    Attributes:
+        take: takes an event for the core.
+        set_restart: replaces the restart policy of an instance. It calls its last argument with ""
+            when the policy is durable, whichever process is killed, else with the reason why there
+            is no such instance.
+        keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
+        drop_kept: deletes the snapshots of a process, of instances up to this one.
+        execute: runs an executor with arguments and a time-out in seconds, after which its strategy
+            counts as failing. It calls its last argument with code, message and result as JSON; the
+            code is "" after a success.
+        read_log: returns a part of a log; raises `Refused`.
+    """
 
-    def statuses(self) -> Sequence[InstanceStatus]:
-        """Return the statuses of all instances on this host."""
-
-    def kept_states(self) -> Sequence[KeptState]:
-        """Return all snapshots that this host holds."""
-
-    def read_log(self, query: LogQuery) -> LogSlice:
-        """Return a part of a log; raises `Refused`."""
-
-    def set_restart(
-        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
-    ) -> None:
-        """Replace the restart policy of an instance.
-
-        Args:
-            settled: called in the loop's thread; with "" when the policy is durable, whichever
-                process is killed, else with the reason why there is no such instance.
-        """
-
-    def execute(
-        self, executor: str, arguments: dict[str, Any], timeout: float,
-        done: Callable[[str, str, str], None],
-    ) -> None:  # fmt: skip
-        """Run an executor; `done(code, message, result)` is called in the loop's thread.
-
-        The code is "" after a success. If the executor takes longer than `timeout` seconds, its
-        strategy counts as failing.
-        """
-
-    def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
-        """Replicate an instance's snapshot to these hosts from now on, every `every` seconds."""
-
-    def drop_kept(self, instance: InstanceId) -> None:
-        """Delete the snapshots of a process, of instances up to this one."""
-
-    def say(self, message: str) -> None:
-        """Show a message to the user."""
+    take: Callable[[events.Event], None]
+    set_restart: Callable[[InstanceId, RestartPolicy, Callable[[str], None]], None]
+    keep: Callable[[InstanceId, Sequence[str], float], None]
+    drop_kept: Callable[[InstanceId], None]
+    execute: Callable[[str, dict[str, Any], float, Callable[[str, str, str], None]], None]
+    read_log: Callable[[LogQuery], LogSlice]
 
 
 class SlaveServices:
@@ -90,20 +71,21 @@ class SlaveServices:
 
     Args:
         participant: offers the services.
-        host: carries out the requests.
-        name: of the host.
-        gate: admits or refuses every order.
+        duties: execute the requests.
+        host: name of the host.
+        max_age: seconds after which an order is stale.
         epoch: newest known epoch of the master; older orders are refused.
     """
 
     def __init__(
-        self, participant: Participant, host: Host, name: str, gate: Gate, epoch: Callable[[], int]
-    ) -> None:
-        self._host = host
+        self, participant: Participant, duties: Duties, host: str, max_age: float,
+        epoch: Callable[[], int],
+    ) -> None:  # fmt: skip
+        self._duties = duties
         path = names.Names(participant.settings.namespace)
-        server = ControlServer(participant, gate, epoch)
-        server.offer(srv.ControlHost, path.of_host(name, names.CONTROL), self._take_order)
-        participant.serve(srv.ReadLog, path.of_host(name, names.READ_LOG), self._take_log)
+        server = ControlServer(participant, Gate(time.monotonic_ns, max_age), epoch)
+        server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
+        participant.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
 
     def _take_order(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
         kind = srv.ControlHost.Request
@@ -117,7 +99,7 @@ class SlaveServices:
             if request.action in (kind.KEEP, kind.DROP_KEPT):
                 self._keep_or_drop(request)
             else:
-                self._host.take(_ordered(request))
+                self._duties.take(_ordered(request))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
@@ -126,9 +108,9 @@ class SlaveServices:
     def _keep_or_drop(self, request: srv.ControlHost.Request) -> None:
         instance = convert.instance_from_msg(request.instance)
         if request.action == request.KEEP:
-            self._host.keep(instance, tuple(request.keep_on), request.keep_every)
+            self._duties.keep(instance, tuple(request.keep_on), request.keep_every)
         else:
-            self._host.drop_kept(instance)
+            self._duties.drop_kept(instance)
 
     def _set_restart(
         self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
@@ -138,7 +120,7 @@ class SlaveServices:
             respond(srv.ControlHost.Response(answer=answer))
 
         restart = convert.restart_from_msg(request.restart)
-        self._host.set_restart(convert.instance_from_msg(request.instance), restart, settled)
+        self._duties.set_restart(convert.instance_from_msg(request.instance), restart, settled)
 
     def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
         def done(code: str, message: str, result: str) -> None:
@@ -146,7 +128,7 @@ class SlaveServices:
             respond(srv.ControlHost.Response(answer=answer, result=result))
 
         arguments = convert.json_object(request.arguments, "the arguments of an executor")
-        self._host.execute(request.executor, arguments, request.timeout, done)
+        self._duties.execute(request.executor, arguments, request.timeout, done)
 
     def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "a reader of logs")
@@ -154,7 +136,7 @@ class SlaveServices:
             open_request.answer(srv.ReadLog.Response(answer=refused("version", fault)))
             return
         try:
-            part = self._host.read_log(
+            part = self._duties.read_log(
                 LogQuery(
                     request.process, request.number, request.offset, request.tail, request.since,
                     request.max_bytes,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,8 @@ from rosrm.slave.sessions import SessionTable
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.wording import one_line
 
+_log = logging.getLogger("rosrm.slave")
+
 
 @dataclass
 class Starter:
@@ -41,7 +44,6 @@ class Starter:
         sessions: process tree of each instance.
         launchers: of this host.
         take: takes events for the core.
-        say: logs a message for the user.
     """
 
     config: HostConfig
@@ -54,7 +56,6 @@ class Starter:
     sessions: SessionTable
     launchers: Launchers
     take: Callable[[events.Event], None]
-    say: Callable[[str], None]
     _environment: Mapping[str, str] = field(init=False)
     _graph_before: dict[InstanceId, frozenset[bytes]] = field(init=False, default_factory=dict)
     _closed: bool = field(init=False, default=False)
@@ -139,7 +140,9 @@ class Starter:
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
-                self.say(f"{assignment.instance} cannot be started here: {one_line(str(error))}")
+                _log.info(
+                    "%s cannot be started here: %s", assignment.instance, one_line(str(error))
+                )
                 self.take(events.LaunchRefused(assignment.instance, str(error)))
         if orders:
             self.supervisor.start(orders)

@@ -6,6 +6,7 @@ their results to the loop. So a slow disk, or a snapshot of many megabytes, dela
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
@@ -22,6 +23,8 @@ from rosrm.ros.slave.replication import MOST, KeptEndpoint
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import KeptStore
 from rosrm.snapshots import Head, Part
+
+_log = logging.getLogger("rosrm.slave")
 
 #: Seconds between two scans of the snapshots on this host.
 _SCAN_EVERY: Final = 1.0
@@ -85,19 +88,18 @@ class Keeping:
         settings: limits.
         endpoint: exchanges messages with other slaves.
         post: schedules a call in the loop; may be called from any thread.
-        say: logs a message for the user.
         publish: reports the snapshots to the master; returns False if there is no master.
     """
 
     def __init__(
         self, root: Path, host: str, settings: KeepSettings, endpoint: KeptEndpoint, *,
-        post: Callable[[Callable[[], None]], None], say: Callable[[str], None],
+        post: Callable[[Callable[[], None]], None],
         publish: Callable[[Sequence[KeptState]], bool],
     ) -> None:  # fmt: skip
         self._host = host
         self._settings = settings
         self._endpoint = endpoint
-        self._post, self._say, self._publish = post, say, publish
+        self._post, self._publish = post, publish
         self._store = KeptStore(root, settings.max_bytes)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._shipments: dict[str, _Shipment] = {}
@@ -134,7 +136,7 @@ class Keeping:
             try:
                 outcome = work()
             except Exception as error:  # noqa: BLE001 - the thread has to live on
-                self._post(partial(self._say, f"a snapshot: {type(error).__name__}: {error}"))
+                _log.info("a snapshot: %s: %s", type(error).__name__, error)
                 outcome = otherwise
             self._post(partial(then, outcome))
 
@@ -278,7 +280,7 @@ class Keeping:
             shipment.due[host] = now + max(_AGAIN, shipment.every)
         if shipment.said.get(host) != code:
             shipment.said[host] = code
-            self._say(f"{host} does not keep the state of {shipment.instance}: {message}")
+            _log.info("%s does not keep the state of %s: %s", host, shipment.instance, message)
 
     def _end(self, transfer: _Transfer) -> None:
         process = transfer.shipment.instance.process
@@ -347,7 +349,7 @@ class Keeping:
 
         def ended(message: str) -> None:
             if self.forget(instance):
-                self._say(message)
+                _log.info("%s", message)
                 done(assignment)
 
         fetch = self._preparing[instance] = Fetch(
