@@ -17,15 +17,13 @@ from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.launch.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
 from rosrm.supervisor.client import (
-    Amended,
-    LaunchOrder,
-    LogLimits,
     SupervisorClient,
     SupervisorEnded,
     SupervisorGone,
     SupervisorSilent,
-    Told,
 )
+from rosrm.supervisor.client_values import Amended, LaunchOrder, Told
+from rosrm.supervisor.logs import LogLimits
 from rosrm.wording import counted
 
 _log = logging.getLogger("rosrm.slave")
