@@ -1,4 +1,4 @@
-"""Rows of listings: plain values for clients, tables and tests."""
+"""Rows of listings, and parts of logs: plain values for clients, tables and tests."""
 
 from __future__ import annotations
 
@@ -145,3 +145,28 @@ class Snapshot:
     plugins: Sequence[PluginRow] = ()
     events: Sequence[EventRow] = ()
     trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LogPart:
+    """A part of an instance's log.
+
+    Attributes:
+        number: of the instance.
+        numbers: of all instances of the process whose logs the host holds, ascending.
+        content: the bytes.
+        offset: of the content, from the first byte that the instance wrote. Bytes between the
+            requested offset and this one were dropped.
+        next_offset: offset of the next part.
+        ended: the instance has ended, and the log is complete.
+        marks: checks of the log: (unix time, offset, pid). Everything before the offset had been
+            written by that time; a pid not 0 is that of a process whose output begins there.
+    """
+
+    number: int
+    numbers: Sequence[int]
+    content: bytes
+    offset: int
+    next_offset: int
+    ended: bool
+    marks: Sequence[tuple[float, int, int]]

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosrm.errors import Refused
+from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
-from rosrm.ros.slave.services import LogQuery, LogSlice
+from rosrm.ros.slave.services import LogQuery
 from rosrm.supervisor import log_index, paths
 from rosrm.supervisor.client import log_path
 
@@ -32,7 +33,7 @@ class _Segment(NamedTuple):
     end: int
 
 
-def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice:
+def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
     """Read a part of an instance's output.
 
     Args:
@@ -67,9 +68,9 @@ def newest_instance(state_directory: Path, process: str) -> InstanceId:
     return InstanceId(process, numbers[-1])
 
 
-def nothing_yet(query: LogQuery) -> LogSlice:
+def nothing_yet(query: LogQuery) -> LogPart:
     """Return an empty answer for an instance that is starting, whose file does not exist yet."""
-    return LogSlice(query.number, (), b"", query.offset, query.offset, False, ())
+    return LogPart(query.number, (), b"", query.offset, query.offset, False, ())
 
 
 def _logged(state_directory: Path, process: str) -> list[int]:
@@ -99,7 +100,7 @@ def _segments(path: Path) -> list[_Segment]:
 def _read(
     path: Path, segments: Sequence[_Segment], query: LogQuery, numbers: Sequence[int], *,
     ended: bool,
-) -> LogSlice:  # fmt: skip
+) -> LogPart:  # fmt: skip
     last = segments[-1].end
     offset = min(_start(segments, query), last)
     found = next((one for one in segments if one.end > offset), segments[-1])
@@ -110,7 +111,7 @@ def _read(
         content = log.read(min(query.max_bytes or _MOST, _MOST))
     marks, end = _marks(found, offset, offset + len(content), now=found.path == path)
     content = content[: end - offset]
-    return LogSlice(query.number, numbers, content, offset, end, ended and end >= last, marks)
+    return LogPart(query.number, numbers, content, offset, end, ended and end >= last, marks)
 
 
 def _start(segments: Sequence[_Segment], query: LogQuery) -> int:

@@ -24,6 +24,7 @@ from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
+from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
@@ -38,7 +39,7 @@ from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalSeen
 from rosrm.ros.slave.replication import KeptEndpoint
-from rosrm.ros.slave.services import Duties, LogQuery, LogSlice, SlaveServices
+from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.executors import Done, Executors, Here
@@ -403,7 +404,7 @@ class SlaveRuntime:
         )
         self._keeping.drop(instance, lives=lives)
 
-    def _read_log(self, query: LogQuery) -> LogSlice:
+    def _read_log(self, query: LogQuery) -> LogPart:
         """Return a part of a log; raises `Refused`."""
         if not query.number:
             query = replace(query, number=self._newest_instance(query.process).number)

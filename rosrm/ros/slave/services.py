@@ -9,6 +9,7 @@ from typing import Any
 
 from rosrm.core.slave import events
 from rosrm.errors import Refused
+from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId, RestartPolicy
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
@@ -26,19 +27,6 @@ class LogQuery:
     tail: int = 0
     since: float = 0.0
     max_bytes: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class LogSlice:
-    """A part of a log as in the answer of `ReadLog`; a mark is (time, offset, pid)."""
-
-    number: int
-    numbers: Sequence[int]
-    content: bytes
-    offset: int
-    next_offset: int
-    ended: bool
-    marks: Sequence[tuple[float, int, int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +51,7 @@ class Duties:
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_kept: Callable[[InstanceId], None]
     execute: Callable[[str, dict[str, Any], float, Callable[[str, str, str], None]], None]
-    read_log: Callable[[LogQuery], LogSlice]
+    read_log: Callable[[LogQuery], LogPart]
 
 
 class SlaveServices:
