@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from rosrm.model.values import EMPTY, HostDescription
+
+#: Kinds of offers; "plugin": a fault of a plugin before its offers are known.
+PluginKind = Literal["probe", "scoring", "migration", "checkpoint", "launcher", "plugin"]
+PluginState = Literal["selected", "available", "absent", "broken", "failing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,16 +116,14 @@ class PluginRow:
     """One offer of a plugin, or a fault.
 
     Attributes:
-        kind: "probe", "scoring", "migration" or "checkpoint".
         distribution: name and version of the package that brings it.
-        state: "selected", "available", "absent", "broken" or "failing".
         host: "" for the master.
     """
 
-    kind: str
+    kind: PluginKind
     name: str
     distribution: str
-    state: str
+    state: PluginState
     reason: str
     host: str = ""
 
