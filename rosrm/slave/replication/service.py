@@ -19,7 +19,7 @@ from typing import Any, Final
 from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, KeptState
-from rosrm.ros.slave.replication import MOST, KeptEndpoint
+from rosrm.ros.slave.replication import MOST, KeptEndpoint, NotStored
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import KeptStore
 from rosrm.snapshots import Head, Part
@@ -40,7 +40,7 @@ _LOST_WORDS: Final = frozenset({"timeout", "order"})
 
 
 #: Answer for a part that could not be written because of an unexpected error.
-_FAILED: Final = ("full", "the slave failed to store it; its log has the reason")
+_FAILED: Final = NotStored("full", "the slave failed to store it; its log has the reason")
 
 
 @dataclass(slots=True)
@@ -251,11 +251,11 @@ class Keeping:
         answered = partial(self._given, transfer, len(data))
         self._endpoint.give(transfer.host, part, now, _PART_TIMEOUT, answered)
 
-    def _given(self, transfer: _Transfer, size: int, code: str, message: str) -> None:
+    def _given(self, transfer: _Transfer, size: int, refusal: NotStored | None) -> None:
         shipment, head, host = transfer.shipment, transfer.head, transfer.host
         now = time.monotonic()
-        if code and head is not None:
-            self._not_taken(shipment, host, head, now, code, message)
+        if refusal is not None and head is not None:
+            self._not_taken(shipment, host, head, now, refusal)
             self._end(transfer)
             return
         transfer.offset += size
@@ -268,19 +268,20 @@ class Keeping:
             self._go_on(transfer, now)
 
     def _not_taken(
-        self, shipment: _Shipment, host: str, head: Head, now: float, code: str, message: str
+        self, shipment: _Shipment, host: str, head: Head, now: float, refusal: NotStored
     ) -> None:
         """Schedule another transfer, at once if only a message was lost."""
-        if code == "newer":  # the acknowledgement of the last part may be lost
+        if refusal.code == "newer":  # the acknowledgement of the last part may be lost
             shipment.sent[host] = head.age
             return
-        if code in _LOST_WORDS:
+        if refusal.code in _LOST_WORDS:
             shipment.due[host] = now
         else:
             shipment.due[host] = now + max(_AGAIN, shipment.every)
-        if shipment.said.get(host) != code:
-            shipment.said[host] = code
-            _log.info("%s does not keep the state of %s: %s", host, shipment.instance, message)
+        if shipment.said.get(host) != refusal.code:
+            shipment.said[host] = refusal.code
+            instance, why = shipment.instance, refusal.message
+            _log.info("%s does not keep the state of %s: %s", host, instance, why)
 
     def _end(self, transfer: _Transfer) -> None:
         process = transfer.shipment.instance.process
@@ -289,13 +290,13 @@ class Keeping:
 
     # --- from other hosts ----------------------------------------------------------------
 
-    def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
+    def take_part(self, part: Part, answer: Callable[[NotStored | None], None]) -> None:
         """Store a part of a snapshot from another host."""
 
-        def taken(outcome: tuple[str, str]) -> None:
-            if part.is_last and not outcome[0]:
+        def taken(refusal: NotStored | None) -> None:
+            if part.is_last and refusal is None:
                 self._next_scan = 0.0  # the master may need the new replica at once
-            answer(*outcome)
+            answer(refusal)
 
         self._in_thread(partial(self._store.take, part, bounded=True), taken, _FAILED)
 
@@ -358,7 +359,7 @@ class Keeping:
         )  # fmt: skip
         fetch.go_on(time.monotonic())
 
-    def _take_fetched(self, part: Part, then: Callable[[tuple[str, str]], None]) -> None:
+    def _take_fetched(self, part: Part, then: Callable[[NotStored | None], None]) -> None:
         self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)
 
     def is_preparing(self, instance: InstanceId) -> bool:

@@ -16,6 +16,7 @@ import pytest
 from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm.ros.slave.replication import NotStored
 from rosrm.slave.replication import fetch
 from rosrm.slave.replication.service import Keeping
 from rosrm.snapshots import Block, Part, SlotWriter
@@ -43,7 +44,7 @@ class Wire:
     def give(self, host, part, now, timeout, done) -> None:
         self.given.append(part)
         if host in self.net.silent:
-            self.net.unanswered.append(lambda: done("timeout", "no answer"))
+            self.net.unanswered.append(lambda: done(NotStored("timeout", "no answer")))
         else:
             self.net.slaves[host].take_part(part, done)
 
@@ -256,9 +257,9 @@ def test_a_state_that_is_damaged_on_its_way_is_refused(net):
     good = snapshots.newest_content(net.directory("b"))[1]
     answers = []
     part = Part("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
-    taker.take_part(part, lambda *answer: answers.append(answer))
+    taker.take_part(part, answers.append)
     net.settle()
-    assert answers[0][0] == "damaged"
+    assert answers[0].code == "damaged"
     assert net.age("b") == (6, 1)
     assert not (net.directory("b") / "copy.new").exists()
 
@@ -267,9 +268,9 @@ def test_parts_out_of_order_begin_anew(net):
     """A part was lost, or two senders send at the same time."""
     taker = net.add("b")
     answers = []
-    taker.take_part(Part("p", 7, 5, 100, 200, 0, b"x" * 50), lambda *a: answers.append(a))
+    taker.take_part(Part("p", 7, 5, 100, 200, 0, b"x" * 50), answers.append)
     net.settle()
-    assert answers[0][0] == "order"
+    assert answers[0].code == "order"
 
 
 def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
