@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from rosrm.core.slave import events
 from rosrm.errors import Refused
@@ -29,6 +29,22 @@ class LogQuery:
     max_bytes: int = 0
 
 
+class ExecutorOutcome(NamedTuple):
+    """Outcome of an executor.
+
+    Attributes:
+        code: "" after a success; "unable": the executor reported a failure by a `ValueError` or an
+            error of rosrm, which is a valid answer; "bad_result": it answered no JSON object;
+            "failed": it raised another exception.
+        message: of a failure.
+        result: as JSON; "" after a failure.
+    """
+
+    code: Literal["", "unable", "bad_result", "failed"]
+    message: str = ""
+    result: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Duties:
     """Functions of a slave that execute requests; each is called in the loop's thread.
@@ -41,8 +57,7 @@ class Duties:
         keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
         drop_kept: deletes the snapshots of a process, of instances up to this one.
         execute: runs an executor with arguments and a time-out in seconds, after which its strategy
-            counts as failing. It calls its last argument with code, message and result as JSON; the
-            code is "" after a success.
+            counts as failing; calls its last argument with the outcome.
         read_log: returns a part of a log; raises `Refused`.
     """
 
@@ -50,7 +65,7 @@ class Duties:
     set_restart: Callable[[InstanceId, RestartPolicy, Callable[[str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_kept: Callable[[InstanceId], None]
-    execute: Callable[[str, dict[str, Any], float, Callable[[str, str, str], None]], None]
+    execute: Callable[[str, dict[str, Any], float, Callable[[ExecutorOutcome], None]], None]
     read_log: Callable[[LogQuery], LogPart]
 
 
@@ -111,9 +126,9 @@ class SlaveServices:
         self._duties.set_restart(convert.instance_from_msg(request.instance), restart, settled)
 
     def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        def done(code: str, message: str, result: str) -> None:
-            answer = refused(code, message) if code else accepted()
-            respond(srv.ControlHost.Response(answer=answer, result=result))
+        def done(outcome: ExecutorOutcome) -> None:
+            answer = refused(outcome.code, outcome.message) if outcome.code else accepted()
+            respond(srv.ControlHost.Response(answer=answer, result=outcome.result))
 
         arguments = convert.json_object(request.arguments, "the arguments of an executor")
         self._duties.execute(request.executor, arguments, request.timeout, done)
