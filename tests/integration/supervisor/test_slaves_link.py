@@ -134,7 +134,9 @@ def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, mon
     monkeypatch.setattr(send_buffer, "MOST_UNSENT", 300_000)
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
-    loop.wait(lambda: any("takes no orders" in one for one in loop.log.messages), "it is said")
+    loop.wait(
+        lambda: any("takes no orders" in one for one in loop.log.messages), "a log line about it"
+    )
     os.kill(loop.pid, signal.SIGCONT)
     loop.wait(lambda: len(loop.replaced()) == 2, "it is connected to anew")
     assert {status.instance for status in loop.replaced()[1].statuses} == set(MANY)
