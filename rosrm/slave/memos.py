@@ -6,7 +6,7 @@ import json
 from dataclasses import astuple
 from typing import Any
 
-from rosrm.core.slave.reducer import Awaited, Memo, Watch
+from rosrm.core.slave.watches import Awaited, Memo, Watch
 from rosrm.model.values import Health
 
 

@@ -55,21 +55,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from rosrm.core.supervisor.reducer import (
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,
-    FenceRule,
     Forgotten,
     Heard,
-    Instance,
-    Key,
     RestartOrdered,
-    RestartRule,
     ShutdownOrdered,
     StopOrdered,
-    StopRule,
 )
+from rosrm.core.supervisor.instance import Instance
+from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.supervisor.json_lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
 

@@ -10,7 +10,7 @@ import time
 import pytest
 from std_msgs.msg import Int64, String
 
-from rosrm.core.slave.reducer import Watch
+from rosrm.core.slave.watches import Watch
 from rosrm.model.values import Health, MigrationPolicy, RestartPolicy
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.health import HealthEar

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.commands import OrderId
+from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.plan import ReportPhase
+from rosrm.model.rows import PluginKind
 from rosrm.model.values import (
     EMPTY,
     HostDescription,
@@ -107,9 +109,9 @@ class StatusesReceived:
     failing_strategies: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     failing_launchers: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
-    def failing_plugins(self) -> dict[tuple[str, str], str]:
+    def failing_plugins(self) -> dict[Plugin, str]:
         """Return all plugins that fail there by kind and name, and why."""
-        by_kind = (
+        by_kind: tuple[tuple[PluginKind, Mapping[str, str]], ...] = (
             ("probe", self.failing),
             ("migration", self.failing_strategies),
             ("launcher", self.failing_launchers),

@@ -13,7 +13,8 @@ import pytest
 
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor import instance_record, procfs
-from rosrm.supervisor.client import Amended, LaunchOrder, SupervisorClient, log_path
+from rosrm.supervisor.client import SupervisorClient, log_path
+from rosrm.supervisor.client_values import Amended, LaunchOrder
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
 #: Seconds allowed on a busy machine; no wait takes so long unless a test fails.

@@ -28,7 +28,8 @@ SLAVE = """
     import os, sys, time
     from pathlib import Path
     from rosrm.model.values import Fence, InstanceId
-    from rosrm.supervisor.client import LaunchOrder, SupervisorClient
+    from rosrm.supervisor.client_values import LaunchOrder
+    from rosrm.supervisor.client import SupervisorClient
     client = SupervisorClient.connect(Path(sys.argv[1]))
     fences = {"one": Fence(3.0, 0.5), "driver": None}
     client.start([

@@ -28,7 +28,8 @@ SLAVE = """
     import os, sys
     from pathlib import Path
     from rosrm.model.values import InstanceId
-    from rosrm.supervisor.client import LaunchOrder, SupervisorClient
+    from rosrm.supervisor.client_values import LaunchOrder
+    from rosrm.supervisor.client import SupervisorClient
     client = SupervisorClient.connect(Path(sys.argv[1]))
     order = LaunchOrder(InstanceId("kept", 1), ("sleep", "1000"), dict(os.environ))
     client.start([order])

@@ -163,7 +163,7 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
 ASKING = """
 import sys
 from rosrm.cli import connection
-from rosrm.ros.client import LogPart
+from rosrm.model.rows import LogPart
 from tests.unit.cli.conftest import FakeClient
 client = FakeClient()
 client.read_log = lambda host, name, number, offset, *more, **rest: LogPart(

@@ -9,9 +9,8 @@ import pytest
 from rich.console import Console
 
 from rosrm.cli.output import tables
-from rosrm.errors import ConfigError
 from rosrm_simulate import picture
-from rosrm_simulate.runs import agreement_of
+from rosrm_simulate.runs import Request, carry_out
 from tests.unit.simulation.workloads import host, plan, recorded, simulation
 
 WORKLOAD = """
@@ -231,9 +230,8 @@ def test_a_file_of_another_kind_is_named(rosrm, tmp_path):
 
 
 def test_how_closely_a_run_was_simulated_can_be_asked_for(record, workload):
-    assert agreement_of(record).same_host == 1.0
-    with pytest.raises(ConfigError, match="only the record of a run can be compared"):
-        agreement_of(workload)
+    assert carry_out(Request(record)).agreement.same_host == 1.0
+    assert carry_out(Request(workload)).agreement is None
 
 
 def test_a_file_that_is_not_there_is_named(rosrm, tmp_path):

@@ -34,7 +34,7 @@ from rosrm.core.master.master_state import MasterState, Process
 from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
@@ -325,8 +325,8 @@ class Cluster:
         if reply.accepted:
             machine.host_id, machine.fresh = reply.host_id, False
             machine.polled.clear()
-            machine.tell(reducer.Registered(self.state.epoch), self.now)
-            machine.tell(reducer.MasterHears(self.now), self.now)
+            machine.tell(events.Registered(self.state.epoch), self.now)
+            machine.tell(events.MasterHears(self.now), self.now)
             self.read(machine)
             self.ask_for_work(machine)
         self.settle()
@@ -403,7 +403,7 @@ class Cluster:
         """Stop a slave: it announces its departure and ends all its processes."""
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
         for instance in list(machine.programs):
-            machine.tell(reducer.StopOrdered(instance), self.now)
+            machine.tell(events.StopOrdered(instance), self.now)
         self.settle()
         return reply
 
@@ -460,9 +460,9 @@ class Cluster:
             self.read()
             for machine in self.machines.values():
                 if machine.connected and machine.host_id:
-                    machine.tell(reducer.TimePassed(), self.now)
+                    machine.tell(events.TimePassed(), self.now)
                     if machine.host_id not in self.state.hosts.unheard():
-                        machine.tell(reducer.MasterHears(self.now), self.now)
+                        machine.tell(events.MasterHears(self.now), self.now)
                     self.ask_for_work(machine)
                     self.tell(machine.usages())
             self.tell(happened.TimePassed())

@@ -11,8 +11,20 @@ import numpy as np
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import OrderId, SendOrder
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events, reducer
+from rosrm.core.slave.commands import (
+    Amend,
+    Command,
+    Fence,
+    Forget,
+    Launch,
+    Report,
+    Restart,
+    Settle,
+    Stop,
+)
 from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.state import SlaveState
 from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
 from rosrm.model.values import (
     EMPTY,
@@ -79,13 +91,13 @@ class Machine:
 
     host_id: int = 0
     incarnation: int = 0
-    slave: reducer.SlaveState = field(default_factory=reducer.SlaveState)
+    slave: SlaveState = field(default_factory=SlaveState)
     programs: dict[InstanceId, Program] = field(default_factory=dict)
     ends: dict[InstanceId, InstanceStatus] = field(default_factory=dict)
     refuses: dict[str, str] = field(default_factory=dict)
     stubborn: set[str] = field(default_factory=set)
     quirks: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
-    settled: list[reducer.Settle] = field(default_factory=list)
+    settled: list[Settle] = field(default_factory=list)
     busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
     shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     polled: list[Assignment] = field(default_factory=list)
@@ -153,9 +165,9 @@ class Machine:
             np.array([one.get("memory", 0.0) for one in used]),
         )  # fmt: skip
 
-    def _report(self, commands: Iterable[reducer.Command], now: float) -> None:
+    def _report(self, commands: Iterable[Command], now: float) -> None:
         for command in commands:
-            if isinstance(command, reducer.Report):
+            if isinstance(command, Report):
                 self.batches += 1
                 self.said.append(
                     happened.StatusesReceived(
@@ -166,32 +178,32 @@ class Machine:
             else:
                 self._carry_out(command, now)
 
-    def _carry_out(self, command: reducer.Command, now: float) -> None:
-        if isinstance(command, reducer.Launch):
+    def _carry_out(self, command: Command, now: float) -> None:
+        if isinstance(command, Launch):
             for assignment in command.assignments:
                 self._launch(assignment, now)
-        elif isinstance(command, reducer.Stop):
+        elif isinstance(command, Stop):
             self._stop(command.instance, now)
-        elif isinstance(command, reducer.Fence):
+        elif isinstance(command, Fence):
             if command.instance in self.programs:
                 self._end(command.instance, InstanceState.FENCED, now, signal=9)
-        elif isinstance(command, reducer.Restart):
+        elif isinstance(command, Restart):
             self._restart(command.instance, now)
-        elif isinstance(command, reducer.Amend):
+        elif isinstance(command, Amend):
             self.programs[command.instance].restart = command.restart
-            self.tell(reducer.RestartPolicyRecorded(command.instance, command.restart), now)
-        elif isinstance(command, reducer.Settle):
+            self.tell(events.RestartPolicyRecorded(command.instance, command.restart), now)
+        elif isinstance(command, Settle):
             self.settled.append(command)
-        elif isinstance(command, reducer.Forget):
+        elif isinstance(command, Forget):
             for instance in command.instances:
                 self.ends.pop(instance, None)
 
-    def tell(self, event: reducer.Event, now: float) -> None:
+    def tell(self, event: events.Event, now: float) -> None:
         """Pass an event to the slave's reducer and carry out its commands."""
         self._report(reducer.step(self.slave, event, now), now)
 
     def _supervisor_says(self, status: InstanceStatus, now: float) -> None:
-        self.tell(reducer.SupervisorReported((status,)), now)
+        self.tell(events.SupervisorReported((status,)), now)
 
     # --- commands of the slave -----------------------------------------------------------
 
@@ -199,7 +211,7 @@ class Machine:
         instance = assignment.instance
         reason = self.refuses.get(instance.process)
         if reason is not None:
-            self.tell(reducer.LaunchRefused(instance, reason), now)
+            self.tell(events.LaunchRefused(instance, reason), now)
             return
         self.pids += 1
         silent = assignment.shadow or assignment.restored
@@ -262,7 +274,7 @@ class Machine:
 
     def seen_in_graph(self, name: str, now: float) -> None:
         """Show the node of the newest instance in the ROS graph."""
-        self.tell(reducer.SeenInGraph(self.find(name)), now)
+        self.tell(events.SeenInGraph(self.find(name)), now)
 
     def obey(self, sent: SendOrder, now: float) -> happened.OrderAnswered:
         """Pass an order to the slave and return the answer."""
@@ -318,13 +330,13 @@ class Machine:
         """Answer the slave's open request with the assignments that wait for it."""
         batch, self.polled = self.polled, []
         if batch:
-            self.tell(reducer.AssignmentsReceived(tuple(batch)), now)
+            self.tell(events.AssignmentsReceived(tuple(batch)), now)
 
     def replace_supervisor(self, now: float) -> None:
         """Kill the supervisor; the next one adopts what runs and remembers what ended."""
         fenced = {one for one, it in self.programs.items() if it.assignment.fence is not None}
         statuses = (*self.ends.values(), *self._running())
-        self.tell(reducer.SupervisorReplaced(statuses, {}, frozenset(fenced)), now)
+        self.tell(events.SupervisorReplaced(statuses, {}, frozenset(fenced)), now)
 
     def _running(self) -> list[InstanceStatus]:
         return [
@@ -350,6 +362,6 @@ class Machine:
         self.said.clear()
         self.ordered.clear()
         self.polled.clear()
-        self.slave = reducer.SlaveState(max_processes=self.max_processes)
+        self.slave = SlaveState(max_processes=self.max_processes)
         found = (*self.ends.values(), *self._running())
-        reducer.step(self.slave, reducer.SupervisorReported(found), now)
+        reducer.step(self.slave, events.SupervisorReported(found), now)

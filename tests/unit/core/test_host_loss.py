@@ -9,7 +9,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.model.orders import FenceInstance, SetRestartPolicy
 from rosrm.model.values import (
     HostLossPolicy,
@@ -382,7 +382,7 @@ def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
     cluster.add(Machine("b", busy={"memory": 0.9}))  # a host in contact, without room
     cluster.wait(11.0)
     a = cluster.machines["a"]
-    a.tell(reducer.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
+    a.tell(events.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
     lose(cluster, "a")
     assert cluster.phase("p") == "queued"
     back(cluster, "a")

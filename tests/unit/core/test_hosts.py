@@ -9,7 +9,7 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.model.orders import ReportInstances, StopInstance
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -436,7 +436,7 @@ def test_an_instance_that_nobody_intends_is_stopped_until_it_has_ended() -> None
     machine.stubborn.add("ghost")
     spec = process("ghost", memory=10 * MIB)
     ghost = Assignment(InstanceId("ghost", 999), spec, 1, "ghost")
-    machine.tell(reducer.AssignmentsReceived((ghost,)), cluster.now)
+    machine.tell(events.AssignmentsReceived((ghost,)), cluster.now)
     cluster.settle()
     cluster.wait(5.0)
     assert len(cluster.orders(StopInstance)) == 3

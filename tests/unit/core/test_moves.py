@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.extensions.declared_fields import Declared
 from rosrm.model.orders import StartInstance
 from rosrm.model.plan import AwaitReady, Commit, Execute, Move, Plan, SetRestart, Start, Stop
@@ -216,7 +216,7 @@ def test_a_source_whose_host_forgot_it_returns_to_the_queue() -> None:
     machine = cluster.machines["a"]
     machine.programs.clear()
     machine.slave.held.clear()
-    machine.tell(reducer.ReportRequested(), cluster.now)
+    machine.tell(events.ReportRequested(), cluster.now)
     cluster.settle()
     assert cluster.phase("p") in {"starting", "running"}
     assert len(cluster.where("p")) == 1

@@ -6,7 +6,7 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.model.orders import StartInstance, StopInstance
 from rosrm.model.plan import Move, Plan
 from rosrm.model.values import (
@@ -316,7 +316,7 @@ def test_what_is_over_is_kept_while_something_of_it_is_being_stopped() -> None:
     machine = cluster.machines["a"]
     late = InstanceStatus(InstanceId("p", 77), InstanceState.RUNNING, pid=5)
     machine.stubborn.add("p")
-    machine.tell(reducer.SupervisorReported((late,)), cluster.now)
+    machine.tell(events.SupervisorReported((late,)), cluster.now)
     cluster.settle()
     machine.finish("q", cluster.now)
     cluster.wait(0.5)

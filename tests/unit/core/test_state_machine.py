@@ -19,7 +19,7 @@ from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
 from rosrm.core.master.master_state import ProcessPhase, Wanted
 from rosrm.core.master.state.hosts import HostCondition, HostTable
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.model.values import (
     HostLossPolicy,
@@ -213,8 +213,8 @@ class Play(RuleBasedStateMachine):
             machine.host_id = self.cluster.replies[self.cluster._requests].host_id
             machine.fresh = False
             machine.polled.clear()
-            machine.tell(reducer.Registered(self.cluster.state.epoch), self.cluster.now)
-            machine.tell(reducer.MasterHears(self.cluster.now), self.cluster.now)
+            machine.tell(events.Registered(self.cluster.state.epoch), self.cluster.now)
+            machine.tell(events.MasterHears(self.cluster.now), self.cluster.now)
 
     def pick(self, things: list, which: int) -> object:
         return things[which % len(things)]
@@ -472,7 +472,7 @@ class Play(RuleBasedStateMachine):
         """Request a full report, which arrives now and perhaps again later."""
         machine = self.machine(host)
         if self.known(machine):
-            machine.tell(reducer.ReportRequested(), self.cluster.now)
+            machine.tell(events.ReportRequested(), self.cluster.now)
             self.late.append(machine.said[-1])
 
     @rule(prompt=chance)
@@ -558,7 +558,7 @@ class Play(RuleBasedStateMachine):
         elif what == "leaves" and self.known(machine):
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
             for instance in list(machine.programs):
-                machine.tell(reducer.StopOrdered(instance), self.cluster.now)
+                machine.tell(events.StopOrdered(instance), self.cluster.now)
         elif what == "is detached" and self.known(machine):
             # No slave runs until it is killed or `all_is_well`.
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation, machine.begun())
@@ -616,7 +616,7 @@ class Play(RuleBasedStateMachine):
     def time_passes(self, seconds: float, quiet: bool) -> None:
         self.cluster.now += seconds
         for machine in self.cluster.machines.values():
-            machine.tell(reducer.TimePassed(), self.cluster.now)
+            machine.tell(events.TimePassed(), self.cluster.now)
             if self.known(machine) and not quiet:
                 self.tell(self.cluster.readings([machine]))
                 self.tell(machine.usages())
@@ -921,7 +921,7 @@ class Play(RuleBasedStateMachine):
         for _ in range(times):
             for machine in self.cluster.machines.values():
                 for instance in list(machine.programs):
-                    machine.tell(reducer.SeenInGraph(instance), self.cluster.now)
+                    machine.tell(events.SeenInGraph(instance), self.cluster.now)
             self.cluster.wait(1.0, tick=0.5)
             self.no_process_is_lost()
             self.the_books_balance()

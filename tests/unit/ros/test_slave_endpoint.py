@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import events
+from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import HostDescription
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.slave import endpoint
@@ -99,22 +102,12 @@ class Host:
     def __init__(self) -> None:
         self.events = []
         self.heard: list[float] = []
-        self.said: list[str] = []
-
-    def kept_states(self):
-        return ()
 
     def take(self, event) -> None:
-        if isinstance(event, core.MasterHears):
+        if isinstance(event, events.MasterHears):
             self.heard.append(event.at)
         else:
             self.events.append(event)
-
-    def statuses(self) -> list:
-        return []
-
-    def say(self, message: str) -> None:
-        self.said.append(message)
 
 
 class Master:
@@ -158,7 +151,9 @@ class Slave:
     def __init__(self, clock: Clock, seen: JournalSeen | None = None) -> None:
         self.clock, self.wire, self.host = clock, Wire(), Host()
         description = HostDescription("h0", 5)
-        self.endpoint = SlaveEndpoint(self.wire, self.host, description, max_age=5.0, seen=seen)
+        self.endpoint = SlaveEndpoint(
+            self.wire, description, SlaveState(), take=self.host.take, seen=seen
+        )
 
     @property
     def link(self) -> Link:
@@ -189,7 +184,8 @@ class Slave:
 
 
 @pytest.fixture
-def slave(monkeypatch) -> Slave:
+def slave(monkeypatch, caplog) -> Slave:
+    caplog.set_level(logging.INFO)
     clock = Clock()
     monkeypatch.setattr(endpoint, "time", clock)
     return Slave(clock)
@@ -203,7 +199,7 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     slave.pass_time(2.0, old)
     assert slave.link is Link.REGISTERED
     slave.pass_time(1.0, new)
-    assert core.MasterLost() in slave.host.events
+    assert events.MasterLost() in slave.host.events
     assert slave.link is Link.GREETING
 
     new.greet()
@@ -211,7 +207,7 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     new.take_in()
     asked = len(slave.sent(srv.RequestProcess))
     slave.pass_time(PERIOD, new)
-    assert slave.host.events[-1] == core.Registered(epoch, renumbers=epoch <= 2)
+    assert slave.host.events[-1] == events.Registered(epoch, renumbers=epoch <= 2)
     assert len(slave.sent(srv.RegisterHost)) == 2
     assert len(slave.sent(srv.RequestProcess)) == asked + 1
     assert slave.newest(srv.RequestProcess).request.envelope.epoch == epoch
@@ -239,7 +235,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     assert slave.link is Link.GREETING
     new.greet()
     new.take_in()
-    assert slave.host.events[-1] == core.Registered(1, renumbers=True)
+    assert slave.host.events[-1] == events.Registered(1, renumbers=True)
     slave.pass_time(5.0, new)
     assert slave.link is Link.REGISTERED
     assert len(slave.sent(srv.RegisterHost)) == 2
@@ -247,7 +243,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     slave.pass_time(PERIOD, new)
     new.greet()
     new.take_in()
-    assert slave.host.events[-1] == core.Registered(1, renumbers=False)
+    assert slave.host.events[-1] == events.Registered(1, renumbers=False)
 
 
 def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
@@ -305,10 +301,10 @@ def test_a_silent_master_is_lost(slave) -> None:
     assert slave.link is Link.REGISTERED
     slave.pass_time(0.6)
     assert slave.link is not Link.REGISTERED
-    assert core.MasterLost() in slave.host.events
+    assert events.MasterLost() in slave.host.events
 
 
-def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave) -> None:
+def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave, caplog) -> None:
     """The slave leaves once the master is silent; its log claims no running processes."""
     slave.join(Master(slave, 11))
     slave.pass_time(1.6)
@@ -317,7 +313,7 @@ def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave) 
     slave.pass_time(0.6)
     assert slave.link is not Link.REGISTERED
     assert len(told) == 1
-    assert not [line for line in slave.host.said if "keep running" in line]
+    assert not [line for line in caplog.messages if "keep running" in line]
 
 
 def test_a_master_that_comes_back_is_told_that_the_slave_leaves(slave) -> None:
@@ -355,15 +351,15 @@ def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
     first, second = slave.sent(srv.RequestProcess)
     answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True)
     first.answer(srv.RequestProcess.Response(answer=answer))
-    assert core.AssignmentsReceived((), None) in slave.host.events
+    assert events.AssignmentsReceived((), None) in slave.host.events
     slave.pass_time(PERIOD, master)
     assert len(slave.sent(srv.RequestProcess)) == 3  # the master keeps the newest of them open
     slave.pass_time(5.0, master)
     second.answer(srv.RequestProcess.Response(answer=answer))  # the slave has given it up by then
-    assert slave.host.events.count(core.AssignmentsReceived((), None)) == 1
+    assert slave.host.events.count(events.AssignmentsReceived((), None)) == 1
 
 
-def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
+def test_a_name_that_is_taken_is_said_at_once(slave, caplog) -> None:
     """The slave retries for a moment, and logs the conflict once."""
     ours = Master(slave, 11)
     answer = msg.Answer(protocol_version=PROTOCOL_VERSION, code="name_taken", message="a live one")
@@ -372,7 +368,7 @@ def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
         ours.beat()
         ours.greet()
         slave.newest(srv.RegisterHost).answer(srv.RegisterHost.Response(answer=answer))
-    (said,) = slave.host.said
+    (said,) = caplog.messages
     assert said.startswith("a live one. Asking again for 5 s")
     assert slave.endpoint.failure == ""
 
@@ -417,7 +413,7 @@ def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -
     assert seen.of_former_run("m", 2) == 5
 
 
-def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
+def test_a_master_that_cannot_write_is_asked_again(slave, caplog) -> None:
     """A master with a journal stall accepts no host for now: the slave retries and logs it once."""
     ours = Master(slave, 11)
     slave.pass_time(PERIOD)
@@ -431,7 +427,7 @@ def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
         ours.beat()
         ours.greet()
     assert slave.endpoint.failure == ""
-    assert [word for word in slave.host.said if "a full disk" in word] == slave.host.said[:1]
+    assert [word for word in caplog.messages if "a full disk" in word] == caplog.messages[:1]
     ours.take_in()
     assert slave.link is Link.REGISTERED
 

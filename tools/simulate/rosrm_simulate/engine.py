@@ -28,7 +28,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
 from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.slave import reducer
+from rosrm.core.slave.events import AssignmentsReceived, MasterHears, Registered, TimePassed
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record
 from rosrm.extensions.declared_fields import Declared
 from rosrm.model.orders import seconds_of
@@ -165,8 +165,8 @@ class Simulation:
         assert reply is not None  # _tell has set it
         machine.host_id = reply.host_id
         self._by_id[machine.host_id] = machine
-        self._hosting.hear(machine, reducer.Registered(self.state.epoch))
-        self._hosting.hear(machine, reducer.MasterHears(inf))  # no simulated host is cut off
+        self._hosting.hear(machine, Registered(self.state.epoch))
+        self._hosting.hear(machine, MasterHears(inf))  # no simulated host is cut off
         self._read([machine])
 
     def _leave(self, plan: HostPlan) -> None:
@@ -192,7 +192,7 @@ class Simulation:
             self._usage_told = turn
             for machine in there:
                 self._tell_usages(machine)
-                self._hosting.hear(machine, reducer.TimePassed())
+                self._hosting.hear(machine, TimePassed())
         self._tell(happened.TimePassed())
 
     def _read(self, machines: list[Machine]) -> None:
@@ -269,7 +269,7 @@ class Simulation:
         def arrive() -> None:
             if machine.up and not machine.stopping and assignment.instance in self._undelivered:
                 self._undelivered.discard(assignment.instance)
-                self._hosting.hear(machine, reducer.AssignmentsReceived((assignment,)))
+                self._hosting.hear(machine, AssignmentsReceived((assignment,)))
 
         self.agenda.after(self.workload.model.wire, arrive)
 

@@ -19,7 +19,7 @@ from rosrm.core.master.commands import Assign, Command, PublishStateConfig
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
-from rosrm.core.slave.reducer import awaits_graph
+from rosrm.core.slave.state import awaits_graph
 from rosrm.extensions.contracts import Record
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.spec_json import spec_from_dict

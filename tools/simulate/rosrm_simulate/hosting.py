@@ -7,8 +7,9 @@ from functools import partial
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import OrderId, SendOrder
-from rosrm.core.slave import reducer
+from rosrm.core.slave import commands, events, reducer
 from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.state import awaits_graph
 from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus, RestartPolicy
 from rosrm_simulate.agenda import Agenda, Entry
@@ -46,30 +47,30 @@ class Hosting:
 
     # --- events of a slave -----------------------------------------------------------------
 
-    def hear(self, machine: Machine, event: reducer.Event) -> None:
+    def hear(self, machine: Machine, event: events.Event) -> None:
         """Process an event in a slave's core, and carry out its commands."""
         for command in reducer.step(machine.slave, event, self._agenda.now):
             self._carry_out(machine, command)
 
-    def _carry_out(self, machine: Machine, command: reducer.Command) -> None:
-        if isinstance(command, reducer.Report):
+    def _carry_out(self, machine: Machine, command: commands.Command) -> None:
+        if isinstance(command, commands.Report):
             machine.batches += 1
             report = happened.StatusesReceived(
                 machine.host_id, machine.incarnation, machine.batches, command.complete,
                 command.statuses,
             )  # fmt: skip
             self._say(machine, report)
-        elif isinstance(command, reducer.Launch):
+        elif isinstance(command, commands.Launch):
             for assignment in command.assignments:
                 self._launch(machine, assignment)
-        elif isinstance(command, reducer.Stop | reducer.Fence):
+        elif isinstance(command, commands.Stop | commands.Fence):
             self._stop(machine, command.instance)
-        elif isinstance(command, reducer.Restart):
+        elif isinstance(command, commands.Restart):
             self._restart(machine, command.instance)
-        elif isinstance(command, reducer.Amend):
+        elif isinstance(command, commands.Amend):
             machine.programs[command.instance].restart = command.restart
-            self.hear(machine, reducer.RestartPolicyRecorded(command.instance, command.restart))
-        elif isinstance(command, reducer.Settle):
+            self.hear(machine, events.RestartPolicyRecorded(command.instance, command.restart))
+        elif isinstance(command, commands.Settle):
             self._settle(machine, command)
 
     def _say(self, machine: Machine, event: happened.Event) -> None:
@@ -82,7 +83,7 @@ class Hosting:
         self._agenda.after(self._model.wire, arrive)
 
     def _supervisor_says(self, machine: Machine, status: InstanceStatus) -> None:
-        self.hear(machine, reducer.SupervisorReported((status,)))
+        self.hear(machine, events.SupervisorReported((status,)))
 
     # --- programs --------------------------------------------------------------------------
 
@@ -102,13 +103,13 @@ class Hosting:
         self._plan_end(machine)
         status = InstanceStatus(instance, InstanceState.RUNNING, pid=instance.number)
         self._supervisor_says(machine, status)
-        if reducer.awaits_graph(program.assignment.spec):
+        if awaits_graph(program.assignment.spec):
             self._agenda.after(self._model.ready, partial(self._seen, machine, instance, run))
 
     def _seen(self, machine: Machine, instance: InstanceId, run: int) -> None:
         program = machine.programs.get(instance)
         if program is not None and program.run == run and machine.up:
-            self.hear(machine, reducer.SeenInGraph(instance))
+            self.hear(machine, events.SeenInGraph(instance))
 
     def _stop(self, machine: Machine, instance: InstanceId) -> None:
         program = machine.programs.get(instance)
@@ -167,7 +168,7 @@ class Hosting:
         machine.stopping = True
         for instance in list(machine.slave.held):
             if not machine.slave.held[instance].status.state.ended:
-                self.hear(machine, reducer.StopOrdered(instance))
+                self.hear(machine, events.StopOrdered(instance))
         self._close(machine)
 
     def _close(self, machine: Machine) -> None:
@@ -202,7 +203,7 @@ class Hosting:
                 self.hear(machine, event_of(order))
         self._say(machine, happened.OrderAnswered(sent.order_id, accepted=True))
 
-    def _settle(self, machine: Machine, command: reducer.Settle) -> None:
+    def _settle(self, machine: Machine, command: commands.Settle) -> None:
         order = self._settling.pop((command.instance, command.restart), None)
         if order is not None:
             code = "refused" if command.refusal else ""

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rosrm.core.master.state.host_arrays import FloatArray
-from rosrm.core.slave import reducer
+from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Assignment,
@@ -76,7 +76,7 @@ class Machine:
     plan: HostPlan
     incarnation: int
     period: float
-    slave: reducer.SlaveState = field(default_factory=reducer.SlaveState)
+    slave: SlaveState = field(default_factory=SlaveState)
     programs: dict[InstanceId, Program] = field(default_factory=dict)
     host_id: int = 0
     up: bool = True
@@ -186,7 +186,7 @@ class Machine:
             usage = np.zeros(RESOURCE_SLOTS)
             usage[: len(used)] = [used[one.name] for one in self.plan.resources]
             present = (1 << len(used)) - 1
-            accepts = reducer.under_limits(
+            accepts = under_limits(
                 usage.astype(np.float32), self.limit.astype(np.float32), present, 0
             )
             self._reading = Reading(now, usage, accepts)
