@@ -19,10 +19,10 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    Order,
     PublishStateConfig,
     Redeliver,
     Reply,
+    SendOrder,
     Withdraw,
 )
 from rosrm.core.master.master_state import MasterState
@@ -379,7 +379,7 @@ class MasterRuntime:
         for command in commands:
             if isinstance(command, Assign):
                 links.assign(command)
-            elif isinstance(command, Order):
+            elif isinstance(command, SendOrder):
                 links.order(command, now)
             elif isinstance(command, PublishStateConfig):
                 self._endpoint.handoffs.publish(command)

@@ -18,12 +18,14 @@ import numpy as np
 
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
-from rosrm.core.slave.events import Event, Registered, RestartPolicySet, TimePassed
+from rosrm.core.slave.events import Event, Registered, TimePassed
 from rosrm.core.slave.health import LOOK_PERIOD
+from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
+from rosrm.model.orders import RunExecutor, SetRestartPolicy
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -390,10 +392,10 @@ class SlaveRuntime:
 
     # --- requests of the master, and of readers of logs ----------------------------------
 
-    def _set_restart(self, instance: InstanceId, restart: RestartPolicy, settled: Settled) -> None:
+    def _set_restart(self, order: SetRestartPolicy, settled: Settled) -> None:
         """Set the restart policy of an instance; call `settled` when the supervisor recorded it."""
-        self._unsettled.setdefault((instance, restart), []).append(settled)
-        self._take(RestartPolicySet(instance, restart))
+        self._unsettled.setdefault((order.instance, order.restart), []).append(settled)
+        self._take(event_of(order))
 
     def _drop_kept(self, instance: InstanceId) -> None:
         """Delete the snapshots of a process, of instances up to this one."""
@@ -423,14 +425,13 @@ class SlaveRuntime:
             return InstanceId(process, max(held))
         return newest_instance(self._supervisor.state, process)
 
-    def _execute(
-        self, executor: str, arguments: dict[str, Any], timeout: float, done: Done
-    ) -> None:
+    def _execute(self, order: RunExecutor, done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""
         held = self._state.held.items()
         pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
         here = Here(self._config.host, self._config.state, pids)
-        self._executors.execute(executor, arguments, timeout, here=here, done=done)
+        arguments = dict(order.arguments)
+        self._executors.execute(order.executor, arguments, order.timeout, here=here, done=done)
 
 
 def _random_number() -> int:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.core.master.commands import OrderId
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.plan import ReportPhase
 from rosrm.model.rows import PluginKind
@@ -199,7 +200,7 @@ class HostStateRequested:
 
     request: int
     host: str
-    action: str
+    action: Literal["cordon", "uncordon", "drain"]
     by: str = ""
 
 
@@ -220,12 +221,12 @@ class PruneRequested:
 
 @dataclass(frozen=True, slots=True)
 class OrderAnswered:
-    """A slave answered an `Order`, or did not in time (code "timeout").
+    """A slave answered a `SendOrder`, or did not in time (code "timeout").
 
     The code `BAD_RESULT`: an executor ran to its end, but answered no JSON object.
     """
 
-    order: int
+    order: OrderId
     accepted: bool
     code: str = ""
     message: str = ""

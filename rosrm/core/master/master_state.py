@@ -9,9 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from rosrm.core.master.commands import Command
+from rosrm.core.master.commands import Command, OrderId, SendOrder
 from rosrm.core.master.hosts.fencing import fence_of
-from rosrm.core.master.scheduling.decision import Decision
+from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Abilities
@@ -21,6 +21,7 @@ from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import LearnedNeeds
 from rosrm.core.master.state.migration import Run, run_to_dict
+from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import Instance, Process, ProcessPhase, Wanted
 from rosrm.core.master.state.queue import Queue
@@ -29,6 +30,7 @@ from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, Scorin
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import Order
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 
@@ -115,7 +117,6 @@ class MasterState:
         self.over: dict[str, None] = {}
         self.instances: dict[int, Instance] = {}
         self.runs: dict[str, Run] = {}
-        self.runs_by_order: dict[int, str] = {}
         self.standbys: dict[str, Run] = {}
         self.wants_standby: set[str] = set()
         self.learned = LearnedNeeds()
@@ -129,11 +130,11 @@ class MasterState:
         self.keeping = Keeping()
         self.abilities = Abilities()
         self.images = Images()
+        self.pending_orders = PendingOrders()
         self.periodic = Periodic()
         self.next_order = 1
         self.next_instance = 1
         self.reserved_instances = 1
-        self.next_order_id = 1
         self.wall = 0.0
         self.in_company_since = inf
         self.held_since = inf
@@ -227,10 +228,15 @@ class MasterState:
         stopping = [number for number in numbers if self.instances[number].stopping]
         return Intent("migration", run.process, run_to_dict(run, stopping))
 
-    def order_id(self) -> int:
-        """Return a number for an order to a slave, unique within this run of the master."""
-        self.next_order_id += 1
-        return self.next_order_id - 1
+    def send(self, host: Host, order: Order, purpose: Purpose | None = None) -> OrderId:
+        """Send an order to the slave of a host and return its id.
+
+        Args:
+            purpose: of the answer; None: the answer is ignored.
+        """
+        order_id = self.pending_orders.add(purpose)
+        self.emit(SendOrder(order_id, host.host_id, order))
+        return order_id
 
     # --- processes -----------------------------------------------------------------------
 
@@ -417,7 +423,9 @@ class MasterState:
             restored,
         )  # fmt: skip
 
-    def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
+    def note_decision(
+        self, process: Process, decision: Decision, kind: DecisionKind, now: float
+    ) -> None:
         """Remember the newest decision about a process, for `explain`."""
         decision.kind = kind
         process.decision = decision

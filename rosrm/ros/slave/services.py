@@ -7,12 +7,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from rosrm.core.slave import events
+from rosrm.core.slave.events import Event
+from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
+from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
 from rosrm.model.rows import LogPart
-from rosrm.model.values import InstanceId, RestartPolicy
-from rosrm.ros import convert, names
+from rosrm.model.values import InstanceId
+from rosrm.ros import names
 from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
+from rosrm.ros.orders import order_from_msg
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm_msgs import srv
 
@@ -56,16 +59,16 @@ class Duties:
             is no such instance.
         keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
         drop_kept: deletes the snapshots of a process, of instances up to this one.
-        execute: runs an executor with arguments and a time-out in seconds, after which its strategy
-            counts as failing; calls its last argument with the outcome.
+        execute: runs an executor, and calls its last argument with the outcome. If that takes
+            longer than the order allows, the executor's strategy counts as failing.
         read_log: returns a part of a log; raises `Refused`.
     """
 
-    take: Callable[[events.Event], None]
-    set_restart: Callable[[InstanceId, RestartPolicy, Callable[[str], None]], None]
+    take: Callable[[Event], None]
+    set_restart: Callable[[SetRestartPolicy, Callable[[str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_kept: Callable[[InstanceId], None]
-    execute: Callable[[str, dict[str, Any], float, Callable[[ExecutorOutcome], None]], None]
+    execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
     read_log: Callable[[LogQuery], LogPart]
 
 
@@ -91,47 +94,40 @@ class SlaveServices:
         participant.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
 
     def _take_order(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        kind = srv.ControlHost.Request
+        """Carry out an order; the outcomes of executors and restart policies come later."""
         try:
-            if request.action == kind.EXECUTE:
-                self._execute(request, respond)
-                return
-            if request.action == kind.SET_RESTART:
-                self._set_restart(request, respond)
-                return
-            if request.action in (kind.KEEP, kind.DROP_KEPT):
-                self._keep_or_drop(request)
-            else:
-                self._duties.take(_ordered(request))
+            order = order_from_msg(request)
+            match order:
+                case RunExecutor():
+                    self._execute(order, respond)
+                    return
+                case SetRestartPolicy():
+                    self._set_restart(order, respond)
+                    return
+                case ReplicateSnapshot(instance, hosts, every):
+                    self._duties.keep(instance, hosts, every)
+                case DropReplica(instance):
+                    self._duties.drop_kept(instance)
+                case _:
+                    self._duties.take(event_of(order, request.envelope.receiver_beat / 1e9))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
 
-    def _keep_or_drop(self, request: srv.ControlHost.Request) -> None:
-        instance = convert.instance_from_msg(request.instance)
-        if request.action == request.KEEP:
-            self._duties.keep(instance, tuple(request.keep_on), request.keep_every)
-        else:
-            self._duties.drop_kept(instance)
-
-    def _set_restart(
-        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
-    ) -> None:
+    def _set_restart(self, order: SetRestartPolicy, respond: Callable[[Any], None]) -> None:
         def settled(refusal: str) -> None:
             answer = refused("unknown", refusal) if refusal else accepted()
             respond(srv.ControlHost.Response(answer=answer))
 
-        restart = convert.restart_from_msg(request.restart)
-        self._duties.set_restart(convert.instance_from_msg(request.instance), restart, settled)
+        self._duties.set_restart(order, settled)
 
-    def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
+    def _execute(self, order: RunExecutor, respond: Callable[[Any], None]) -> None:
         def done(outcome: ExecutorOutcome) -> None:
             answer = refused(outcome.code, outcome.message) if outcome.code else accepted()
             respond(srv.ControlHost.Response(answer=answer, result=outcome.result))
 
-        arguments = convert.json_object(request.arguments, "the arguments of an executor")
-        self._duties.execute(request.executor, arguments, request.timeout, done)
+        self._duties.execute(order, done)
 
     def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "a reader of logs")
@@ -158,23 +154,3 @@ class SlaveServices:
                 mark_pids=[mark[2] for mark in part.marks],
             )
         )  # fmt: skip
-
-
-def _ordered(request: srv.ControlHost.Request) -> events.Event:
-    """Return the core event of an order; raises `Refused`."""
-    kind = srv.ControlHost.Request
-    if request.action == kind.START:
-        given_at = request.envelope.receiver_beat / 1e9
-        return events.AssignmentsReceived(
-            (convert.assignment_from_msg(request.assignment),), given_at
-        )
-    instance = convert.instance_from_msg(request.instance)
-    orders: dict[int, events.Event] = {
-        kind.STOP: events.StopOrdered(instance),
-        kind.FENCE: events.FenceOrdered(instance),
-        kind.RESTART: events.RestartOrdered(instance),
-        kind.REPORT: events.ReportRequested(),
-    }
-    if request.action not in orders:
-        raise Refused(f"unknown action {request.action}")
-    return orders[request.action]

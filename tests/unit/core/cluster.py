@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,10 +24,10 @@ from rosrm.core.master import listing
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    Order,
     PublishStateConfig,
     Redeliver,
     Reply,
+    SendOrder,
     Withdraw,
 )
 from rosrm.core.master.master_state import MasterState, Process
@@ -40,6 +40,7 @@ from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.registry import Registry
 from rosrm.model.codec import to_plain
+from rosrm.model.orders import Order
 from rosrm.model.plan import (
     AwaitReady,
     AwaitReleased,
@@ -164,6 +165,8 @@ class HandOver:
         )
 
 
+OrderT = TypeVar("OrderT", bound=Order)
+
 _REGISTRY = Registry.of(migration=rosrm_migration.plugin, criu=rosrm_criu.plugin)
 _SHIPPED = {name: _REGISTRY.offer("migration", name) for name in _REGISTRY.names("migration")}
 _CAPABILITIES, _CAPABILITIES_OF = _REGISTRY.capabilities(), _REGISTRY.capabilities_of()
@@ -273,7 +276,7 @@ class Cluster:
                 self.replies[command.request] = command
             elif isinstance(command, Assign):
                 self.by_id(command.host_id).polled.append(command.assignment)
-            elif isinstance(command, Order):
+            elif isinstance(command, SendOrder):
                 self.by_id(command.host_id).ordered.append(command)
             elif isinstance(command, Withdraw):
                 self._withdraw(command)
@@ -289,14 +292,12 @@ class Cluster:
             machine.polled = kept
             self.tell(happened.AssignmentWithdrawn(command.instance))
         else:
-            machine.ordered.append(Order(command.order, command.host_id, "stop", command.instance))
+            machine.ordered.append(command.if_fetched)
 
     def _redeliver(self, command: Redeliver) -> None:
         machine, assignment = self.by_id(command.host_id), command.assignment
         if all(one.instance != assignment.instance for one in machine.polled):
-            machine.ordered.append(
-                Order(command.order, command.host_id, "start", assignment.instance, assignment)
-            )
+            machine.ordered.append(command.if_fetched)
 
     def by_id(self, host_id: int) -> Machine:
         name = self.state.hosts.hosts[host_id - 1].name
@@ -531,5 +532,10 @@ class Cluster:
         assert story is not None
         return json.loads(json.dumps(story, default=dict))
 
-    def orders(self, action: str) -> list[Order]:
-        return [c for c in self.carried if isinstance(c, Order) and c.action == action]
+    def orders(self, kind: type[OrderT]) -> list[OrderT]:
+        return [sent.order for sent in self.sent() if isinstance(sent.order, kind)]
+
+    def sent(self, *kinds: type[Order]) -> list[SendOrder]:
+        """Return all orders of these kinds; without a kind, all orders."""
+        sent = [c for c in self.carried if isinstance(c, SendOrder)]
+        return [one for one in sent if not kinds or isinstance(one.order, kinds)]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
+from rosrm.core.master.commands import OrderId, SendOrder
 from rosrm.core.slave import events, reducer
 from rosrm.core.slave.commands import (
     Amend,
@@ -23,7 +23,9 @@ from rosrm.core.slave.commands import (
     Settle,
     Stop,
 )
+from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState
+from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
 from rosrm.model.values import (
     EMPTY,
     Assignment,
@@ -99,7 +101,7 @@ class Machine:
     busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
     shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     polled: list[Assignment] = field(default_factory=list)
-    ordered: deque[Order] = field(default_factory=deque)
+    ordered: deque[SendOrder] = field(default_factory=deque)
     said: deque[happened.StatusesReceived] = field(default_factory=deque)
     kept: dict[str, KeptState] = field(default_factory=dict)
     ships: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -274,44 +276,32 @@ class Machine:
         """Show the node of the newest instance in the ROS graph."""
         self.tell(events.SeenInGraph(self.find(name)), now)
 
-    def obey(self, order: Order, now: float) -> happened.OrderAnswered:
+    def obey(self, sent: SendOrder, now: float) -> happened.OrderAnswered:
         """Pass an order to the slave and return the answer."""
-        if order.action == "execute":
-            try:
-                result = self.executors[order.executor](order.arguments)
-            except Exception as error:  # noqa: BLE001 - what a test's executor does
-                return happened.OrderAnswered(order.order, False, "failed", str(error))
-            if not isinstance(result, Mapping):
-                return happened.OrderAnswered(order.order, False, happened.BAD_RESULT, "no object")
-            return happened.OrderAnswered(order.order, True, result=result)
-        if order.action == "set_restart":
-            return self._set_restart(order, now)
-        if order.action in ("keep", "drop_kept"):
-            assert order.instance is not None
-            self._keep_or_drop(order, order.instance)
-            return happened.OrderAnswered(order.order, True)
-        event: events.Event
-        if order.action == "report":
-            event = events.ReportRequested()
-        elif order.action == "start":
-            assert order.assignment is not None
-            event = events.AssignmentsReceived((order.assignment,))
-        else:
-            assert order.instance is not None
-            kinds = {
-                "stop": events.StopOrdered, "fence": events.FenceOrdered,
-                "restart": events.RestartOrdered,
-            }  # fmt: skip
-            event = kinds[order.action](order.instance)
-        self.tell(event, now)
-        return happened.OrderAnswered(order.order, accepted=True)
+        order = sent.order
+        match order:
+            case RunExecutor():
+                return self._execute(sent.order_id, order)
+            case SetRestartPolicy():
+                return self._set_restart(sent.order_id, order, now)
+            case ReplicateSnapshot(instance, hosts):
+                self.ships[instance.process] = hosts
+            case DropReplica(instance):
+                kept = self.kept.get(instance.process)
+                if kept is not None and kept.instance.number <= instance.number:
+                    del self.kept[instance.process]
+            case _:
+                self.tell(event_of(order), now)
+        return happened.OrderAnswered(sent.order_id, accepted=True)
 
-    def _keep_or_drop(self, order: Order, instance: InstanceId) -> None:
-        name, number = instance.process, instance.number
-        if order.action == "keep":
-            self.ships[name] = order.keep_on
-        elif name in self.kept and self.kept[name].instance.number <= number:
-            del self.kept[name]
+    def _execute(self, order_id: OrderId, order: RunExecutor) -> happened.OrderAnswered:
+        try:
+            result = self.executors[order.executor](order.arguments)
+        except Exception as error:  # noqa: BLE001 - what a test's executor does
+            return happened.OrderAnswered(order_id, False, "failed", str(error))
+        if not isinstance(result, Mapping):
+            return happened.OrderAnswered(order_id, False, happened.BAD_RESULT, "no object")
+        return happened.OrderAnswered(order_id, True, result=result)
 
     def keep_state(self, instance: InstanceId) -> KeptState:
         """Publish a snapshot that is newer than the one before."""
@@ -327,14 +317,14 @@ class Machine:
         if own is None or (own.instance.number, own.sequence) < age:
             self.kept[state.instance.process] = state
 
-    def _set_restart(self, order: Order, now: float) -> happened.OrderAnswered:
-        assert order.instance is not None
-        assert order.restart is not None
+    def _set_restart(
+        self, order_id: OrderId, order: SetRestartPolicy, now: float
+    ) -> happened.OrderAnswered:
         self.settled.clear()
-        self.tell(events.RestartPolicySet(order.instance, order.restart), now)
+        self.tell(event_of(order), now)
         (settled,) = self.settled
         code = "refused" if settled.refusal else ""
-        return happened.OrderAnswered(order.order, not code, code, settled.refusal)
+        return happened.OrderAnswered(order_id, not code, code, settled.refusal)
 
     def fetch(self, now: float) -> None:
         """Answer the slave's open request with the assignments that wait for it."""

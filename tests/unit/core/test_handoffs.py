@@ -13,6 +13,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.lifecycle import restarts_after
+from rosrm.model.orders import StopInstance
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.model.values import (
     InstanceId,
@@ -150,7 +151,7 @@ def test_the_commit_is_durable_before_the_source_is_stopped() -> None:
     while not cluster["p"].migrations:
         cluster._nodes_talk()
     assert cluster.intents["migration"]["p"]["committed"]
-    assert not cluster.orders("stop")
+    assert not cluster.orders(StopInstance)
 
 
 def test_a_source_that_does_not_say_that_it_is_released_does_not_hold_up_the_move() -> None:
@@ -165,7 +166,7 @@ def test_a_source_that_does_not_say_that_it_is_released_does_not_hold_up_the_mov
             one for one in cluster.air.to_master if one[1].phase is not ReportPhase.RELEASED
         ]
     assert cluster["p"].migrations == 1  # the destination may fail after this point
-    assert not cluster.orders("stop")
+    assert not cluster.orders(StopInstance)
     cluster.wait(11.0)
     has_moved(cluster)
 
@@ -309,7 +310,7 @@ def test_a_destination_that_does_not_answer_to_abort_is_stopped_before_the_sourc
     cluster.migrate("p", "b")
     cluster.wait(25.0)
     assert "RESUME" not in said(cluster)
-    assert len(cluster.orders("stop")) > 1
+    assert len(cluster.orders(StopInstance)) > 1
     assert len(cluster.told("destination_unheard")) == 1
     cluster.machines["b"].let_go("p", cluster.now)
     cluster.settle()

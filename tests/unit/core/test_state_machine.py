@@ -426,7 +426,7 @@ class Play(RuleBasedStateMachine):
             del machine.ordered[which]
         if fate == "lost":
             self.heard.pop(machine.name, None)
-            self.tell(happened.OrderAnswered(order.order, accepted=False, code="timeout"))
+            self.tell(happened.OrderAnswered(order.order_id, accepted=False, code="timeout"))
         else:
             self.tell(machine.obey(order, self.cluster.now))
         self.flow()

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rosrm.core.master.commands import Order
+from rosrm.core.master.commands import SendOrder
 from rosrm.core.master.events import BAD_RESULT
+from rosrm.model.orders import ReportInstances
 from rosrm.model.values import HostDescription
 from rosrm.ros.control import accepted
 from rosrm.ros.master.slave_links import HostLinks, _order_answered
@@ -64,7 +65,7 @@ def links(monkeypatch, control) -> HostLinks:
     links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
     links._client = FakeClient()
     monkeypatch.setattr(
-        "rosrm.ros.master.slave_links._order_request",
+        "rosrm.ros.master.slave_links.order_to_msg",
         lambda command: SimpleNamespace(envelope=None),
     )
     return links
@@ -75,7 +76,7 @@ def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control)
     control.ready = False
     links.renew(HOST, DESCRIPTION)
     heard(links, beat=100, sequence=1)
-    links.order(Order(1, HOST, "report"), now=0.0)
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
     heard(links, beat=200, sequence=2)
     assert links._client.beats == []
     control.ready = True
@@ -89,7 +90,7 @@ def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
     links.renew(HOST, DESCRIPTION)
     heard(links, beat=100, sequence=1)
     links.renew(HOST, DESCRIPTION)
-    links.order(Order(1, HOST, "report"), now=0.0)
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
     assert client.beats == []
     heard(links, beat=900, sequence=2)
     assert client.beats == [900]

@@ -36,6 +36,7 @@ from .workloads import host, plan, read, recorded, simulation
 INT = st.integers(0, 2**53)
 FLOAT = st.floats(allow_nan=False)
 TEXT = st.text(max_size=8)
+ORDER_ID = st.one_of(st.integers(0, 2**40 - 1), st.tuples(TEXT, INT))
 TEXTS = st.dictionaries(TEXT, TEXT, max_size=2)
 JSON = st.dictionaries(TEXT, st.one_of(FLOAT, TEXT, st.booleans(), st.none()), max_size=2)
 INSTANCE = st.builds(InstanceId, TEXT, INT)
@@ -120,7 +121,12 @@ EVENTS = {
         happened.PruneRequested, INT, *2 * [st.lists(TEXT).map(tuple)], TEXT
     ),
     happened.OrderAnswered: st.builds(
-        happened.OrderAnswered, INT, st.booleans(), TEXT, TEXT, st.one_of(st.none(), JSON)
+        happened.OrderAnswered,
+        ORDER_ID,
+        st.booleans(),
+        TEXT,
+        TEXT,
+        st.one_of(st.none(), JSON),
     ),
     happened.AssignmentWithdrawn: st.builds(happened.AssignmentWithdrawn, INSTANCE),
     happened.HandoffReported: st.builds(
@@ -151,6 +157,21 @@ def test_an_event_comes_back_as_it_was(event, now, wall):
     assert type(back.event) is type(event)
     for field in dataclasses.fields(event):
         assert same(getattr(event, field.name), getattr(back.event, field.name)), field.name
+
+
+@pytest.mark.parametrize(
+    ("number", "order_id"),
+    [
+        (7, 7),
+        ((1 << 40) + 1, ("replication", 1)),
+        ((1 << 41) + 3, ("capability", 3)),
+        ((1 << 42) + 2, ("periodic", 2)),
+    ],
+)
+def test_an_answer_of_an_older_record_belongs_to_the_same_order(number, order_id):
+    """Rosrm 0.1.0 wrote the orders that depend on optional plugins with large numbers."""
+    kind, content = encode(happened.OrderAnswered(number, accepted=True), 1.0, 2.0)
+    assert decode(kind, content).event == happened.OrderAnswered(order_id, accepted=True)
 
 
 @pytest.fixture(scope="module")

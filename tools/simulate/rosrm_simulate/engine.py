@@ -18,10 +18,10 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    Order,
     PublishStateConfig,
     Redeliver,
     Reply,
+    SendOrder,
     Withdraw,
 )
 from rosrm.core.master.master_state import MasterState
@@ -31,6 +31,7 @@ from rosrm.core.master.settings import CoreSettings
 from rosrm.core.slave.events import AssignmentsReceived, MasterHears, Registered, TimePassed
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record
 from rosrm.extensions.declared_fields import Declared
+from rosrm.model.orders import seconds_of
 from rosrm.model.values import EMPTY, InstanceId
 from rosrm_simulate.agenda import Agenda
 from rosrm_simulate.hosting import Hosting
@@ -252,7 +253,7 @@ class Simulation:
         self._active = self.agenda.now
         if isinstance(command, Assign):
             self._assign(command)
-        elif isinstance(command, Order):
+        elif isinstance(command, SendOrder):
             self._order(command)
         elif isinstance(command, Withdraw):
             self._withdraw(command)
@@ -278,24 +279,21 @@ class Simulation:
             withdrawn = happened.AssignmentWithdrawn(command.instance)
             self.agenda.after(0.0, partial(self._tell, withdrawn))
             return
-        self._order(Order(command.order, command.host_id, "stop", command.instance))
+        self._order(command.if_fetched)
 
     def _redeliver(self, command: Redeliver) -> None:
-        assignment = command.assignment
-        if assignment.instance not in self._undelivered:
-            self._order(
-                Order(command.order, command.host_id, "start", assignment.instance, assignment)
-            )
+        if command.assignment.instance not in self._undelivered:
+            self._order(command.if_fetched)
 
-    def _order(self, order: Order) -> None:
-        machine = self._by_id[order.host_id]
+    def _order(self, sent: SendOrder) -> None:
+        machine = self._by_id[sent.host_id]
 
         def arrive() -> None:
             if machine.up:
-                self._hosting.obey(machine, order)
+                self._hosting.obey(machine, sent)
                 return
-            timeout = happened.OrderAnswered(order.order, False, "timeout", "no answer in time")
-            seconds = order.timeout + self.state.settings.order_retry
+            timeout = happened.OrderAnswered(sent.order_id, False, "timeout", "no answer in time")
+            seconds = seconds_of(sent.order) + self.state.settings.order_retry
             self.agenda.after(seconds, partial(self._tell, timeout))
 
         self.agenda.after(self.workload.model.wire, arrive)

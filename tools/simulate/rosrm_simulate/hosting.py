@@ -6,9 +6,11 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
+from rosrm.core.master.commands import OrderId, SendOrder
 from rosrm.core.slave import commands, events, reducer
+from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import awaits_graph
+from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus, RestartPolicy
 from rosrm_simulate.agenda import Agenda, Entry
 from rosrm_simulate.machine import Machine, Program
@@ -41,7 +43,7 @@ class Hosting:
         self._tell = tell
         self.where: dict[int, Machine] = {}
         self._ends: dict[str, Entry] = {}
-        self._settling: dict[tuple[InstanceId, RestartPolicy], Order] = {}
+        self._settling: dict[tuple[InstanceId, RestartPolicy], OrderId] = {}
 
     # --- events of a slave -----------------------------------------------------------------
 
@@ -183,37 +185,26 @@ class Hosting:
 
     # --- orders --------------------------------------------------------------------------
 
-    def obey(self, machine: Machine, order: Order) -> None:
+    def obey(self, machine: Machine, sent: SendOrder) -> None:
         """Carry out an order at a slave, and answer it."""
-        if order.action == "execute":
-            message = f"the simulation cannot carry out {order.executor!r}"
-            answer = happened.OrderAnswered(order.order, False, "failed", message)
-            self._say(machine, answer)
-        elif order.action == "set_restart":
-            assert order.instance is not None
-            assert order.restart is not None
-            self._settling[order.instance, order.restart] = order
-            self.hear(machine, events.RestartPolicySet(order.instance, order.restart))
-        else:
-            self.hear(machine, _as_event(order))
-            self._say(machine, happened.OrderAnswered(order.order, accepted=True))
+        order = sent.order
+        match order:
+            case RunExecutor(executor):
+                message = f"the simulation cannot carry out {executor!r}"
+                self._say(machine, happened.OrderAnswered(sent.order_id, False, "failed", message))
+                return
+            case SetRestartPolicy(instance, restart):
+                self._settling[instance, restart] = sent.order_id
+                self.hear(machine, event_of(order))
+                return
+            case ReplicateSnapshot() | DropReplica():
+                pass  # nodes of a simulation publish no snapshots
+            case _:
+                self.hear(machine, event_of(order))
+        self._say(machine, happened.OrderAnswered(sent.order_id, accepted=True))
 
     def _settle(self, machine: Machine, command: commands.Settle) -> None:
         order = self._settling.pop((command.instance, command.restart), None)
         if order is not None:
             code = "refused" if command.refusal else ""
-            self._say(machine, happened.OrderAnswered(order.order, not code, code, command.refusal))
-
-
-def _as_event(order: Order) -> events.Event:
-    if order.action == "report":
-        return events.ReportRequested()
-    if order.action == "start":
-        assert order.assignment is not None
-        return events.AssignmentsReceived((order.assignment,))
-    assert order.instance is not None
-    if order.action == "restart":
-        return events.RestartOrdered(order.instance)
-    if order.action == "fence":
-        return events.FenceOrdered(order.instance)
-    return events.StopOrdered(order.instance)
+            self._say(machine, happened.OrderAnswered(order, not code, code, command.refusal))

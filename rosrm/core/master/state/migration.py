@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from rosrm.core.master.commands import OrderId
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Lazy
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
@@ -72,7 +73,7 @@ class Run:
         committed: the destination owns the name.
         deadline: of the current step.
         begun: the current step has been ordered.
-        order: of the current step, 0: none.
+        order: of the current step; None: it has none.
         stuck: a step that must be done failed; it is retried from `retry_at` on.
         answer: of the slave to the order of the current step: accepted, message.
         bad_result: the executor of the current step ran to its end, but returned no JSON object.
@@ -105,7 +106,7 @@ class Run:
     committed: bool = False
     begun: bool = False
     deadline: float = 0.0
-    order: int = 0
+    order: OrderId | None = None
     order_at: float = 0.0
     failure: str = ""
     stuck: bool = False

@@ -69,8 +69,7 @@ class Instance:
         given_again: the assignment was delivered again, because its slave did not accept it.
         recalled: a former run of the master ordered it to stop, so its end counts as ordered.
         at_once: it is to end without delay, because another instance owns the name.
-        order: of an unanswered stop, 0: none.
-        order_at: time of that order.
+        order_at: time of the last order to stop it, or to withdraw it; -inf: none.
         node_name: name of its node, where that is not the process's name.
         ready_at: time at which this master learned that it is ready.
     """
@@ -92,8 +91,7 @@ class Instance:
     given_again: bool = False
     recalled: bool = False
     at_once: bool = False
-    order: int = 0
-    order_at: float = 0.0
+    order_at: float = -inf
     node_name: str = ""
     ready_at: float = inf
 
