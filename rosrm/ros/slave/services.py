@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from rosrm.core.slave import events
+from rosrm.core.slave.events import Event
 from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
 from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
@@ -59,12 +59,12 @@ class Duties:
             is no such instance.
         keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
         drop_kept: deletes the snapshots of a process, of instances up to this one.
-        execute: runs an executor, and calls its last argument with the outcome. If the executor
-            takes longer than the order allows, its strategy counts as failing.
+        execute: runs an executor, and calls its last argument with the outcome. If that takes
+            longer than the order allows, the executor's strategy counts as failing.
         read_log: returns a part of a log; raises `Refused`.
     """
 
-    take: Callable[[events.Event], None]
+    take: Callable[[Event], None]
     set_restart: Callable[[SetRestartPolicy, Callable[[str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_kept: Callable[[InstanceId], None]
