@@ -10,7 +10,8 @@ from rosrm.config.settings import LivenessSettings
 from rosrm.model.rows import ProcessRow
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
 from tests.faults.watching import Blow, Watcher, blocks, instances, is_gapless
-from tests.ros.clusters import PATIENCE, QUICK, Cluster, host
+from tests.ros.clusters import QUICK, Cluster, host
+from tests.waiting import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "moving"
@@ -128,13 +129,9 @@ class Scene:
 
     def _start_again(self, victim: str) -> None:
         if victim == "master":
-            self.cluster.master.process.wait(PATIENCE)
-            self.cluster.reconnect()
-            self.cluster.start_master()
+            self.cluster.restart_master()
         elif victim.endswith("slave"):
-            name = self._host_of(victim)
-            self.cluster.slaves[name].process.wait(PATIENCE)
-            self.cluster.start_slave_again(name)
+            self.cluster.start_slave_again(self._host_of(victim))
 
     # --- blows -----------------------------------------------------------------------------
 

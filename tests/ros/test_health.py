@@ -14,7 +14,8 @@ from rosrm.core.slave.reducer import Watch
 from rosrm.model.values import Health, MigrationPolicy, RestartPolicy
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.health import HealthEar
-from tests.ros.clusters import PATIENCE, STEADY, alive, host, node, service, wait_gone
+from tests.ros.clusters import STEADY, alive, host, node, service
+from tests.waiting import wait_gone, wait_until
 
 #: Seconds: far more than a busy machine takes between two messages.
 SOON = 2.0
@@ -118,11 +119,7 @@ def test_a_node_that_is_stopped_starts_again(cluster) -> None:
     event = cluster.wait_for_event("backoff", "unhealthy: ", process="hung")
     assert "restart 1 of 5" in event.message
     wait_gone(before.pid)
-    view = cluster.wait_until(
-        "hung runs again",
-        lambda v: any((r.name, r.state, r.restarts) == ("hung", "running", 1) for r in v.processes),
-    )
-    assert next(r.number for r in view.processes if r.name == "hung") == before.number
+    assert cluster.wait("hung", "running", restarts=1).number == before.number
     history = cluster.client.explain("hung")["history"]
     assert any("unhealthy: " in entry["message"] for entry in history)
     cluster.cancel("hung")
@@ -156,9 +153,6 @@ def test_the_next_run_of_the_slave_watches_on(cluster) -> None:
     """The supervisor stores the health check for the next slave, whose downtime does not count."""
     cluster.submit(service("orphan", health=Health(timeout=SOON)))
     pid = cluster.wait("orphan", "running").pid
-    slave = cluster.slaves["h0"].process
-    slave.kill()
-    slave.wait(PATIENCE)
     cluster.start_slave_again("h0")
     os.kill(pid, signal.SIGSTOP)
     assert failed(cluster, "orphan").startswith("unhealthy: stopped by a signal")
@@ -166,11 +160,8 @@ def test_the_next_run_of_the_slave_watches_on(cluster) -> None:
 
 def test_a_healthy_node_is_never_ended(cluster) -> None:
     """A healthy node, watched by two runs of the slave, and for a while longer here, is kept."""
-    until = time.monotonic() + 2 * SOON
-    while time.monotonic() < until:
-        cluster.client.spin(0.2)
-    row = cluster.process("healthy")
-    assert (row.state, row.restarts) == ("running", 0), row.reason
+    cluster.stays(2 * SOON, lambda: cluster.process("healthy").restarts == 0, "the first run")
+    cluster.wait("healthy", "running", restarts=0)
 
 
 #: A stateful node, whose output is below its name even under an alias.
@@ -213,19 +204,11 @@ def test_a_node_that_was_moved_is_watched_where_it_is_now(make_cluster) -> None:
     cluster.wait_for_event("migrated", process="moved")
     after = cluster.wait("moved", "running")
     assert after.host != before.host
-    until = time.monotonic() + 2 * SOON
-    while time.monotonic() < until:
-        cluster.client.spin(0.2)
-    assert cluster.process("moved").restarts == 0
+    cluster.stays(2 * SOON, lambda: cluster.process("moved").restarts == 0, "healthy")
     os.kill(after.pid, signal.SIGSTOP)
     event = cluster.wait_for_event("backoff", "unhealthy: ", process="moved")
     assert event.host == after.host
-    cluster.wait_until(
-        "it runs again",
-        lambda v: any(
-            (r.name, r.state, r.restarts) == ("moved", "running", 1) for r in v.processes
-        ),
-    )
+    cluster.wait("moved", "running", restarts=1)
 
 
 # --- reception in the slave ---------------------------------------------------------------------
@@ -248,11 +231,14 @@ class Listener:
         return self.ear.topic((os.getpid(),), time.monotonic())
 
     def look_until(self, condition, what: str) -> tuple[int | None, str]:
-        deadline = time.monotonic() + PATIENCE
-        while not condition(look := self.look()):
-            assert time.monotonic() < deadline, f"{what} did not come about: {look}"
-            time.sleep(0.02)
-        return look
+        looks = []
+
+        def met() -> bool:
+            looks.append(self.look())
+            return condition(looks[-1])
+
+        wait_until(met, what, seen=lambda: looks[-1])
+        return looks[-1]
 
 
 @pytest.mark.parametrize("alone", [True, False])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,9 +21,8 @@ from tests.ros.clusters import (
     node,
     python,
     service,
-    wait_gone,
-    wait_until,
 )
+from tests.waiting import wait_gone, wait_until
 
 MOVES = MigrationPolicy("relaunch")
 STOPS_FIRST = MigrationPolicy("relaunch", overlap=False)
@@ -44,31 +42,16 @@ def other(name: str) -> str:
     return {"left": "right", "right": "left"}[name]
 
 
-def moved(cluster, name: str, times: int = 1):
-    view = cluster.wait_until(
-        f"{name} moved {times} times",
-        lambda v: any(
-            r.name == name and r.migrations == times and r.state == "running" for r in v.processes
-        ),
-    )
-    return next(row for row in view.processes if row.name == name)
+def moved(cluster, name: str):
+    return cluster.wait(name, "running", migrations=1)
 
 
-def written(folder, runs: int) -> None:
+def started(folder, runs: int) -> None:
     """Wait until this number of runs has written its start time."""
     wait_until(
         lambda: sum(bool(path.read_text()) for path in folder.iterdir()) == runs,
         f"{runs} runs at work",
     )
-
-
-def spans(folder) -> list[tuple[float, float]]:
-    """Return the start and end times of the runs that wrote both."""
-    runs = []
-    for path in folder.iterdir():
-        times = [float(line) for line in path.read_text().split()]
-        runs.append((times[0], times[-1]))
-    return sorted(runs)
 
 
 #: Writes the time of its start (from its /proc entry) and of its end.
@@ -92,38 +75,31 @@ def recorder(cluster, name: str, migration: MigrationPolicy):
     return replace(spec, arguments=(str(folder),)), folder
 
 
-def test_start_first_has_never_none(cluster) -> None:
-    """By default the new instance is ready before the old one stops; then it runs alone."""
-    spec, folder = recorder(cluster, "overlapping", MOVES)
+@pytest.mark.parametrize(("name", "migration"), [("overlaps", MOVES), ("apart", STOPS_FIRST)])
+def test_the_order_of_start_and_stop(cluster, name, migration) -> None:
+    """By default the new instance is ready before the old one stops; then it runs alone.
+
+    With `overlap: false` the old instance ends before the new one starts.
+    """
+    spec, folder = recorder(cluster, name, migration)
     cluster.submit(spec)
-    before = cluster.wait("overlapping", "running")
-    written(folder, 1)
-    assert "moves to" in cluster.client.migrate("overlapping")
-    after = moved(cluster, "overlapping")
+    before = cluster.wait(name, "running")
+    started(folder, 1)
+    assert "moves to" in cluster.client.migrate(name)
+    after = moved(cluster, name)
     assert after.host == other(before.host)
     wait_gone(before.pid)
     assert alive(after.pid)
-    written(folder, 2)
-    cluster.cancel("overlapping")
-    (_, first_end), (second_begin, _) = spans(folder)
-    assert second_begin <= first_end
-    kinds = cluster.kinds("overlapping")
+    started(folder, 2)
+    cluster.cancel(name)
+    runs = [list(map(float, path.read_text().split())) for path in folder.iterdir()]
+    (_, first_end), (second_begin, _) = sorted(runs)
+    if name == "overlaps":
+        assert second_begin <= first_end
+    else:
+        assert first_end <= second_begin + 1 / os.sysconf("SC_CLK_TCK")  # starts are in ticks
+    kinds = cluster.kinds(name)
     assert kinds.index("migration_begun") < kinds.index("migrated")
-
-
-def test_stop_first_has_never_two(cluster) -> None:
-    """With `overlap: false` the old instance ends before the new one starts."""
-    spec, folder = recorder(cluster, "apart", STOPS_FIRST)
-    cluster.submit(spec)
-    before = cluster.wait("apart", "running")
-    written(folder, 1)
-    cluster.client.migrate("apart", other(before.host))
-    after = moved(cluster, "apart")
-    assert after.host == other(before.host)
-    written(folder, 2)
-    cluster.cancel("apart")
-    (_, first_end), (second_begin, _) = spans(folder)
-    assert first_end <= second_begin + 1 / os.sysconf("SC_CLK_TCK")  # starts are in ticks
 
 
 def test_a_ros_node_moves_under_its_own_name(cluster) -> None:
@@ -173,7 +149,7 @@ def test_a_destination_that_never_gets_ready_changes_nothing(cluster) -> None:
     cluster.cancel(*overlaps)
 
 
-def test_what_cannot_move_is_refused(cluster) -> None:
+def test_impossible_migrations_are_refused(cluster) -> None:
     """Refused: without a strategy, while queued, to the current host, to an unknown host."""
     cluster.submit(service("rooted"), service("mobile", migration=MOVES))
     cluster.wait("rooted", "running")
@@ -245,7 +221,7 @@ def grower(cluster, name: str, where: str, mib: int, **options):
     return replace(spec, arguments=(str(go), where, str(mib))), go
 
 
-def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
+def test_eviction_from_a_host_over_its_limit(make_cluster) -> None:
     """After the hysteresis the process that helps most and fits elsewhere leaves; others stay."""
     hysteresis = 4.0  # seconds; by then the master knows the size of each process
     limits = {"memory": 0.5, "cpu": 1.0}
@@ -308,12 +284,12 @@ def test_nothing_moves_when_every_host_is_full(make_cluster) -> None:
         "both over", lambda v: not any(row.accepting for row in v.hosts) and bool(v.hosts)
     )
     cluster.submit(service("waits"))
-    deadline = time.monotonic() + 1.5
-    while time.monotonic() < deadline:
-        cluster.client.spin(0.1)
-        rows = {row.name: row for row in cluster.client.list(processes=True).processes}
-        assert rows["waits"].state == "queued"
-        assert rows["on-a"].state == rows["on-b"].state == "running"
+    states = {"waits": "queued", "on-a": "running", "on-b": "running"}
+    cluster.stays(
+        1.5,
+        lambda: {r.name: r.state for r in cluster.client.list(processes=True).processes} == states,
+        f"{states}",
+    )
     assert not cluster.events("migration_begun")
     cluster.cancel("on-a")
     assert cluster.wait("waits", "running").host == "a"

@@ -21,7 +21,8 @@ from std_srvs.srv import Trigger
 
 from rosrm.config.settings import MigrationSettings
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness
-from tests.ros.clusters import PATIENCE, host, wait_until
+from tests.ros.clusters import host
+from tests.waiting import PATIENCE, wait_until
 
 PROGRAM = Path(__file__).parent / "programs" / "dock.py"
 DOCK = ProcessSpec(
@@ -96,7 +97,10 @@ class Robots:
         """Stop the load, and wait for the outstanding messages."""
         for timer in self.timers:
             timer.cancel()
-        wait_until(lambda: len(self.receipts) >= self.orders, f"{self.orders} receipts", 10.0)
+        wait_until(
+            lambda: len(self.receipts) >= self.orders, f"{self.orders} receipts",
+            seen=lambda: f"{len(self.receipts)} came",
+        )  # fmt: skip
         reports = len(self.health)
         wait_until(lambda: len(self.health) >= reports + 2, "a report of the end")
 
@@ -126,11 +130,9 @@ class Robots:
     def ask(self, send):
         """Call a parameter service; repeat the call, because the server may have just gone."""
         for _ in range(5):
-            future = send()
-            deadline = time.monotonic() + 2.0
-            while not future.done() and time.monotonic() < deadline:
-                time.sleep(0.01)
-            if future.done():
+            future, answered = send(), threading.Event()
+            future.add_done_callback(lambda _, answered=answered: answered.set())
+            if answered.wait(2.0):
                 return future.result()
         raise AssertionError("no parameter service of /dock answers")
 
@@ -164,13 +166,7 @@ def move(cluster, robots, to: str, times: int) -> SimpleNamespace:
     """Migrate the dock; return the times of begin and end."""
     began = time.monotonic()
     cluster.client.migrate("dock", to)
-    cluster.wait_until(
-        f"dock on {to}",
-        lambda view: any(
-            (row.name, row.host, row.migrations, row.state) == ("dock", to, times, "running")
-            for row in view.processes
-        ),
-    )
+    cluster.wait("dock", "running", host=to, migrations=times)
     ended = time.monotonic()
     wait_until(lambda: robots.health[-1][0] > ended + 1.0, f"reports from {to}")
     return SimpleNamespace(began=began, ended=ended)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rosrm.model.values import InstanceId
 from rosrm.supervisor import log_index
 from rosrm.supervisor.client import LogLimits, newest_log
 from rosrm.supervisor.logs import PROCESSES_AT_ONCE
-
-from .conftest import wait_until
+from tests.waiting import wait_until
 
 KIB = 1024
 FLOOD = """
@@ -95,10 +96,12 @@ def test_logs_with_numbers_in_the_name_stay_apart(host):
     assert newest_log(host.state, "a.1") == InstanceId("a.1", 3)
 
 
-def test_any_process_name_is_a_safe_file_name(host):
+@pytest.mark.parametrize(
+    "name", ["../../ns/talker é", "/absolute", "with space", "a\nb", "."], ids=repr
+)
+def test_any_process_name_is_a_safe_file_name(host, name):
     """A process name with slashes and dots gives a path below the log folder."""
     client = host.connect()
-    name = "../../ns/talker é"
     host.run(client, host.order(name, "echo", "hello"))
     assert host.log(name).read_text() == "hello\n"
     assert host.state / "logs" in host.log(name).resolve().parents
