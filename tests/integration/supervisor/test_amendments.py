@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 
 import pytest
 
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
-
-from .conftest import wait_gone, wait_until
+from tests.waiting import wait_gone, wait_until
 
 NEVER = RestartPolicy("never")
 ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
@@ -164,11 +162,7 @@ def test_a_record_of_an_earlier_version_is_taken_over(host, client):
     client.start([host.order("kept", *SAYS_WHAT_IT_IS)])
     pid = host.running(client, "kept").pid
     host.kill_supervisor(client)
-    path = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for line in lines:
-        line.pop("memo", None)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    host.rewrite(lambda line: line.pop("memo", None))
     client = host.connect()
     assert [(one.state, one.pid) for one in client.instances] == [(InstanceState.RUNNING, pid)]
     assert client.notes == ()

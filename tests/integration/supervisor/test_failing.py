@@ -8,8 +8,7 @@ import signal
 import pytest
 
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
-
-from .conftest import wait_gone
+from tests.waiting import wait_gone
 
 AGAIN = RestartPolicy("on-failure", delay=0.05)
 

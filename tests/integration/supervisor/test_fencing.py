@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -15,8 +14,7 @@ import pytest
 
 import rosrm
 from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
-
-from .conftest import TIMEOUT, wait_gone, wait_until
+from tests.waiting import PATIENCE, holds_for, wait_gone, wait_until
 
 SLEEPS = ("sleep", "1000")
 DEAF = ("sh", "-c", "trap '' INT TERM; echo deaf; (trap '' INT TERM; sleep 1000) & wait; wait")
@@ -75,7 +73,7 @@ def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
     stopped = time.monotonic()
     wait_gone(one)
     took = time.monotonic() - stopped
-    assert 1.5 < took < TIMEOUT / 2, took  # the last renewal was 0.1 s before, on a quiet machine
+    assert 1.5 < took < PATIENCE / 2, took  # the last renewal was 0.1 s before, on a quiet machine
     assert alive(driver)
     slave.kill()
     slave.wait()
@@ -148,9 +146,9 @@ def test_a_killed_supervisor_puts_no_fence_off(host, client):
     """Repeated kills of the supervisor do not postpone the fence."""
     client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0))])
     pid = host.running(client, "one").pid
-    deadline = time.monotonic() + TIMEOUT
+    deadline = time.monotonic() + PATIENCE
     while alive(pid):
-        assert time.monotonic() < deadline, f"not fenced within {TIMEOUT} s"
+        assert time.monotonic() < deadline, f"not fenced within {PATIENCE} s"
         host.kill_supervisor(client)
         client = host.connect()
         client.receive(0.3)
@@ -181,9 +179,7 @@ def test_without_a_supervisor_nobody_fences_until_the_next(host, client):
     client.start([host.order("one", *SLEEPS, fence=Fence(0.5, 0.0))])
     pid = host.running(client, "one").pid
     host.kill_supervisor(client)
-    begun = time.monotonic()
-    wait_until(lambda: time.monotonic() > begun + 1.0, "its fence has passed")
-    assert alive(pid)
+    holds_for(1.0, lambda: alive(pid), "twice its fence")
     client = host.connect()
     if not of_one(client).state.ended:
         host.ended(client, "one")
@@ -228,17 +224,12 @@ def lose_power(host, client, *pids: int) -> None:
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
         wait_gone(pid)
-    rewrite(host, boot="another")
+    host.rewrite(lambda line: line["record"] == "header" and line.update(boot="another"))
 
 
-def rewrite(host, **header) -> None:
-    """Rewrite the record's header as another machine, or another version, would have left it."""
-    path = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for line in lines:
-        if line["record"] == "header":
-            line.update(header)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+def without_fences(line: dict) -> None:
+    for name in ("fence", "fenced", "heard", "kill_by"):
+        line.pop(name, None)
 
 
 def test_a_record_without_fences_is_taken_over(host, client):
@@ -246,12 +237,7 @@ def test_a_record_without_fences_is_taken_over(host, client):
     client.start([host.order("one", *SLEEPS)])
     pid = host.running(client, "one").pid
     host.kill_supervisor(client)
-    path = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for line in lines:
-        for name in ("fence", "fenced", "heard", "kill_by"):
-            line.pop(name, None)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    host.rewrite(without_fences)
     client = host.connect()
     assert client.notes == ()
     assert client.fenced == frozenset()
@@ -264,15 +250,14 @@ def test_a_supervisor_that_was_stopped_hears_first_what_was_said_in_time(host, c
     pid = host.running(client, "one").pid
     os.kill(client.pid, signal.SIGSTOP)
     try:
-        until = time.monotonic() + 2.5
-        while time.monotonic() < until:
-            client.heard(0.0, time.monotonic())
-            time.sleep(0.05)
+        holds_for(2.5, lambda: client.heard(0.0, time.monotonic()) is None, "more than its fence")
     finally:
         client.heard(0.0, time.monotonic())
         os.kill(client.pid, signal.SIGCONT)
-    until = time.monotonic() + 0.7
-    while time.monotonic() < until:
+
+    def goes_on() -> bool:
         client.heard(0.0, time.monotonic())
-        assert not any(status.state.ended for status in client.receive(0.05))
-    os.kill(pid, 0)
+        return not any(status.state.ended for status in client.receive(0.05))
+
+    holds_for(0.7, goes_on, "not fenced")
+    assert alive(pid)

@@ -19,8 +19,9 @@ from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 from rosrm.supervisor import instance_record, messages, procfs
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
+from tests.waiting import command_of, wait_gone, wait_until
 
-from .conftest import Host, command_line, wait_gone, wait_until
+from .conftest import Host
 
 OURS = messages.PROTOCOL
 
@@ -67,7 +68,7 @@ def test_processes_survive_a_killed_slave(host, slave):
     (status,) = client.instances
     assert status.instance == InstanceId("kept", 1)
     assert status.state is InstanceState.RUNNING
-    wait_until(lambda: command_line(status.pid).startswith("sleep"), "the process is executed")
+    wait_until(lambda: command_of(status.pid).startswith("sleep"), "the process is executed")
 
 
 def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):

@@ -12,8 +12,7 @@ from functools import partial
 import pytest
 
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
-
-from .conftest import wait_gone, wait_until
+from tests.waiting import wait_gone, wait_until
 
 IGNORES_ALL = """
 import signal, time
