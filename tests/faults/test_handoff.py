@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.faults.scenes import Scene
-from tests.faults.watching import blocks
+from tests.faults.handoff_scene import Scene
+from tests.faults.handoff_watcher import blocks
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -38,7 +38,7 @@ def scene(make_shared):
 @pytest.fixture(scope="module")
 def deaf(make_shared):
     """A scene like `scene`, whose process ends by SIGKILL only."""
-    one = Scene(make_shared, "count", module="tests.ros.programs.deaf")
+    one = Scene(make_shared, "count", module="tests.ros.programs.blocks_signals")
     yield one
     one.close()
 

@@ -19,7 +19,7 @@ from rosrm.model.values import (
     RestartPolicy,
     StandbyPolicy,
 )
-from tests.faults.watching import Watcher, instances
+from tests.faults.handoff_watcher import Watcher, instances
 from tests.ros.clusters import QUICK, Cluster, alive, host, service
 from tests.waiting import wait_until
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from rosrm.config.settings import LivenessSettings
 from rosrm.model.rows import ProcessRow
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
-from tests.faults.watching import Blow, Watcher, blocks, instances, is_gapless
+from tests.faults.handoff_watcher import Blow, Watcher, blocks, instances, is_gapless
 from tests.ros.clusters import QUICK, Cluster, host
 from tests.waiting import PATIENCE
 
