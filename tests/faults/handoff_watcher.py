@@ -92,7 +92,7 @@ class Watcher:
         self._thread.start()
 
     def inject_at(self, source: int, *faults: tuple[str, Fault]) -> None:
-        """Inject faults at these events, in order, in the next handoff away from instance `source`."""
+        """Inject faults at these events, in order, in the next handoff of instance `source`."""
         self.injected.clear()
         self.outputs.clear()
         self.heard.clear()
