@@ -321,16 +321,6 @@ def test_following_a_log_to_its_end(rosrm, cluster) -> None:
 # --- actions ----------------------------------------------------------------------------------
 
 
-def test_submit_and_wait(rosrm) -> None:
-    """`submit --wait` exits with 0 if all jobs succeed, with 1 if one fails."""
-    good = rosrm.file(
-        "good.yaml", "processes:\n  - {name: good-job, kind: job, command: ['true']}\n"
-    )
-    bad = rosrm.file("bad.yaml", "processes:\n  - {name: bad-job, kind: job, command: ['false']}\n")
-    rosrm.run("submit", good, "--wait")
-    rosrm.run("submit", bad, "--wait", code=1)
-
-
 def test_a_name_in_use(rosrm) -> None:
     """The submission exits with 1, and no process of the file is queued."""
     work = rosrm.file(

@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 from std_msgs.msg import Int64
 
-from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from rosrm.node.handoff.channel import STATE_CONFIG
 from rosrm.version import PROTOCOL_VERSION
@@ -88,17 +87,6 @@ def end_of_migration(cluster, name: str):
     return ends[0]
 
 
-def test_the_state_moves_along(cluster) -> None:
-    """The counter continues on another host, and keeps its process name."""
-    cluster.submit(counter("good"))
-    before, event = migrate(cluster, "good")
-    assert event.kind == "migrated", event.message
-    after = cluster.wait("good", "running")
-    assert {before.host, after.host} == {"h0", "h1"}
-    assert not alive(before.pid)
-    cluster.cancel("good")
-
-
 def test_a_node_whose_clock_stands_still_moves(cluster) -> None:
     """A node on simulated time without a clock migrates, because rosrm uses another clock."""
     ticks = (
@@ -152,17 +140,6 @@ def test_a_destination_that_is_never_ready_is_given_up_in_time(cluster):
         assert cluster.wait(name, "running").pid == row.pid
         assert alive(row.pid)
     cluster.cancel(*programs)
-
-
-def test_a_process_that_is_moving_is_not_moved_again(cluster) -> None:
-    """The second order is refused with the destination of the first."""
-    cluster.submit(counter("twice"))
-    cluster.wait("twice", "running")
-    cluster.client.migrate("twice")
-    with pytest.raises(Refused, match="twice is moving already, to h"):
-        cluster.client.migrate("twice")
-    cluster.wait_for_event("migrated", process="twice")
-    cluster.cancel("twice")
 
 
 def test_a_foreign_state_config_moves_nothing(cluster) -> None:

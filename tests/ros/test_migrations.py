@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import MigrationSettings, ProcessDefaults
-from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy, Readiness
 from tests.ros.clusters import (
     CALM,
@@ -147,24 +146,6 @@ def test_a_destination_that_never_gets_ready_changes_nothing(cluster) -> None:
         assert after.migrations == 0
         assert (after.pid == row.pid) == overlaps[name]
     cluster.cancel(*overlaps)
-
-
-def test_impossible_migrations_are_refused(cluster) -> None:
-    """Refused: without a strategy, while queued, to the current host, to an unknown host."""
-    cluster.submit(service("rooted"), service("mobile", migration=MOVES))
-    cluster.wait("rooted", "running")
-    here = cluster.wait("mobile", "running").host
-    with pytest.raises(Refused, match="no migration strategy"):
-        cluster.client.migrate("rooted")
-    with pytest.raises(Refused, match="already"):
-        cluster.client.migrate("mobile", here)
-    with pytest.raises(Refused, match="nowhere"):
-        cluster.client.migrate("mobile", "nowhere")
-    cluster.client.set_host_state(other(here), "cordon")
-    with pytest.raises(Refused, match="cordoned"):
-        cluster.client.migrate("mobile", other(here))
-    cluster.client.set_host_state(other(here), "uncordon")
-    cluster.cancel("rooted", "mobile")
 
 
 def test_drain_empties_a_host(cluster) -> None:

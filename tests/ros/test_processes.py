@@ -14,10 +14,8 @@ from rosrm.config.settings import LogSettings
 from rosrm.errors import Refused
 from rosrm.model.values import (
     Kind,
-    MigrationPolicy,
     ProcessSpec,
     Readiness,
-    RestartPolicy,
 )
 from tests.ros.clusters import CALM, NODE, QUICK, alive, host, job, node, python, service
 from tests.waiting import wait_gone, wait_until
@@ -57,15 +55,6 @@ def test_a_command_runs_to_its_end(cluster) -> None:
     assert kinds.index("assigned") < kinds.index("finished")
 
 
-def test_a_module_runs(cluster) -> None:
-    """A module runs as by `python -m`, with the slave's Python."""
-    spec = ProcessSpec(
-        "module", module="json.tool", arguments=("--help",), kind=Kind.JOB, stop=QUICK
-    )
-    assert cluster.run(spec)[0].state == "finished"
-    assert "usage: python" in cluster.log("module")
-
-
 def test_a_service_runs_until_it_is_cancelled(cluster) -> None:
     """A service has a pid, shows its usage, and is gone after a cancellation."""
     cluster.submit(service("sleeper"))
@@ -76,14 +65,6 @@ def test_a_service_runs_until_it_is_cancelled(cluster) -> None:
     cluster.cancel("sleeper")
     assert not alive(row.pid)
     assert cluster.process("sleeper").state == "cancelled"
-
-
-def test_a_service_that_exits_has_finished_or_failed(cluster) -> None:
-    """The exit code decides, and is kept."""
-    good, bad = cluster.run(service("good", "true"), service("bad", "sh", "-c", "exit 7"))
-    assert good.state == "finished"
-    assert (bad.state, bad.exit_code) == ("failed", 7)
-    assert "7" in bad.reason
 
 
 def test_a_program_that_is_not_there(cluster) -> None:
@@ -187,17 +168,6 @@ def test_never_ready_is_stopped_and_has_failed(cluster) -> None:
 # --- restarts ---------------------------------------------------------------------------------
 
 
-def test_on_failure_leaves_a_success_alone(cluster) -> None:
-    """`on-failure` does not restart a process that exits with 0, `always` does."""
-    on_failure = RestartPolicy("on-failure", delay=0.05)
-    always = RestartPolicy("always", delay=0.05, attempts=2)
-    done, again = cluster.run(
-        service("done", "true", restart=on_failure), service("again", "true", restart=always)
-    )
-    assert (done.state, done.restarts) == ("finished", 0)
-    assert again.restarts == 2
-
-
 def test_restart_by_hand(cluster) -> None:
     """A running process restarts on its host with a new pid; an ended one is queued again."""
     cluster.submit(service("again-by-hand"))
@@ -213,16 +183,6 @@ def test_restart_by_hand(cluster) -> None:
 
 
 # --- missing requirements ---------------------------------------------------------------------
-
-
-def test_a_missing_package_fails_naming_every_host(cluster) -> None:
-    """All hosts are tried; the reason has the missing package for each."""
-    row = cluster.run(ProcessSpec("lost", package="no_such_package", executable="x", ros=True))[0]
-    assert row.state == "failed"
-    for name in ("h0", "h1"):
-        assert name in row.reason
-    assert "no_such_package" in row.reason
-    assert cluster.kinds("lost").count("assigned") == 2
 
 
 def test_what_one_host_lacks_goes_to_another(make_cluster, ament_prefix) -> None:
@@ -293,36 +253,3 @@ def test_no_log_is_said(cluster) -> None:
     """The error names a process that never ran on the host."""
     with pytest.raises(Refused, match="no log of nobody"):
         cluster.client.read_log("h0", "nobody", 0, 0, 0)
-
-
-# --- names ------------------------------------------------------------------------------------
-
-
-def test_a_name_in_use_is_refused_with_nothing_queued(cluster) -> None:
-    """A batch with one taken name is refused as a whole; the message has the name."""
-    cluster.submit(service("taken"))
-    with pytest.raises(Refused, match="taken") as refusal:
-        cluster.submit(job("fresh", "true"), service("taken"))
-    assert refusal.value.code == "name_taken"
-    with pytest.raises(Refused, match="twice"):
-        cluster.submit(job("double", "true"), job("double", "true"))
-    names = {row.name for row in cluster.client.list(processes=True).processes}
-    assert not names & {"fresh", "double"}
-    cluster.cancel("taken")
-    cluster.run(job("taken", "true"))
-
-
-def test_unknown_names_are_refused(cluster) -> None:
-    """Each refusal has the unknown name."""
-    for ask in (
-        lambda: cluster.client.cancel(["nobody"]),
-        lambda: cluster.client.restart(["nobody"]),
-        lambda: cluster.client.migrate("nobody"),
-        lambda: cluster.client.explain("nobody"),
-        lambda: cluster.client.set_host_state("nowhere", "drain"),
-        lambda: cluster.client.set_host_state("h0", "explode"),
-    ):
-        with pytest.raises(Refused, match=r"nobody|nowhere|explode"):
-            ask()
-    with pytest.raises(Refused, match="teleport"):
-        cluster.submit(service("moving", migration=MigrationPolicy("teleport")))

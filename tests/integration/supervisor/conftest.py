@@ -83,6 +83,16 @@ class Host:
         wait_gone(client.pid)
         client.close()
 
+    def replace_supervisor(self, client) -> SupervisorClient:
+        """Kill the supervisor with SIGKILL; return the connection to the next one."""
+        self.kill_supervisor(client)
+        return self.connect()
+
+    def reconnect(self, client) -> SupervisorClient:
+        """Close a connection, and return another one."""
+        client.close()
+        return self.connect()
+
     def rewrite(self, change: Callable[[dict], object]) -> None:
         """Change each line of the record, as another version or another boot would have left it."""
         path = self.state / "instances.jsonl"

@@ -87,9 +87,8 @@ def test_logs_of_old_processes_are_pruned(host):
     assert newest_log(host.state, "job0") is None
 
 
-def test_logs_with_numbers_in_the_name_stay_apart(host):
+def test_logs_with_numbers_in_the_name_stay_apart(host, client):
     """The processes `a` and `a.1` have separate logs."""
-    client = host.connect()
     host.run(client, host.order("a", "echo", "first", number=2))
     host.run(client, host.order("a.1", "echo", "second", number=3))
     assert newest_log(host.state, "a") == InstanceId("a", 2)
