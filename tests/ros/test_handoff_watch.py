@@ -15,7 +15,7 @@ from std_msgs.msg import Int64, String
 
 from rosrm.testing.local_cluster import claim_domain
 from rosrm_migration.handoff import watch
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE, wait_until
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -74,7 +74,7 @@ def test_a_second_publisher_is_heard(qos):
         thread.join(1.0)
         assert thread.is_alive()
         with publishing("destination", qos):
-            thread.join(15.0)
+            thread.join(PATIENCE)
     (result,) = heard
     assert result["heard"] > 10
     assert result["seconds"] > 0.9

@@ -7,6 +7,7 @@ import threading
 import time
 from itertools import groupby, pairwise
 from pathlib import Path
+from statistics import median
 from types import SimpleNamespace
 
 import pytest
@@ -34,7 +35,7 @@ DOCK = ProcessSpec(
     readiness=Readiness(timeout=PATIENCE),
 )
 CHARGE = 100  # of each order: more comes than is delivered, so that `current` shows the limit
-ANSWER_TIMEOUT = 1.0  # seconds until a call is given up
+ANSWER_TIMEOUT = 3.0  # seconds until a call is given up, which a busy machine may take
 
 
 class Robots:
@@ -224,8 +225,8 @@ def test_a_node_from_the_guide_moves_there_and_back_with_its_state(cluster, robo
     # The slow timer keeps its period.
     times, reports = zip(*((when, data[0]) for when, data in robots.health), strict=True)
     assert list(reports) == [reports[0] + n for n in range(len(reports))]
-    assert all(0.3 < b - a < 1.9 for a, b in pairwise(times))
-    assert abs(times[-1] - times[0] - (len(reports) - 1)) < 1.0
+    phases = [when - number for number, when in zip(reports, times, strict=True)]
+    assert abs(median(phases[-5:]) - median(phases[:5])) < 0.5  # one may be late, of a busy machine
 
 
 def counted(number: int) -> range:
