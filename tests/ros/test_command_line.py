@@ -222,8 +222,8 @@ def test_logs(rosrm) -> None:
 
 def test_an_unknown_name(rosrm) -> None:
     """The command exits with 1 and the name in its error."""
-    assert "nobody" in rosrm.run("cancel", "nobody", code=1)
-    assert "no such process" in rosrm.run("logs", "nobody", code=1)
+    assert "absent" in rosrm.run("cancel", "absent", code=1)
+    assert "no such process" in rosrm.run("logs", "absent", code=1)
 
 
 # --- until Ctrl-C -----------------------------------------------------------------------------

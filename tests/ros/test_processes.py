@@ -109,7 +109,7 @@ def test_name_parameters_and_remappings_reach_the_node(cluster, ament_prefix) ->
 
 
 def test_the_environment(cluster) -> None:
-    """It has no variable of the wheels' bootstrapper, but the spec's, and the identity.
+    """The environment has the spec's variables and the identity, and none of the bootstrapper's.
 
     A node checks messages by its own and its master's identity.
     """
