@@ -7,6 +7,7 @@ can send, or omit, each message at any moment.
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,6 +26,8 @@ from rosrm_msgs.msg import HandoffReport, StateConfig
 from tests.waiting import PATIENCE, wait_until
 
 TOPIC = "/rosrm/state_config"
+#: Name of a destination.
+ALIAS = "counter_1700000000"
 CLUSTER = "rosrm"
 EPOCH = 3
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -233,3 +236,12 @@ class Conductor:
         self.wait(self.config.destination, HandoffReport.ABORTED)
         self.say(StateConfig.RESUME)
         self.wait(self.config.source, HandoffReport.RESUMED)
+
+
+def pair_of(stage: Stage, make: Callable[..., Any], **named: Any) -> SimpleNamespace:
+    """Return a source, its shadow as destination, and the conductor of their handoff."""
+    first = stage.instance(make, 1, **named)
+    second = stage.instance(make, 2, alias=ALIAS, shadow=True, **named)
+    return SimpleNamespace(
+        first=first, second=second, conductor=Conductor(stage, source=1, destination=2)
+    )

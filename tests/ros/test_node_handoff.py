@@ -18,7 +18,17 @@ from std_srvs.srv import Trigger
 from rosrm.node import Migratable
 from rosrm.node.handoff import source
 from rosrm_msgs.msg import HandoffReport, StateConfig
-from tests.ros.nodes import EPOCH, PATIENCE, RELIABLE, Conductor, Counter, Server, Stage
+from tests.ros.nodes import (
+    ALIAS,
+    EPOCH,
+    PATIENCE,
+    RELIABLE,
+    Conductor,
+    Counter,
+    Server,
+    Stage,
+    pair_of,
+)
 
 R, C = HandoffReport, StateConfig
 
@@ -27,13 +37,10 @@ R, C = HandoffReport, StateConfig
 def pair(stage):
     """Return a counting source, its shadow, their received outputs, and a conductor."""
     counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")
-    first = stage.instance(Counter, 1)
+    pair = pair_of(stage, Counter)
+    pair.counts, pair.sums = counts, sums
     stage.spin_until(lambda: counts, "the first count")
-    second = stage.instance(Counter, 2, alias="counter_1700000000", shadow=True)
-    conductor = Conductor(stage, source=1, destination=2)
-    return SimpleNamespace(
-        first=first, second=second, counts=counts, sums=sums, conductor=conductor
-    )
+    return pair
 
 
 def numbers(heard):
@@ -95,7 +102,7 @@ def test_a_shadow_that_is_slower_than_its_source_keeps_up(stage):
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.plain.create_timer(0.002, lambda: talker.publish(Int64(data=1)))
     stage.spin_until(lambda: counts and sums, "the source's outputs")
-    busy.instance(partial(Counter, period=0.002), 2, alias="counter_1700000000", shadow=True)
+    busy.instance(partial(Counter, period=0.002), 2, alias=ALIAS, shadow=True)
     conductor = Conductor(stage, source=1, destination=2)
 
     def is_ready():
@@ -127,7 +134,7 @@ def test_the_alias_changes_no_visible_name(stage, pair):
 
     stage.spin_until(lambda: stage.plain.count_publishers("/counter/state") == 1, "its state topic")
     stage.spin_until(lambda: "/counter/set_parameters" in names(), "its parameter services")
-    assert pair.second.get_name() == "counter_1700000000"
+    assert pair.second.get_name() == ALIAS
     assert not [name for name in names() if "1700000000" in name and "type_desc" not in name]
 
 
@@ -185,8 +192,7 @@ def test_parameters_that_are_valid_only_together_move_along(stage):
 
 def test_a_service_is_served_by_the_active_node_alone(stage):
     """In DDS all servers of a name get a request: a shadow has none, a silent node buffers."""
-    first = stage.instance(Server, 1)
-    second = stage.instance(Server, 2, alias="counter_17", shadow=True)
+    pair = pair_of(stage, Server)
     client = stage.plain.create_client(Trigger, "/counter/poke")
 
     def call():
@@ -194,24 +200,20 @@ def test_a_service_is_served_by_the_active_node_alone(stage):
         stage.spin_until(future.done, "an answer")
         return future.result().message
 
-    conductor = Conductor(stage, source=1, destination=2)
-    conductor.prepare()
+    pair.conductor.prepare()
     stage.spin_until(client.service_is_ready, "the service")
     assert [call() for _ in range(3)] == ["counter"] * 3
     assert _servers(stage, "/counter/poke") == ["counter"]
-    conductor.hand_over()
-    stage.spin_until(
-        lambda: _servers(stage, "/counter/poke") == ["counter_17"], "the successor's service"
-    )
-    assert [call() for _ in range(3)] == ["counter_17"] * 3
-    assert (first.served, second.served) == (3, 3)
+    pair.conductor.hand_over()
+    stage.spin_until(lambda: _servers(stage, "/counter/poke") == [ALIAS], "the successor's service")
+    assert [call() for _ in range(3)] == [ALIAS] * 3
+    assert (pair.first.served, pair.second.served) == (3, 3)
 
 
 def _servers(stage, name):
     """Return the nodes that serve a name, according to the graph."""
-    nodes = ("counter", "counter_17")
     return [
-        node for node in nodes
+        node for node in ("counter", ALIAS)
         if name in dict(stage.plain.get_service_names_and_types_by_node(node, "/"))
     ]  # fmt: skip
 
@@ -221,19 +223,15 @@ def test_timers_go_on_in_step(stage):
     ticks = stage.listen(Int64, "count")
     times = []
     stage.plain.create_subscription(Int64, "count", lambda _: times.append(time.monotonic()), 10)
-    first = stage.instance(lambda **named: Counter(period=2.0, **named), 1)
-    second = stage.instance(
-        lambda **named: Counter(period=2.0, **named), 2, alias="counter_17", shadow=True
-    )
-    conductor = Conductor(stage, source=1, destination=2)
-    conductor.hand_over()
-    stage.remove(first)
+    pair = pair_of(stage, partial(Counter, period=2.0))
+    pair.conductor.hand_over()
+    stage.remove(pair.first)
     done = len(ticks)
     stage.spin_until(lambda: len(times) >= done + 2, "two more ticks")
     assert numbers(ticks) == list(range(1, len(ticks) + 1))
     gaps = [later - earlier for earlier, later in pairwise(times)]
     assert all(1.0 < gap < 3.0 for gap in gaps), gaps
-    assert second.timer.timer_period_ns == 2_000_000_000
+    assert pair.second.timer.timer_period_ns == 2_000_000_000
 
 
 def test_a_successor_can_be_succeeded(stage, pair):
@@ -358,12 +356,11 @@ def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(s
             made.append(("made", self.get_name()))
             return SimpleNamespace(destroy=lambda: made.append(("destroyed", self.get_name())))
 
-    stage.instance(Opener, 1)
-    stage.instance(Opener, 2, alias="counter_17", shadow=True)
+    pair = pair_of(stage, Opener)
     assert made == [("made", "counter")]
-    Conductor(stage, source=1, destination=2).hand_over()
+    pair.conductor.hand_over()
     stage.spin_until(lambda: len(made) == 3, "what the successor makes")
-    assert made[1:] == [("destroyed", "counter"), ("made", "counter_17")]
+    assert made[1:] == [("destroyed", "counter"), ("made", ALIAS)]
 
 
 def test_inputs_are_served_between_two_services_that_open(stage):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from types import SimpleNamespace
 
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -13,10 +12,9 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rosrm_msgs.msg import HandoffReport, StateConfig
-from tests.ros.nodes import RELIABLE, Conductor, Counter, Server, Stage
+from tests.ros.nodes import ALIAS, RELIABLE, Conductor, Counter, Server, Stage, pair_of
 
 R, C = HandoffReport, StateConfig
-ALIAS = "counter_1700000000"
 
 
 class Listener(Counter):
@@ -106,14 +104,6 @@ class Talker:
     def end(self) -> None:
         self._end.set()
         self._thread.join(5.0)
-
-
-def pair_of(stage, make, **named):
-    first = stage.instance(make, 1, **named)
-    second = stage.instance(make, 2, alias=ALIAS, shadow=True, **named)
-    return SimpleNamespace(
-        first=first, second=second, conductor=Conductor(stage, source=1, destination=2)
-    )
 
 
 # --- one thread -------------------------------------------------------------------------------
