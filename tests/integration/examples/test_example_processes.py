@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from rosrm.testing.local_cluster import claim_domain
-from rosrm_examples import holder
 from rosrm_examples.pieces import load_piece
 from tests.waiting import PATIENCE, wait_until
 
@@ -270,11 +269,12 @@ def test_holder_can_be_a_ros_node(start: Start, listen) -> None:
 
 
 @pytest.mark.parametrize("size", ["-5", "much", "nan", "inf"])
-def test_holder_refuses_what_is_no_size(capsys, size: str) -> None:
-    """The error names the option and what is allowed."""
-    with pytest.raises(SystemExit, match="2"):
-        holder.main(["--mb", size])
-    assert f"argument --mb: {size} is not a number from 0" in capsys.readouterr().err
+def test_holder_refuses_what_is_no_size(start: Start, size: str) -> None:
+    """The error names the option and what is allowed; the process blocks signals, so it is real."""
+    process = start("holder", "--mb", size)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2
+    assert f"argument --mb: {size} is not a number from 0" in errors
 
 
 def test_holder_says_when_there_is_no_more_memory(start: Start) -> None:
