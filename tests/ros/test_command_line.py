@@ -162,16 +162,6 @@ def test_hosts(rosrm) -> None:
     assert 0.0 <= memory["usage"] < memory["limit"] == pytest.approx(0.8)
 
 
-def test_status(rosrm) -> None:
-    """`rosrm status` prints half a page, with counts."""
-    text = rosrm.run("status")
-    assert "2 up" in text
-    assert "loser" in text
-    counts = rosrm.json("status")
-    assert counts["hosts"] == {"up": 2}
-    assert counts["processes"]["failed"] == 1
-
-
 def test_events(rosrm) -> None:
     """`rosrm events` prints events in order, optionally of one process."""
     assert "counter" in rosrm.run("events")
