@@ -43,7 +43,7 @@ class TestHandoffAsInThePaper(MigrationContract):
     offer = OFFERS["handoff"]
     options: ClassVar = {"protocol": "paper", "state": "/p/state", "type": "std_msgs/msg/Int64"}
     spec = ProcessSpec("p", command=("true",), ros=True)
-    not_called: ClassVar = {"handoff_watch": "needs a ROS graph: tests/ros/test_watching.py"}
+    not_called: ClassVar = {"handoff_watch": "needs a ROS graph: tests/ros/test_handoff_watch.py"}
 
     def moves(self):
         """Return moves of processes that may overlap: both instances are briefly active."""

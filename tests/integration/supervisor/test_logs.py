@@ -9,8 +9,7 @@ from rosrm.model.values import InstanceId
 from rosrm.slave.logs import newest_instance
 from rosrm.supervisor import log_index
 from rosrm.supervisor.logs import PROCESSES_AT_ONCE, LogLimits
-
-from .conftest import wait_until
+from tests.waiting import wait_until
 
 KIB = 1024
 FLOOD = """
@@ -90,19 +89,20 @@ def test_logs_of_old_processes_are_pruned(host):
         newest_instance(host.state, "job0")
 
 
-def test_logs_with_numbers_in_the_name_stay_apart(host):
+def test_logs_with_numbers_in_the_name_stay_apart(host, client):
     """The processes `a` and `a.1` have separate logs."""
-    client = host.connect()
     host.run(client, host.order("a", "echo", "first", number=2))
     host.run(client, host.order("a.1", "echo", "second", number=3))
     assert newest_instance(host.state, "a") == InstanceId("a", 2)
     assert newest_instance(host.state, "a.1") == InstanceId("a.1", 3)
 
 
-def test_any_process_name_is_a_safe_file_name(host):
+@pytest.mark.parametrize(
+    "name", ["../../ns/talker é", "/absolute", "with space", "a\nb", "."], ids=repr
+)
+def test_any_process_name_is_a_safe_file_name(host, name):
     """A process name with slashes and dots gives a path below the log folder."""
     client = host.connect()
-    name = "../../ns/talker é"
     host.run(client, host.order(name, "echo", "hello"))
     assert host.log(name).read_text() == "hello\n"
     assert host.state / "logs" in host.log(name).resolve().parents

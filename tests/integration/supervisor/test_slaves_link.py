@@ -17,8 +17,7 @@ from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.supervisor import send_buffer
 from rosrm.supervisor.client import SupervisorClient
-
-from .conftest import TIMEOUT, wait_gone
+from tests.waiting import PATIENCE, wait_gone
 
 #: Together more than a socket buffer holds.
 COUNT, LARGE = 10, "x" * 100_000
@@ -47,10 +46,10 @@ class Loop:
         return pid
 
     def wait(self, condition, what: str) -> None:
-        deadline = time.monotonic() + TIMEOUT
+        deadline = time.monotonic() + PATIENCE
         while not condition():
             left = deadline - time.monotonic()
-            assert left > 0, f"not within {TIMEOUT} s: {what}; {self.log.messages}, {self.ended}"
+            assert left > 0, f"not within {PATIENCE} s: {what}; {self.log.messages}, {self.ended}"
             try:
                 self.posted.get(timeout=min(left, 0.1))()
             except queue.Empty:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from rosrm.config.settings import MigrationSettings, ProcessDefaults
-from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy, Readiness
 from tests.ros.clusters import (
     CALM,
@@ -22,9 +20,8 @@ from tests.ros.clusters import (
     node,
     python,
     service,
-    wait_gone,
-    wait_until,
 )
+from tests.waiting import wait_gone, wait_until
 
 MOVES = MigrationPolicy("relaunch")
 STOPS_FIRST = MigrationPolicy("relaunch", overlap=False)
@@ -44,31 +41,16 @@ def other(name: str) -> str:
     return {"left": "right", "right": "left"}[name]
 
 
-def moved(cluster, name: str, times: int = 1):
-    view = cluster.wait_until(
-        f"{name} moved {times} times",
-        lambda v: any(
-            r.name == name and r.migrations == times and r.state == "running" for r in v.processes
-        ),
-    )
-    return next(row for row in view.processes if row.name == name)
+def moved(cluster, name: str):
+    return cluster.wait(name, "running", migrations=1)
 
 
-def written(folder, runs: int) -> None:
+def started(folder, runs: int) -> None:
     """Wait until this number of runs has written its start time."""
     wait_until(
         lambda: sum(bool(path.read_text()) for path in folder.iterdir()) == runs,
         f"{runs} runs at work",
     )
-
-
-def spans(folder) -> list[tuple[float, float]]:
-    """Return the start and end times of the runs that wrote both."""
-    runs = []
-    for path in folder.iterdir():
-        times = [float(line) for line in path.read_text().split()]
-        runs.append((times[0], times[-1]))
-    return sorted(runs)
 
 
 #: Writes the time of its start (from its /proc entry) and of its end.
@@ -92,38 +74,31 @@ def recorder(cluster, name: str, migration: MigrationPolicy):
     return replace(spec, arguments=(str(folder),)), folder
 
 
-def test_start_first_has_never_none(cluster) -> None:
-    """By default the new instance is ready before the old one stops; then it runs alone."""
-    spec, folder = recorder(cluster, "overlapping", MOVES)
+@pytest.mark.parametrize(("name", "migration"), [("overlaps", MOVES), ("apart", STOPS_FIRST)])
+def test_the_order_of_start_and_stop(cluster, name, migration) -> None:
+    """By default the new instance is ready before the old one stops; then it runs alone.
+
+    With `overlap: false` the old instance ends before the new one starts.
+    """
+    spec, folder = recorder(cluster, name, migration)
     cluster.submit(spec)
-    before = cluster.wait("overlapping", "running")
-    written(folder, 1)
-    assert "moves to" in cluster.client.migrate("overlapping")
-    after = moved(cluster, "overlapping")
+    before = cluster.wait(name, "running")
+    started(folder, 1)
+    assert "moves to" in cluster.client.migrate(name)
+    after = moved(cluster, name)
     assert after.host == other(before.host)
     wait_gone(before.pid)
     assert alive(after.pid)
-    written(folder, 2)
-    cluster.cancel("overlapping")
-    (_, first_end), (second_begin, _) = spans(folder)
-    assert second_begin <= first_end
-    kinds = cluster.kinds("overlapping")
+    started(folder, 2)
+    cluster.cancel(name)
+    runs = [list(map(float, path.read_text().split())) for path in folder.iterdir()]
+    (_, first_end), (second_begin, _) = sorted(runs)
+    if name == "overlaps":
+        assert second_begin <= first_end
+    else:
+        assert first_end <= second_begin + 1 / os.sysconf("SC_CLK_TCK")  # starts are in ticks
+    kinds = cluster.kinds(name)
     assert kinds.index("migration_begun") < kinds.index("migrated")
-
-
-def test_stop_first_has_never_two(cluster) -> None:
-    """With `overlap: false` the old instance ends before the new one starts."""
-    spec, folder = recorder(cluster, "apart", STOPS_FIRST)
-    cluster.submit(spec)
-    before = cluster.wait("apart", "running")
-    written(folder, 1)
-    cluster.client.migrate("apart", other(before.host))
-    after = moved(cluster, "apart")
-    assert after.host == other(before.host)
-    written(folder, 2)
-    cluster.cancel("apart")
-    (_, first_end), (second_begin, _) = spans(folder)
-    assert first_end <= second_begin + 1 / os.sysconf("SC_CLK_TCK")  # starts are in ticks
 
 
 def test_a_ros_node_moves_under_its_own_name(cluster) -> None:
@@ -171,24 +146,6 @@ def test_a_destination_that_never_gets_ready_changes_nothing(cluster) -> None:
         assert after.migrations == 0
         assert (after.pid == row.pid) == overlaps[name]
     cluster.cancel(*overlaps)
-
-
-def test_what_cannot_move_is_refused(cluster) -> None:
-    """Refused: without a strategy, while queued, to the current host, to an unknown host."""
-    cluster.submit(service("rooted"), service("mobile", migration=MOVES))
-    cluster.wait("rooted", "running")
-    here = cluster.wait("mobile", "running").host
-    with pytest.raises(Refused, match="no migration strategy"):
-        cluster.client.migrate("rooted")
-    with pytest.raises(Refused, match="already"):
-        cluster.client.migrate("mobile", here)
-    with pytest.raises(Refused, match="nowhere"):
-        cluster.client.migrate("mobile", "nowhere")
-    cluster.client.set_host_state(other(here), "cordon")
-    with pytest.raises(Refused, match="cordoned"):
-        cluster.client.migrate("mobile", other(here))
-    cluster.client.set_host_state(other(here), "uncordon")
-    cluster.cancel("rooted", "mobile")
 
 
 def test_drain_empties_a_host(cluster) -> None:
@@ -245,7 +202,7 @@ def grower(cluster, name: str, where: str, mib: int, **options):
     return replace(spec, arguments=(str(go), where, str(mib))), go
 
 
-def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
+def test_eviction_from_a_host_over_its_limit(make_cluster) -> None:
     """After the hysteresis the process that helps most and fits elsewhere leaves; others stay."""
     hysteresis = 4.0  # seconds; by then the master knows the size of each process
     limits = {"memory": 0.5, "cpu": 1.0}
@@ -275,46 +232,3 @@ def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
     cluster.wait_for_event("nothing_moves", "rooted has no migration strategy", host="full")
     assert "small" not in {e.process for e in cluster.events("migration_begun")[1:]}
     cluster.cancel("big", "small", "rooted")
-
-
-def test_nothing_moves_when_every_host_is_full(make_cluster) -> None:
-    """With both hosts over their limits nothing is assigned or migrated; the queue waits."""
-    limits = {"memory": 0.5, "cpu": 1.0}
-    cluster = make_cluster(
-        host("a", memory=400 * MIB, limits=limits), host("b", memory=400 * MIB, limits=limits),
-        migration=MigrationSettings(hysteresis=0.2, cooldown=0.0),
-        defaults=ProcessDefaults(needs={"memory": MIB}), liveness=STEADY,
-    )  # fmt: skip
-    specs = []
-    for where in ("a", "b"):
-        spec, go = grower(cluster, f"on-{where}", where, 200, migration=MOVES, preferred_labels={})
-        go.touch()
-        specs.append(spec)
-    cluster.client.set_host_state("b", "cordon")
-    cluster.submit(specs[0])
-    assert cluster.wait("on-a", "running").host == "a"
-    # Before its size is known, the process would fit on the other host.
-    cluster.wait_until(
-        "a over its limit, and all of on-a seen",
-        lambda v: (
-            v.processes[0].memory > 245 * MIB
-            and not any(row.accepting for row in v.hosts if row.description.name == "a")
-        ),
-    )
-    cluster.client.set_host_state("b", "uncordon")
-    cluster.submit(specs[1])
-    assert cluster.wait("on-b", "running").host == "b"
-    cluster.wait_until(
-        "both over", lambda v: not any(row.accepting for row in v.hosts) and bool(v.hosts)
-    )
-    cluster.submit(service("waits"))
-    deadline = time.monotonic() + 1.5
-    while time.monotonic() < deadline:
-        cluster.client.spin(0.1)
-        rows = {row.name: row for row in cluster.client.list(processes=True).processes}
-        assert rows["waits"].state == "queued"
-        assert rows["on-a"].state == rows["on-b"].state == "running"
-    assert not cluster.events("migration_begun")
-    cluster.cancel("on-a")
-    assert cluster.wait("waits", "running").host == "a"
-    cluster.cancel("on-b", "waits")

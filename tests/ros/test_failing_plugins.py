@@ -6,14 +6,14 @@ import os
 import signal
 import textwrap
 import time
-from pathlib import Path
 
 import pytest
 
 from rosrm.config.settings import MigrationSettings, ScoringChoice
 from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy
-from tests.ros.clusters import PATIENCE, host, job, service, wait_until
+from tests.ros.clusters import host, job, service
+from tests.waiting import PATIENCE, wait_until
 
 PLUGIN = """
 import os, sys, time
@@ -44,14 +44,9 @@ def hangs(count):
 @hookimpl
 def register_scoring_policies():
     return [
-        named("raises", raises), named("nan", lambda count: np.full(count, np.nan)),
-        named("wrong_size", lambda count: np.zeros(count + 1)), named("hangs", hangs),
+        named("raises", raises), named("hangs", hangs),
         named("exits", lambda count: sys.exit(3)),
-        ScoringOffer("answers_none", lambda options: Silent()),
     ]
-
-class Silent:
-    def score(self, hosts, process): pass
 
 class Probe:
     def __init__(self, name, act):
@@ -80,7 +75,6 @@ def probe(name, act):
 def register_probes():
     return [
         probe("battery", lambda: 0.25), probe("fails", fails), probe("sleeps", sleeps),
-        probe("nan_probe", lambda: float("nan")),
         probe("comes_back", comes_back),
         ProbeOffer("no_unit", lambda options, context: NoUnit("no_unit", lambda: 0.0)),
         ProbeOffer("absent_one", absent), ProbeOffer("broken_one", broken),
@@ -215,14 +209,7 @@ def plugins(cluster) -> list:
 
 @pytest.mark.parametrize(
     ("policy", "said"),
-    [
-        ("raises", "out of order"),
-        ("nan", "nan"),
-        ("wrong_size", "scores of shape (2,)"),
-        ("hangs", "1 s"),
-        ("exits", "SystemExit: 3"),
-        ("answers_none", "answered None; Scores is required"),
-    ],
+    [("raises", "out of order"), ("hangs", "1 s"), ("exits", "SystemExit: 3")],
 )
 def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, policy, said) -> None:
     """A process is placed without the failing policy, with an event; the master keeps running."""
@@ -251,11 +238,11 @@ def probes(*names: str) -> dict:
 @pytest.fixture(scope="module")
 def cluster(make_shared, third_party):
     """Yield a host with all these probes, and a limit on the working one."""
-    names = ("battery", "fails", "sleeps", "nan_probe", "absent_one", "broken_one")
+    names = ("battery", "fails", "sleeps", "absent_one", "broken_one")
     return make_shared(host("h0", probes=probes(*names), limits={"battery": 0.5}))
 
 
-def test_a_third_party_s_probe_is_read(cluster) -> None:
+def test_a_probe_of_a_third_party_is_read(cluster) -> None:
     """A third party's resource has a limit, a reading in the rows, and counts in needs."""
 
     def shown(view) -> bool:
@@ -270,7 +257,7 @@ def test_a_third_party_s_probe_is_read(cluster) -> None:
     cluster.cancel("heavy")
 
 
-@pytest.mark.parametrize("name", ["fails", "sleeps", "nan_probe"])
+@pytest.mark.parametrize("name", ["fails", "sleeps"])
 def test_a_probe_that_fails_is_stale_never_zero(cluster, name) -> None:
     """A failing probe stops new work, until it works, only where its resource has a limit."""
     works, waits, limited = f"works-{name}", f"waits-{name}", f"limited-{name}"
@@ -287,15 +274,12 @@ def test_a_probe_that_fails_is_stale_never_zero(cluster, name) -> None:
     cluster.wait_until(f"{name} stale on {limited}", stale)
     cluster.client.set_host_state("h0", "cordon")
     cluster.submit(job(waits, "true"))
-    deadline = time.monotonic() + 1.0
-    while time.monotonic() < deadline:
-        cluster.client.spin(0.1)
-        assert cluster.process(waits).state in ("queued", "set_aside")
+    waiting = ("queued", "set_aside")
+    cluster.stays(1.0, lambda: cluster.process(waits).state in waiting, "no host takes it")
     assert not cluster.host(limited).accepting
     cluster.cancel(waits)
     cluster.client.set_host_state("h0", "uncordon")
-    part.end()
-    assert part.process.wait(PATIENCE) == 0
+    assert cluster.end(part, signal.SIGINT) == 0
 
 
 def test_a_probe_that_fails_is_listed_until_it_works_again(make_cluster, third_party) -> None:
@@ -350,84 +334,78 @@ def test_a_probe_that_is_absent_or_broken_is_listed(cluster) -> None:
 # --- migration --------------------------------------------------------------------------------
 
 
-def test_a_strategy_that_gives_no_plan(make_cluster, third_party) -> None:
+STRATEGIES = ("never_plans", "hangs", "exits", "forgets", "exits_there", "forgets_slowly")
+
+
+@pytest.fixture(scope="module")
+def pair(make_shared, third_party):
+    """Yield two hosts, and all these strategies."""
+    strategies = {name: {} for name in (*STRATEGIES, "relaunch")}
+    return make_shared(host("h0"), host("h1"), migration=MigrationSettings(strategies))
+
+
+@pytest.fixture
+def moving(pair, request):
+    """Yield a process of the strategy that the test names; it must run on as it was."""
+    strategy = request.param
+    pair.submit(service(strategy, migration=MigrationPolicy(strategy)))
+    before = pair.wait(strategy, "running")
+    yield before
+    assert pair.wait(strategy, "running").pid == before.pid
+    assert pair.run(job(f"after-{strategy}", "true"))[0].state == "finished"
+    pair.cancel(strategy)
+
+
+@pytest.mark.parametrize("moving", ["never_plans"], indirect=True)
+def test_a_strategy_that_gives_no_plan(pair, moving) -> None:
     """The refusal has the strategy's name and reason; the process stays."""
-    cluster = make_cluster(
-        host("h0"), host("h1"),
-        migration=MigrationSettings({"never_plans": {}, "relaunch": {}}),
-    )  # fmt: skip
-    cluster.submit(service("p", migration=MigrationPolicy("never_plans")))
-    before = cluster.wait("p", "running")
     with pytest.raises(Refused, match=r"never_plans.*not on a Sunday"):
-        cluster.client.migrate("p")
-    assert cluster.wait("p", "running").pid == before.pid
-    cluster.cancel("p")
-
-
-@pytest.mark.parametrize(("strategy", "said"), [("hangs", "longer than 1 s"), ("exits", "Exit: 3")])
-def test_a_strategy_that_hangs_or_exits(make_cluster, third_party, strategy, said) -> None:
-    """The refusal comes within the deadline, the strategy is failing, the master works on."""
-    cluster = make_cluster(
-        host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
-    )
-    cluster.submit(service("p", migration=MigrationPolicy(strategy)))
-    before = cluster.wait("p", "running")
-    with pytest.raises(Refused, match=rf"{strategy}.*{said}.*odd_plugin\.py:"):
-        cluster.client.migrate("p")
-    failed = f"the migration strategy '{strategy}' fails: propose: "
-    cluster.wait_for_event("plugin_failed", says=failed)
-    (row,) = [row for row in plugins(cluster) if (row.kind, row.name) == ("migration", strategy)]
-    assert (row.state, "odd_plugin.py:" in row.reason) == ("failing", True)
-    assert cluster.wait("p", "running").pid == before.pid
-    assert cluster.run(job("more", "true"))[0].state == "finished"
-    cluster.cancel("p")
+        pair.client.migrate(moving.name)
 
 
 @pytest.mark.parametrize(
-    ("strategy", "said"),
+    ("moving", "said"), [("hangs", "longer than 1 s"), ("exits", "Exit: 3")], indirect=["moving"]
+)
+def test_a_strategy_that_hangs_or_exits(pair, moving, said) -> None:
+    """The refusal comes within the deadline, the strategy is failing, the master works on."""
+    strategy = moving.name
+    with pytest.raises(Refused, match=rf"{strategy}.*{said}.*odd_plugin\.py:"):
+        pair.client.migrate(strategy)
+    failed = f"the migration strategy '{strategy}' fails: propose: "
+    pair.wait_for_event("plugin_failed", says=failed)
+    (row,) = [row for row in plugins(pair) if (row.kind, row.name) == ("migration", strategy)]
+    assert (row.state, "odd_plugin.py:" in row.reason) == ("failing", True)
+
+
+@pytest.mark.parametrize(
+    ("moving", "said"),
     [
         ("forgets", "forgets answered None; a JSON object is required"),
         ("exits_there", "exits_there raised SystemExit: 3"),
     ],
+    indirect=["moving"],
 )
-def test_an_executor_that_fails(make_cluster, third_party, strategy, said) -> None:
+def test_an_executor_that_fails(pair, moving, said) -> None:
     """The step fails with this message, the migration is undone, the process keeps running.
 
     The strategy is listed as failing on the host.
     """
-    cluster = make_cluster(
-        host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
-    )
-    cluster.submit(service("p", migration=MigrationPolicy(strategy)))
-    before = cluster.wait("p", "running")
-    cluster.client.migrate("p")
-    assert said in cluster.wait_for_event("stayed", process="p").message
-    assert cluster.wait("p", "running").pid == before.pid
-    failed = f"the migration strategy '{strategy}' on {before.host} fails: executor "
-    cluster.wait_for_event("plugin_failed", says=failed)
-    rows = [row for row in plugins(cluster) if row.name == strategy and row.host]
+    strategy = moving.name
+    pair.client.migrate(strategy)
+    assert said in pair.wait_for_event("stayed", process=strategy).message
+    failed = f"the migration strategy '{strategy}' on {moving.host} fails: executor "
+    pair.wait_for_event("plugin_failed", says=failed)
+    rows = [row for row in plugins(pair) if row.name == strategy and row.host == moving.host]
     assert [(row.state, said in row.reason) for row in rows] == [("failing", True)]
-    cluster.cancel("p")
 
 
-def test_an_executor_that_answers_none_to_a_master_that_was_killed(
-    make_cluster, third_party
-) -> None:
+@pytest.mark.parametrize("moving", ["forgets_slowly"], indirect=True)
+def test_an_executor_that_answers_none_to_a_killed_master(pair, moving) -> None:
     """The repeated step fails again, so the migration is undone, not repeated forever."""
-    cluster = make_cluster(
-        host("h0"), host("h1"),
-        migration=MigrationSettings({"forgets_slowly": {}, "relaunch": {}}),
-    )  # fmt: skip
-    cluster.submit(service("p", migration=MigrationPolicy("forgets_slowly")))
-    before = cluster.wait("p", "running")
-    cluster.client.migrate("p")
-    cluster.wait("p", "migrating")
-    cluster.master.end(signal.SIGKILL)
-    cluster.reconnect()
-    cluster.start_master()
-    assert "answered None" in cluster.wait_for_event("stayed", process="p").message
-    assert cluster.wait("p", "running").pid == before.pid
-    cluster.cancel("p")
+    pair.client.migrate(moving.name)
+    pair.wait(moving.name, "migrating")
+    pair.restart_master()
+    assert "answered None" in pair.wait_for_event("stayed", process=moving.name).message
 
 
 # --- launchers --------------------------------------------------------------------------------
@@ -438,7 +416,7 @@ KNOWS = ("sh", "-c", 'echo "knows ${IMAGER_KNOWS-no launcher}"; exec sleep 1000'
 @pytest.mark.parametrize(
     ("strategy", "first"), [("imager", "nothing yet"), ("relaunch", "no launcher")]
 )
-def test_a_third_party_s_launcher_restores_from_its_image(
+def test_a_launcher_of_a_third_party_restores_from_its_image(
     make_cluster, third_party, strategy, first
 ) -> None:
     """The launcher starts processes whose strategy declares it, and restores any process."""
@@ -478,34 +456,18 @@ def test_a_plugin_that_does_not_import_is_listed_as_broken(cluster) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cluster_settings", "said"),
-    [
-        ({"scoring": ScoringChoice("wieghted")}, ["wieghted", "weighted", "threshold"]),
-        ({"scoring": ScoringChoice("weighted", {"w_memory": 0.1})}, ["w_memory"]),
-        ({"migration": MigrationSettings({"teleport": {}})}, ["teleport", "relaunch"]),
-    ],
-    ids=["policy", "option", "strategy"],
+    ("part", "said"),
+    [("master", ["wieghted", "weighted", "threshold"]), ("h0", ["memery", "memory"])],
 )
-def test_an_unknown_name_is_refused_at_start(make_cluster, cluster_settings, said) -> None:
-    """The error has the given and the allowed names; exit code 2, no traceback."""
-    cluster = make_cluster()
-    cluster.close()
-    cluster.cluster = type(cluster.cluster)(**cluster_settings)
-    part = cluster.start_master()
-    assert part.process.wait(PATIENCE) == 2
-    log = Path(part.log).read_text()
+def test_an_unknown_name_is_refused_at_start(make_cluster, part, said) -> None:
+    """The error has the given and the allowed names; exit code 2, no traceback, no supervisor."""
+    cluster = make_cluster(started=False, scoring=ScoringChoice("wieghted"))
+    if part == "master":
+        process = cluster.start_master().process
+    else:
+        process = cluster.start_slave(host("h0", probes={"memery": {}})).process
+    assert process.wait(PATIENCE) == 2
+    log = cluster.log_of(part)
     for word in said:
         assert word in log
-    assert "Traceback" not in log
-
-
-def test_an_unknown_probe_is_refused_at_start(make_cluster) -> None:
-    """The slave exits with 2 as well, and leaves no supervisor."""
-    cluster = make_cluster()
-    part = cluster.start_slave(host("h0", probes={"memery": {}}))
-    assert part.process.wait(PATIENCE) == 2
-    del cluster.slaves["h0"]
-    log = cluster.log_of("h0")
-    assert "memery" in log
-    assert "memory" in log
     assert "Traceback" not in log

@@ -9,8 +9,9 @@ from pathlib import Path
 from rosrm.config.settings import LivenessSettings
 from rosrm.model.rows import ProcessRow
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
-from tests.faults.watching import Blow, Watcher, blocks, instances, is_gapless
-from tests.ros.clusters import PATIENCE, QUICK, Cluster, host
+from tests.faults.handoff_watcher import Fault, Watcher, blocks, instances, is_gapless
+from tests.ros.clusters import QUICK, Cluster, host
+from tests.waiting import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "moving"
@@ -21,12 +22,12 @@ _ALONE = 10
 _OTHER = {"h0": "h1", "h1": "h0"}
 
 
-def all_of(*blows: Blow) -> Blow:
-    """Return a blow that strikes all `blows`, one after the other."""
+def all_of(*faults: Fault) -> Fault:
+    """Return one fault that consists of several, in this order."""
 
     def fall() -> None:
-        for blow in blows:
-            blow()
+        for fault in faults:
+            fault()
 
     return fall
 
@@ -34,7 +35,7 @@ def all_of(*blows: Blow) -> Blow:
 class Scene:
     """A cluster with one process, and a watcher of its handoffs.
 
-    Possible victims of a blow: "master", "source", "destination", "source's slave", "destination's
+    Possible victims of a fault: "master", "source", "destination", "source's slave", "destination's
     slave".
 
     Args:
@@ -68,23 +69,23 @@ class Scene:
 
     # --- the migration ---------------------------------------------------------------------
 
-    def move(self, *blows: tuple[str, Blow]) -> None:
-        """Wait for one active instance, start its migration and strike at the given phases."""
+    def move(self, *faults: tuple[str, Fault]) -> None:
+        """Wait for one active instance, start its migration, and inject the faults."""
         row = self.settle()
         self.cluster.wait_for_hosts()
         self._source, self._host = row.number, row.host
         self._pid = instances(self.cluster, NAME)[row.number]
         self._begun = self.cluster.client.list().last_sequence
-        self.watcher.strike_at(self._source, *blows)
+        self.watcher.inject_at(self._source, *faults)
         self.cluster.client.migrate(NAME, _OTHER[row.host])
-        assert self.watcher.struck.wait(PATIENCE), self._why_not_struck(blows)
+        assert self.watcher.injected.wait(PATIENCE), self._why_not_injected(faults)
 
-    def _why_not_struck(self, blows: tuple[tuple[str, Blow], ...]) -> str:
+    def _why_not_injected(self, faults: tuple[tuple[str, Fault], ...]) -> str:
         """Describe the missing reports, the received ones, and the newest logs of the instances."""
         logs = sorted(self.cluster.directory.glob(f"hosts/*/supervisor/logs/{NAME}.*.log"))
         newest = sorted(logs, key=lambda path: int(path.suffixes[-2][1:]))[-2:]
         wrote = [f"{path.name}: {path.read_text(errors='replace')[-2000:]!r}" for path in newest]
-        words = ", ".join(word for word, _ in blows)
+        words = ", ".join(word for word, _ in faults)
         return "\n".join(
             [f"of {words} not all was heard: {self.watcher.heard}", *wrote, self._record()]
         )
@@ -128,33 +129,29 @@ class Scene:
 
     def _start_again(self, victim: str) -> None:
         if victim == "master":
-            self.cluster.master.process.wait(PATIENCE)
-            self.cluster.reconnect()
-            self.cluster.start_master()
+            self.cluster.restart_master()
         elif victim.endswith("slave"):
-            name = self._host_of(victim)
-            self.cluster.slaves[name].process.wait(PATIENCE)
-            self.cluster.start_slave_again(name)
+            self.cluster.start_slave_again(self._host_of(victim))
 
-    # --- blows -----------------------------------------------------------------------------
+    # --- faults ----------------------------------------------------------------------------
 
-    def kill(self, victim: str) -> Blow:
-        """Return a blow that kills the victim with SIGKILL."""
+    def kill(self, victim: str) -> Fault:
+        """Return a fault that kills the victim with SIGKILL."""
         return lambda: self._send(victim, signal.SIGKILL)
 
-    def hold(self, victim: str) -> Blow:
-        """Return a blow that pauses the victim with SIGSTOP."""
+    def hold(self, victim: str) -> Fault:
+        """Return a fault that pauses the victim with SIGSTOP."""
         return lambda: self._send(victim, signal.SIGSTOP)
 
-    def let_go(self, victim: str) -> Blow:
-        """Return a blow that resumes the victim with SIGCONT."""
+    def let_go(self, victim: str) -> Fault:
+        """Return a fault that resumes the victim with SIGCONT."""
         return lambda: self._send(victim, signal.SIGCONT)
 
     def leave_alone(self) -> None:
-        """Strike nothing."""
+        """Inject nothing."""
 
-    def source_held(self) -> list[tuple[str, Blow]]:
-        """Return blows that pause the source at the destination's READY, unseen by the master."""
+    def source_held(self) -> list[tuple[str, Fault]]:
+        """Return faults that pause the source at the destination's READY, unseen by the master."""
         ready = all_of(self.hold("source"), self.let_go("master"))
         return [("SHADOWING", self.hold("master")), ("READY", ready)]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 
 import pytest
 import rclpy
@@ -16,6 +15,7 @@ from std_msgs.msg import Int64, String
 
 from rosrm.testing.local_cluster import claim_domain
 from rosrm_migration.handoff import watch
+from tests.waiting import PATIENCE, wait_until
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -46,7 +46,7 @@ def publishing(name: str, qos: QoSProfile = LATCHED, kind: type = Int64, period:
     thread = threading.Thread(target=executor.spin, daemon=True)
     thread.start()
     try:
-        yield
+        yield node
     finally:
         executor.shutdown()
         thread.join(5.0)
@@ -71,10 +71,10 @@ def test_a_second_publisher_is_heard(qos):
     with publishing("source", qos):
         thread = threading.Thread(target=lambda: heard.append(listen()))
         thread.start()
-        time.sleep(1.0)
-        assert not heard
+        thread.join(1.0)
+        assert thread.is_alive()
         with publishing("destination", qos):
-            thread.join(15.0)
+            thread.join(PATIENCE)
     (result,) = heard
     assert result["heard"] > 10
     assert result["seconds"] > 0.9
@@ -82,8 +82,8 @@ def test_a_second_publisher_is_heard(qos):
 
 def test_a_second_publisher_that_was_first_is_heard():
     """A watch that begins late finds both publishers active."""
-    with publishing("source"), publishing("destination"):
-        time.sleep(1.0)
+    with publishing("source"), publishing("destination") as destination:
+        wait_until(lambda: destination.count_publishers(TOPIC) == 2, "both publishers")
         assert listen()["heard"] > 1
 
 

@@ -1,4 +1,4 @@
-"""An external watcher of a handoff, which strikes at chosen protocol messages."""
+"""An external watcher of a handoff, which injects faults at chosen protocol messages."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ REPORTED = {
     )
 }  # fmt: skip
 
-#: Action at a protocol message.
-Blow = Callable[[], None]
+#: Action of a fault injector.
+Fault = Callable[[], None]
 
 
 class Output(NamedTuple):
@@ -54,8 +54,8 @@ class Watcher:
     unchanged.
 
     Attributes:
-        outputs, heard: outputs and events since `strike_at`.
-        struck: set after the last blow.
+        outputs, heard: outputs and events since `inject_at`.
+        injected: set after the last fault.
         destination_pid: newest pid from the destination's slave; 0: none.
 
     Args:
@@ -66,10 +66,10 @@ class Watcher:
     def __init__(self, domain: int, inputs: float = 0.0) -> None:
         self.outputs: list[Output] = []
         self.heard: list[str] = []
-        self.struck = threading.Event()
+        self.injected = threading.Event()
         self.destination_pid = 0
         self._source = 0
-        self._blows: list[tuple[str, Blow]] = []
+        self._faults: list[tuple[str, Fault]] = []
         self._states: dict[int, str] = {}
         self._channels: set[str] = set()
         self._sent = 0
@@ -91,13 +91,13 @@ class Watcher:
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)
         self._thread.start()
 
-    def strike_at(self, source: int, *blows: tuple[str, Blow]) -> None:
-        """Strike at these events, in order, in the next handoff away from instance `source`."""
-        self.struck.clear()
+    def inject_at(self, source: int, *faults: tuple[str, Fault]) -> None:
+        """Inject faults at these events, in order, in the next handoff of instance `source`."""
+        self.injected.clear()
         self.outputs.clear()
         self.heard.clear()
         self.destination_pid = 0
-        self._source, self._blows = source, list(blows)
+        self._source, self._faults = source, list(faults)
 
     def _drive(self) -> None:
         self._sent += 1
@@ -133,11 +133,11 @@ class Watcher:
 
     def _hear(self, word: str) -> None:
         self.heard.append(word)
-        if self._blows and self._blows[0][0] == word:
-            _, blow = self._blows.pop(0)
-            blow()
-            if not self._blows:
-                self.struck.set()
+        if self._faults and self._faults[0][0] == word:
+            _, fault = self._faults.pop(0)
+            fault()
+            if not self._faults:
+                self.injected.set()
 
     def close(self) -> None:
         self._executor.shutdown()

@@ -1,4 +1,4 @@
-"""Single service calls to a part, for the protocol tests."""
+"""Answers to single service calls, for the protocol tests."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ from rosrm.ros.client import wait_until
 from rosrm.ros.participant import Participant
 
 
-def wait_for(participant: Participant, future: Any, deadline: float) -> Any:
+def answer_to(participant: Participant, future: Any, deadline: float) -> Any:
     """Return the result of a call; None when `deadline` (monotonic seconds) has passed."""
     return future.result() if wait_until(participant, future.done, deadline) else None

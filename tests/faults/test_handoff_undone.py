@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.faults.scenes import Scene, all_of
-from tests.faults.watching import blocks
+from tests.faults.handoff_scene import Scene, all_of
+from tests.faults.handoff_watcher import blocks
 
 pytestmark = pytest.mark.timeout(180)
 

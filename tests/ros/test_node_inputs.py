@@ -1,10 +1,9 @@
-"""Continuation of a node from buffered inputs: a successor, or a source that resumes."""
+"""Inputs around a handoff: a successor, or a source that resumes, processes the buffered ones."""
 
 from __future__ import annotations
 
 import threading
 import time
-from types import SimpleNamespace
 
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -13,10 +12,9 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rosrm_msgs.msg import HandoffReport, StateConfig
-from tests.ros.nodes import RELIABLE, Conductor, Counter, Stage
+from tests.ros.nodes import ALIAS, RELIABLE, Conductor, Counter, Server, Stage, pair_of
 
 R, C = HandoffReport, StateConfig
-ALIAS = "counter_1700000000"
 
 
 class Listener(Counter):
@@ -31,20 +29,6 @@ class Listener(Counter):
     def take(self, message: Int64) -> None:
         time.sleep(self.work)
         self.seen.append(message.data)
-
-
-class Server(Counter):
-    """A counter that counts executed requests."""
-
-    def __init__(self, group=None, **named) -> None:
-        super().__init__(**named)
-        self.served = 0
-        self.create_service(Trigger, "~/poke", self.poke, callback_group=group)
-
-    def poke(self, _request, response):
-        self.served += 1
-        response.message = self.get_name()
-        return response
 
 
 class Threads:
@@ -122,42 +106,18 @@ class Talker:
         self._thread.join(5.0)
 
 
-def pair_of(stage, make, **named):
-    first = stage.instance(make, 1, **named)
-    second = stage.instance(make, 2, alias=ALIAS, shadow=True, **named)
-    return SimpleNamespace(
-        first=first, second=second, conductor=Conductor(stage, source=1, destination=2)
-    )
-
-
-def silence(pair):
-    """Silence the source while its destination stays a shadow."""
-    pair.second._rosrm._destination._activate = lambda: None
-    pair.conductor.say(C.SHADOW)
-    pair.conductor.wait(2, R.READY)
-    pair.conductor.say(C.SWITCH)
-    pair.conductor.wait(1, R.RELEASED)
-
-
-def resume(pair):
-    pair.conductor.say(C.ABORT)
-    pair.conductor.wait(2, R.ABORTED)
-    pair.conductor.say(C.RESUME)
-    pair.conductor.wait(1, R.RESUMED)
-
-
 # --- one thread -------------------------------------------------------------------------------
 
 
-def test_a_source_that_is_silent_for_long_keeps_all_that_comes(stage):
+def test_a_silent_source_buffers_all_inputs(stage):
     """A source buffers all inputs while its destination exhausts timeouts and grace periods."""
     pair = pair_of(stage, Listener)
     talker = Talker(stage, 0.0, readers=2)
-    silence(pair)
+    pair.conductor.silence(pair.second)
     for number in range(3000):
         talker.say(number)
         stage.spin(0.0)
-    resume(pair)
+    pair.conductor.resume()
     stage.spin_until(lambda: len(pair.first.seen) >= 3000, "all that came")
     assert pair.first.seen == talker.sent
 
@@ -175,34 +135,33 @@ def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end):
     pair = pair_of(stage, Picky)
     talker = Talker(stage, 0.0, readers=2)
     if end == "resumed":
-        silence(pair)
-        goes_on = pair.first
+        pair.conductor.silence(pair.second)
+        successor = pair.first
     else:
-        pair.conductor.say(C.SHADOW)
-        pair.conductor.wait(2, R.READY)
+        pair.conductor.prepare()
         stage.remove(pair.first)
-        goes_on = pair.second
+        successor = pair.second
     talker.say(0, 1, 2, 3)
-    stage.spin_until(lambda: len(goes_on._rosrm.member.buffer) == 4, "four that are kept")
+    stage.spin_until(lambda: len(successor._rosrm.member.buffer) == 4, "four that are kept")
 
     def go_on():
         if end == "resumed":
-            resume(pair)
+            pair.conductor.resume()
         else:
             pair.conductor.say(C.TAKE_OVER)
             pair.conductor.wait(2, R.ACTIVE)
         processed()
 
     def processed():
-        stage.spin_until(lambda: len(goes_on.seen) >= 3, "the others")
+        stage.spin_until(lambda: len(successor.seen) >= 3, "the others")
 
     with pytest.raises(ValueError, match="bad input"):  # from the executor's spin
         go_on()
     processed()
-    assert goes_on.seen == [0, 2, 3]
+    assert successor.seen == [0, 2, 3]
 
 
-def test_timers_and_services_go_on_while_more_comes_than_can_be_processed(stage):
+def test_timers_and_services_run_despite_overload(stage):
     """Timers and services run despite overload, as in a node that was not migrated."""
 
     class Busy(Listener, Server):
@@ -252,8 +211,7 @@ def test_two_inputs_of_one_topic_have_each_message_both(stage):
 
     pair = pair_of(stage, Both)
     talker = Talker(stage, 0.0, readers=4)
-    pair.conductor.say(C.SHADOW)
-    pair.conductor.wait(2, R.READY)
+    pair.conductor.prepare()
     member, source = pair.first._rosrm.member, pair.first._rosrm._source
     received = member._received
 
@@ -278,8 +236,7 @@ def test_a_source_processes_what_waits_before_it_falls_silent(stage):
     """A source processes waiting inputs, which a shadow that joined later never received."""
     pair = pair_of(stage, Listener)
     talker = Talker(stage, 0.0, readers=2)
-    pair.conductor.say(C.SHADOW)
-    pair.conductor.wait(2, R.READY)
+    pair.conductor.prepare()
     talker.say(*range(50))
     assert talker.has_arrived(), "fifty in the readers"
     source = pair.first._rosrm._source
@@ -289,17 +246,17 @@ def test_a_source_processes_what_waits_before_it_falls_silent(stage):
     assert pair.first.seen == list(range(50))
 
 
-def test_a_request_that_came_in_the_silence_is_answered_by_who_goes_on(stage):
+def test_a_request_during_the_silence_is_answered_once(stage):
     """A buffered request is answered once, and blocks no thread."""
     pair = pair_of(stage, Server)
     client = stage.plain.create_client(Trigger, "/counter/poke")
     stage.spin_until(client.service_is_ready, "the service")
-    silence(pair)
+    pair.conductor.silence(pair.second)
     answers = [client.call_async(Trigger.Request()) for _ in range(5)]
     (held,) = (one for one in pair.first._rosrm.member._openings if one.srv_name == "~/poke")
     stage.spin_until(lambda: len(held._held) == 5, "five requests that are held")
     assert pair.first.served == 0
-    resume(pair)
+    pair.conductor.resume()
     stage.spin_until(lambda: all(one.done() for one in answers), "the answers")
     assert {one.result().message for one in answers} == {"counter"}
     assert (pair.first.served, pair.second.served) == (5, 0)
@@ -348,8 +305,7 @@ def test_an_input_that_a_thread_holds_is_not_lost(stage, threads):
 
     member._received = receive
     try:
-        pair.conductor.say(C.SHADOW)
-        pair.conductor.wait(2, R.READY)
+        pair.conductor.prepare()
         talker.say(0, 1, 2)
         stage.spin_until(lambda: len(pair.first.seen) == 2, "two of three")
         pair.conductor.say(C.SWITCH)
@@ -361,15 +317,15 @@ def test_an_input_that_a_thread_holds_is_not_lost(stage, threads):
     assert sorted(pair.first.seen + pair.second.seen) == [0, 1, 2]
 
 
-def test_a_silent_source_answers_however_many_requests_come(stage, threads):
+def test_buffered_requests_block_no_thread(stage, threads):
     """Buffered requests block no thread of a silent source."""
     pair = pair_of(stage, lambda **named: Server(ReentrantCallbackGroup(), **named))
     threads.take(pair.first)
     clients = [stage.plain.create_client(Trigger, "/counter/poke") for _ in range(8)]
     stage.spin_until(lambda: all(one.service_is_ready() for one in clients), "the service")
-    silence(pair)
+    pair.conductor.silence(pair.second)
     answers = [one.call_async(Trigger.Request()) for one in clients]
-    resume(pair)
+    pair.conductor.resume()
     stage.spin_until(lambda: all(one.done() for one in answers), "the answers")
     assert (pair.first.served, pair.second.served) == (8, 0)
 
@@ -388,8 +344,7 @@ def test_a_tick_that_a_thread_holds_is_not_skipped(stage, threads):
 
     pair = pair_of(stage, Rare)
     threads.take(pair.first)
-    pair.conductor.say(C.SHADOW)
-    pair.conductor.wait(2, R.READY)
+    pair.conductor.prepare()
     source, member = pair.first._rosrm._source, pair.first._rosrm.member
     rare = next(one for one in member.timers if one.timer is pair.first.rare)
     with member.turn:  # a cycle during which the slow timer comes due

@@ -1,22 +1,22 @@
-"""Orders of a handoff to a real slave: restart policy, readiness, environment."""
+"""Orders of a handoff to a real slave: another restart policy, and readiness."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
 
 import pytest
 
-from rosrm.model.values import InstanceId, Kind, RestartPolicy
+from rosrm.model.values import InstanceId, RestartPolicy
 from rosrm.ros import convert, names, qos
 from rosrm.ros.client import wait_for_service
 from rosrm.ros.control import ControlClient
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
-from tests.ros.asking import wait_for
-from tests.ros.clusters import NODE, PATIENCE, host, node, python, service, wait_gone
+from tests.ros.calls import answer_to
+from tests.ros.clusters import NODE, host, node, service
+from tests.waiting import PATIENCE, wait_gone
 
 NEVER = RestartPolicy("never")
 ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
@@ -47,7 +47,7 @@ class Orders:
             action=srv.ControlHost.Request.SET_RESTART,
             instance=convert.instance_to_msg(instance), restart=convert.restart_to_msg(restart),
         )  # fmt: skip
-        return wait_for(self.participant, self.client.call_async(request), deadline).answer
+        return answer_to(self.participant, self.client.call_async(request), deadline).answer
 
 
 @pytest.fixture
@@ -62,16 +62,7 @@ def end(pid: int) -> None:
     wait_gone(pid)
 
 
-def replace_slave(cluster) -> None:
-    """Kill the slave with SIGKILL, and start the next one."""
-    part = cluster.slaves["h0"]
-    part.process.kill()
-    part.process.wait()
-    cluster.start_slave_again("h0")
-    cluster.wait_for_hosts()
-
-
-def test_another_policy_counts_from_its_answer_on(cluster, orders) -> None:
+def test_another_policy_applies_from_its_answer_on(cluster, orders) -> None:
     """An acknowledged policy applies, whatever is killed a moment later."""
     cluster.submit(service("source", restart=ON_FAILURE), service("copy"))
     for name in ("source", "copy"):
@@ -80,25 +71,21 @@ def test_another_policy_counts_from_its_answer_on(cluster, orders) -> None:
     for name, restart in (("source", NEVER), ("copy", ON_FAILURE)):
         answer = orders.set_restart(InstanceId(name, rows[name].number), restart)
         assert answer.accepted, answer.message
-    lock = cluster.directory / "hosts" / "h0" / "supervisor" / "supervisor.lock"
-    os.kill(int(lock.read_text()), signal.SIGKILL)
+    os.kill(cluster.supervisor("h0"), signal.SIGKILL)
     for row in rows.values():
         end(row.pid)
     assert cluster.wait("source", "failed", "finished").state == "failed"
-    cluster.wait_until("copy again", lambda view: any(
-        row.name == "copy" and row.restarts == 1 and row.state == "running"
-        for row in view.processes
-    ))  # fmt: skip
+    cluster.wait("copy", "running", restarts=1)
     again = orders.set_restart(InstanceId("source", rows["source"].number), ON_FAILURE)
     assert again.accepted
     cluster.cancel("copy")
 
 
-def test_a_policy_for_what_a_killed_slave_left(cluster, orders) -> None:
+def test_a_policy_for_a_process_of_a_killed_slave(cluster, orders) -> None:
     """The next slave changes the policy, although it does not know the spec."""
     cluster.submit(service("left", restart=ON_FAILURE))
     row = cluster.wait("left", "running")
-    replace_slave(cluster)
+    cluster.start_slave_again("h0")
     cluster.wait("left", "running")
     answer = orders.set_restart(InstanceId("left", row.number), NEVER)
     assert answer.accepted, answer.message
@@ -106,39 +93,25 @@ def test_a_policy_for_what_a_killed_slave_left(cluster, orders) -> None:
     assert cluster.wait("left", "failed").restarts == 0
 
 
-def test_a_policy_for_a_stranger_is_refused(orders) -> None:
+def test_a_policy_for_an_unknown_instance_is_refused(orders) -> None:
     """The refusal has a code for programs and a reason for users."""
     answer = orders.set_restart(InstanceId("nobody", 99), NEVER)
     assert (answer.accepted, answer.code) == (False, "unknown")
     assert "nobody#99 is not known here" in answer.message
 
 
-def test_a_node_that_is_awaited_when_its_slave_is_killed_is_not_ready(cluster, tmp_path) -> None:
+def test_readiness_over_kills_of_the_slave(cluster, tmp_path) -> None:
     """The next slave waits for readiness; the one after that knows that the node was ready."""
     go = tmp_path / "go"
     waits = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.05)\n"
     cluster.submit(node("late", waits + NODE))
     pid = cluster.wait("late", "starting").pid
-    replace_slave(cluster)
-    deadline = time.monotonic() + 1.0
-    while time.monotonic() < deadline:
-        assert cluster.process("late").state in ("starting", "unreachable")
-        cluster.client.spin(0.05)
+    cluster.start_slave_again("h0")
+    cluster.stays(
+        1.0, lambda: cluster.process("late").state in ("starting", "unreachable"), "not ready"
+    )
     go.touch()
     assert cluster.wait("late", "running").pid == pid
-    replace_slave(cluster)
+    cluster.start_slave_again("h0")
     assert cluster.wait("late", "running").pid == pid
     cluster.cancel("late")
-
-
-def test_a_process_is_told_who_it_is(cluster) -> None:
-    """A process gets its own and its master's identity, in order to check messages."""
-    code = "import json, os; print(json.dumps(dict(os.environ)))"
-    environment = {"ROS_DOMAIN_ID": str(cluster.domain)}
-    cluster.run(python("who", code, kind=Kind.JOB, environment=environment, ros=True))
-    told = json.loads(cluster.log("who"))
-    assert told["ROSRM_NODE"] == "/who"
-    assert told["ROSRM_STATE_CONFIG"] == "/rosrm/state_config"
-    assert told["ROSRM_MASTER"] == cluster.cluster.name
-    assert told["ROSRM_EPOCH"] == "1"
-    assert "ROSRM_SHADOW" not in told
