@@ -12,7 +12,7 @@ from rosrm.cli.output import tables
 from rosrm.errors import ConfigError
 from rosrm_simulate import picture
 from rosrm_simulate.runs import agreement_of
-from tests.unit.simulation.workloads import host, plan, recorded, simulation
+from tests.unit.tools.simulate.workloads import host, plan, recorded, simulation
 
 WORKLOAD = """
 hosts: [{name: 'h{i}', foreach: {i: 'range(0, 2)'}, memory: 1GB, cpu: 2}]

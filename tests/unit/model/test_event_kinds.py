@@ -8,7 +8,7 @@ from pathlib import Path
 from rosrm.model.event_kinds import EventKind
 from scripts.event_table import PAGE, with_table
 
-SOURCES = Path(__file__).parents[2] / "rosrm"
+SOURCES = Path(__file__).parents[3] / "rosrm"
 
 
 def test_the_reference_page_has_the_table_of_the_kinds() -> None:

@@ -19,7 +19,7 @@ from rosrm.model.plan_json import step_to_dict
 from rosrm.model.values import ProcessSpec
 from tests.unit.core.cluster import Eq1
 
-DATA = Path(__file__).parents[1] / "data" / "journal"
+DATA = Path(__file__).parents[2] / "data" / "journal"
 ROWS = [json.loads(line) for line in (DATA / "rows.jsonl").read_text().splitlines()]
 INTENTS = {tuple(row["intent"][:2]): row["intent"][2] for row in ROWS if "intent" in row}
 #: Unix time of the restart: 5 s after the newest row.

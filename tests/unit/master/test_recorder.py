@@ -16,8 +16,7 @@ from rosrm.master import recorder
 from rosrm.master.recorder import Recorder
 from rosrm.model.values import RESOURCE_SLOTS
 from rosrm.recording.reader import Header
-
-from .workloads import read
+from tests.unit.tools.simulate.workloads import read
 
 
 def header(epoch: int = 1, master: str = "lab") -> Header:

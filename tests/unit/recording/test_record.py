@@ -30,8 +30,7 @@ from rosrm.model.values import (
     RestartPolicy,
 )
 from rosrm.recording.encoding import decode, encode
-
-from .workloads import host, plan, read, recorded, simulation
+from tests.unit.tools.simulate.workloads import host, plan, read, recorded, simulation
 
 INT = st.integers(0, 2**53)
 FLOAT = st.floats(allow_nan=False)

@@ -13,7 +13,7 @@ from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import Registry
 from rosrm.testing import FakeProbe
 
-from .test_starting import OURS
+from .test_start import OURS
 
 
 @pytest.fixture(autouse=True)
@@ -162,7 +162,7 @@ def test_plugins_that_cannot_be_made_are_found(rosrm, file, monkeypatch):
     assert "raised KeyError: 'weight'" in result.err
     assert "which has no `propose`; is its `proposes` misspelt?" in result.err
     assert "made None; an object with `choose` is required" in result.err
-    assert "test_checking.py:" in result.err
+    assert "test_config_check.py:" in result.err
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from rosrm_simulate.runs import run
 from rosrm_simulate.variants import variant_in_text
 from rosrm_simulate.workload_file import load_workload
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 HOST = "hosts: [{name: a, memory: 1GiB, cpu: 2}]\n"
 PROCESS = "processes: [{name: p, memory: 10MB}]\n"
 BOTH = HOST + PROCESS

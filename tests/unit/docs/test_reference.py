@@ -30,7 +30,7 @@ from rosrm_migration.relaunch import RelaunchOptions
 from rosrm_scoring.threshold import ThresholdOptions
 from rosrm_scoring.weighted import WeightedOptions
 
-REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
+REFERENCE = Path(__file__).resolve().parents[3] / "docs" / "reference"
 
 
 def page(name: str) -> str:

@@ -11,7 +11,7 @@ from rosrm_resources.cgroups import count_cpus, find_group, read_number
 from rosrm_resources.cpu import CgroupCpu, CpuOptions
 from rosrm_resources.memory import CgroupMemory, MemoryOptions
 
-TREES = Path(__file__).parents[2] / "data" / "cgroup_v2"
+TREES = Path(__file__).parents[3] / "data" / "cgroup_v2"
 RECORDED = sorted(path.name for path in TREES.iterdir() if (path / "proc").is_dir())
 MIB = 2.0**20
 GIB = 2.0**30
