@@ -10,38 +10,18 @@ import pytest
 from rosrm.cli.commands import start
 from rosrm.config import ClusterConfig, HostConfig
 from rosrm.extensions.contracts import Intent, MigrationOffer, ProbeOffer, ScoringOffer
-from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.installed import installed_plugins
 from rosrm.extensions.registry import Registry
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.runtime.bootstrap import take_over
 from rosrm.runtime.state_lock import only_one
 from rosrm.testing import FakeProbe
+from tests.plugin_kit import plugin
 
-
-def cpu(options, context):
-    return FakeProbe(cpu=0.5)
-
-
-@hookimpl
-def register_probes():
-    return [ProbeOffer("cpu", cpu, default=True)]
-
-
-@hookimpl
-def register_scoring_policies():
-    return [ScoringOffer("weighted", lambda options: SimpleNamespace(score=None))]
-
-
-@hookimpl
-def register_migration_strategies():
-    return [MigrationOffer("relaunch", lambda options: SimpleNamespace(propose=None))]
-
-
-OURS = SimpleNamespace(
-    register_probes=register_probes,
-    register_scoring_policies=register_scoring_policies,
-    register_migration_strategies=register_migration_strategies,
+OURS = plugin(
+    ProbeOffer("cpu", lambda *_: FakeProbe(cpu=0.5), default=True),
+    ScoringOffer("weighted", lambda options: SimpleNamespace(score=None)),
+    MigrationOffer("relaunch", lambda options: SimpleNamespace(propose=None)),
 )
 
 

@@ -60,10 +60,8 @@ def test_what_is_no_such_quantity_is_refused_with_what_is_allowed(marker, given,
 
 
 def test_an_amount_takes_the_units_of_its_resource_only():
-    assert amount_of("memory", "8MB") == 8e6
-    assert amount_of("cpu", "0.5 cores") == 0.5
-    assert amount_of("network", "10 MB/s") == 10e6
-    with pytest.raises(ValueError, match="unknown unit 'MB'"):
-        amount_of("cpu", "8MB")
-    with pytest.raises(ValueError, match="unknown unit 'cores'"):
-        amount_of("memory", "2 cores")
+    amounts = {("memory", "8MB"): 8e6, ("cpu", "0.5 cores"): 0.5, ("network", "10 MB/s"): 10e6}
+    assert {given: amount_of(*given) for given in amounts} == amounts
+    for resource, given, unit in (("cpu", "8MB", "MB"), ("memory", "2 cores", "cores")):
+        with pytest.raises(ValueError, match=f"unknown unit '{unit}'"):
+            amount_of(resource, given)

@@ -5,19 +5,14 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 from rosrm.extensions.contracts import ScoringOffer
-from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import Registry
 from rosrm.master.fallback_policy import fallback_of
+from tests import plugin_kit
 
 
 def registry_of(**policies):
     """Return a registry of policies, each with its factory."""
-
-    @hookimpl
-    def register_scoring_policies():
-        return [ScoringOffer(name, create) for name, create in policies.items()]
-
-    return Registry.of(ours=SimpleNamespace(register_scoring_policies=register_scoring_policies))
+    offers = (ScoringOffer(name, create) for name, create in policies.items())
+    return plugin_kit.registry_of(*offers)
 
 
 def broken(options):

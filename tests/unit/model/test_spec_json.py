@@ -57,11 +57,6 @@ def test_a_spec_comes_back_from_json_as_it_was(spec):
     assert spec_from_dict(json.loads(json.dumps(spec_to_dict(spec)))) == spec
 
 
-def test_a_spec_with_defaults_alone_is_json():
-    spec = ProcessSpec("a", command=("true",))
-    assert spec_from_dict(json.loads(json.dumps(spec_to_dict(spec)))) == spec
-
-
 def test_an_older_record_gets_the_defaults_of_what_it_lacks():
     assert spec_from_dict({"name": "a"}) == ProcessSpec("a")
 
