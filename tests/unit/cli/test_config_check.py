@@ -154,13 +154,18 @@ def test_plugins_that_cannot_be_made_are_found(check, install):
     assert "test_config_check.py:" in result.err
 
 
+NAMESAKES = """
+defaults: {package: p, executable: e}
+processes: [{name: a}, {name: b, arguments: [--ros-args, -r, '__node:=a']}]
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "warning"),
     [
         ("processes: [{name: a, command: x, needs: {cpus: 1}}]",
          ":1:43: warning: needs: no probe reads 'cpus'; did you mean 'cpu'?"),
-        ("defaults: {package: p, executable: e}\nprocesses: [{name: a}, {name: b, arguments: ["
-         "--ros-args, -r, '__node:=a']}]",
+        (NAMESAKES,
          ": warning: a and b put the node /a into the ROS graph; give each node a name of"),
     ],
 )  # fmt: skip

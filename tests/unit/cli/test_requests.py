@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
 from rosrm.errors import NoMaster, Refused
 
-from .conftest import event, host, process
+from .conftest import event, host, interrupt, process
 
 
 @pytest.fixture
@@ -49,12 +50,8 @@ def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, a
     ("action", "kind", "message", "code"),
     [
         ("checkpoint", "checkpointed", "a is checkpointed: its image is on alpha", 0),
-        (
-            "checkpoint",
-            "checkpoint_failed",
-            "a was not checkpointed and still runs on alpha: it holds a pipe",
-            1,
-        ),
+        ("checkpoint", "checkpoint_failed",
+         "a was not checkpointed and still runs on alpha: it holds a pipe", 1),
         ("restore", "restored", "a was restored from its image on alpha", 0),
         ("restore", "restore_failed", "a stays checkpointed on alpha: a port is in use", 1),
         ("restore", "cancelled", "a cancelled; its image is removed", 1),
@@ -62,22 +59,19 @@ def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, a
         ("migrate", "stayed", "a stayed on alpha: beta did not start it", 1),
         ("migrate", "migration_forgotten", "the move of a cannot be continued: no plan", 1),
     ],
-)
+)  # fmt: skip
 def test_wait_says_how_a_checkpoint_a_restore_or_a_move_ended(
-    rosrm, client, monkeypatch, action, kind, message, code
+    rosrm, client, while_asleep, action, kind, message, code
 ):
     """The first such event after the request counts; an older one does not."""
-    client.events = [event(1, kind, "a", message="of another time")]
     client.processes = [process("a", "stuck", reason="alpha is lost")]
-
-    def later(seconds):
-        client.events += [
-            event(2, "migration_step", "a", message="a: step"),
-            event(3, kind, "b", message="b is none of ours"),
-            event(4, kind, "a", message=message),
-        ]
-
-    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
+    client.events = [event(1, kind, "a", message="of another time")]
+    more = [
+        event(2, "migration_step", "a", message="a: step"),
+        event(3, kind, "b", message="b is none of ours"),
+        event(4, kind, "a", message=message),
+    ]
+    while_asleep({"events": client.events + more})
     result = rosrm(action, "a", "--wait")
     assert result.code == code
     assert "a is stuck: alpha is lost" in result.err
@@ -98,16 +92,11 @@ def test_wait_ends_when_nothing_is_left_to_migrate(rosrm, client, rows, said):
 
 @pytest.mark.parametrize(("last", "code"), [("failed", 1), ("running", 1), ("finished", 0)])
 def test_submit_wait_fails_if_a_job_left_the_list_before_it_was_seen_done(
-    rosrm, client, work, monkeypatch, last, code
+    rosrm, client, work, while_asleep, last, code
 ):
     """Count a job that was pruned between two looks as failed, unless it was seen finished."""
-    looks = iter([[process("a", last, kind="job"), process("b", "starting")], [process("b")]])
-    client.processes = next(looks)
-
-    def later(seconds):
-        client.processes = next(looks)
-
-    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
+    client.processes = [process("a", last, kind="job"), process("b", "starting")]
+    while_asleep({"processes": [process("b")]})
     result = rosrm("submit", work, "--wait")
     assert result.code == code
     assert ("not seen to be done: a (" in result.err) == bool(code)
@@ -133,26 +122,18 @@ def test_submit_refuses_a_wrong_file_before_it_looks_for_a_master(rosrm, client,
     assert client.settings is None
 
 
-def test_submit_wait_ends_when_jobs_have_ended_and_services_run(rosrm, client, work, monkeypatch):
+def test_submit_wait_ends_when_jobs_have_ended_and_services_run(rosrm, client, work, while_asleep):
     client.processes = [process("a", "queued", kind="job"), process("b", "starting")]
-
-    def later(seconds):
-        client.processes = [process("a", "finished", kind="job"), process("b", "running")]
-
-    monkeypatch.setattr("time.sleep", later)
+    while_asleep({"processes": [process("a", "finished", kind="job"), process("b", "running")]})
     result = rosrm("submit", work, "--wait")
-    assert result.code == 0
-    assert result.out.endswith("1 finished, 1 running\n")
+    assert (result.code, result.out.endswith("1 finished, 1 running\n")) == (0, True)
 
 
 def test_submit_wait_fails_with_the_reason_when_a_process_failed(rosrm, client, work):
-    client.processes = [
-        process("a", "failed", kind="job", reason="exit code 3"),
-        process("b", "running"),
-    ]
+    failed = process("a", "failed", kind="job", reason="exit code 3")
+    client.processes = [failed, process("b", "running")]
     result = rosrm("submit", work, "--wait")
-    assert result.code == 1
-    assert "a has failed: exit code 3" in result.err
+    assert (result.code, "a has failed: exit code 3" in result.err) == (1, True)
 
 
 def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
@@ -173,33 +154,20 @@ def test_submit_wait_ends_when_a_service_has_ended(rosrm, client, work):
     assert "waiting" not in result.err
 
 
-def test_submit_wait_ends_when_all_that_is_left_is_set_aside(rosrm, client, work, monkeypatch):
+def test_submit_wait_ends_when_all_that_is_left_is_set_aside(rosrm, client, work, while_asleep):
     """The wait lasts a moment longer, because hosts still register at the start of a cluster."""
-    looks = iter((1.0, 6.0))
-
-    def later(seconds=0.0):
-        reason = "no host has camera=front"
-        since = next(looks)
-        client.processes = [
-            process("a", "set_aside", kind="job", reason=reason, since=since),
-            process("b", "running"),
-        ]
-
-    later()
-    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
+    aside = partial(process, "a", "set_aside", kind="job", reason="no host has camera=front")
+    client.processes = [aside(since=1.0), process("b")]
+    while_asleep({"processes": [aside(since=6.0), process("b")]})
     result = rosrm("submit", work, "--wait")
     assert (result.code, result.out.splitlines()[-1]) == (1, "1 running, 1 set aside")
     assert "a is set aside: no host has camera=front" in result.err
     assert "no longer waiting for a: set aside until a host registers or changes" in result.err
 
 
-def test_ctrl_c_in_a_wait_says_that_the_processes_stay(rosrm, client, work, monkeypatch):
+def test_ctrl_c_in_a_wait_says_that_the_processes_stay(rosrm, client, work, while_asleep):
     client.processes = [process("a", "queued", kind="job")]
-
-    def interrupt(seconds):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("rosrm.client.waiting.time.sleep", interrupt)
+    while_asleep(interrupt)
     result = rosrm("submit", work, "--wait")
     assert result.code == 130
     assert result.err == (
@@ -246,13 +214,9 @@ def test_cancel_needs_names_or_all_of_them(rosrm, client, words):
     assert "give names of processes or work files, or --all" in result.err
 
 
-def test_cancel_wait_ends_when_all_have_ended(rosrm, client, monkeypatch):
+def test_cancel_wait_ends_when_all_have_ended(rosrm, client, while_asleep):
     client.processes = [process("a", "stopping"), process("b", "finished")]
-
-    def later(seconds):
-        client.processes = [process("a", "cancelled"), process("b", "finished")]
-
-    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
+    while_asleep({"processes": [process("a", "cancelled"), process("b", "finished")]})
     result = rosrm("cancel", "a", "b", "--wait")
     said = "cancelled\n1 cancelled, 1 finished\n"
     assert (result.code, result.out, result.err) == (0, said, "")
@@ -266,35 +230,25 @@ def test_cancel_wait_says_once_what_has_become_of_each(rosrm, client):
     assert (result.code, result.out, result.err) == (0, "2 processes cancelled\n", "")
 
 
-def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, monkeypatch):
+def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, while_asleep):
     """A process that had ended runs again at all; a job may have finished."""
     client.processes = [process("a"), process("b", "failed", pid=0), process("c", kind="job")]
-    looks = iter(
-        (
-            [process("a"), process("b", "queued"), process("c", "finished", kind="job")],
-            [process("a", pid=100), process("b"), process("c", "finished", kind="job")],
-        )
+    ended = process("c", "finished", kind="job")
+    left = while_asleep(
+        {"processes": [process("a"), process("b", "queued"), ended]},
+        {"processes": [process("a", pid=100), process("b"), ended]},
     )
-
-    def later(seconds):
-        client.processes = next(looks)
-
-    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
     result = rosrm("restart", "a", "b", "c", "--wait")
-    assert (result.code, result.out) == (0, "restarted\n1 finished, 2 running\n")
-    assert next(looks, None) is None
+    assert (result.code, result.out, left) == (0, "restarted\n1 finished, 2 running\n", [])
 
 
 @pytest.mark.parametrize(("left", "code"), [([], 0), ([process("driver")], 1)])
-def test_drain_wait_ends_when_the_host_is_drained(rosrm, client, monkeypatch, left, code):
+def test_drain_wait_ends_when_the_host_is_drained(rosrm, client, while_asleep, left, code):
     """Exit with 1 if a process has stayed, because turning the host off would end it."""
     client.hosts, client.processes = [host("alpha", draining=True)], [process("talker")]
-
-    def later(seconds):
-        client.hosts, client.processes = [host("alpha", draining=True, drained=True)], left
-        client.events += [event(9, "host_drained", message="alpha is drained: so and so")]
-
-    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
+    drained = event(9, "host_drained", message="alpha is drained: so and so")
+    after = [host("alpha", draining=True, drained=True)]
+    while_asleep({"hosts": after, "processes": left, "events": [*client.events, drained]})
     result = rosrm("drain", "alpha", "--wait")
     assert (result.code, "alpha is drained: so and so\n" in result.out + result.err) == (code, True)
 
@@ -338,34 +292,22 @@ def test_every_command_ends_clean_with_its_code(rosrm, client, work, words, erro
     assert client.closed
 
 
-def test_a_wait_outlives_a_master_that_is_away_for_a_while(rosrm, client, work, monkeypatch):
+def test_a_wait_outlives_a_master_that_is_away_for_a_while(rosrm, client, work, while_asleep):
     """The user reads once that the master does not answer, and once that it answers again."""
-    silences = iter([True, True, True])
-    client.processes = [process("a", "finished", kind="job"), process("b")]
-    real = client.list
-
-    def list_(**what):
-        if next(silences, False):
-            raise NoMaster("the master did not answer within 10 s.")
-        return real(**what)
-
-    client.list = list_
-    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    client.processes = [process("a", "queued", kind="job"), process("b")]
+    ended = [process("a", "finished", kind="job"), process("b")]
+    silent = {"fails": NoMaster("the master did not answer within 10 s.")}
+    while_asleep(silent, silent, silent, {"fails": None, "processes": ended})
     result = rosrm("submit", work, "--wait")
-    assert (result.code, result.err.splitlines()) == (
-        0,
-        [
-            "rosrm: the master did not answer within 10 s. Asking again until the master answers",
-            "rosrm: the master answers again",
-        ],
-    )
+    assert (result.code, result.err.splitlines()) == (0, [
+        "rosrm: the master did not answer within 10 s. Asking again until the master answers",
+        "rosrm: the master answers again",
+    ])  # fmt: skip
 
 
 def test_a_wait_for_a_silent_master_ends_after_its_time(rosrm, client, work, monkeypatch):
-    def list_(**what):
-        raise NoMaster("the master did not answer")
-
-    client.list = list_
+    silent = NoMaster("the master did not answer")
+    monkeypatch.setattr(client, "submit", lambda specs: setattr(client, "fails", silent) or "")
     monkeypatch.setattr("rosrm.client.retrying.PERIOD", 0.01)
     result = rosrm("submit", work, "--wait", "--timeout", "50ms")
     assert result.code == 3

@@ -21,6 +21,7 @@ from rosrm.extensions.contracts import (
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import FailedProbe, Probes, Registry
 from rosrm.model.values import Reading, ResourceDescription
+from tests.plugin_kit import plugin, registry_of
 
 
 @dataclass(frozen=True)
@@ -45,25 +46,6 @@ class Probe:
         self.closed = True
 
 
-def plugin(**hooks):
-    """Return a plugin whose hooks return (or raise) these offers."""
-
-    def implement(name, answer):
-        def hook():
-            if isinstance(answer, BaseException):
-                raise answer
-            return answer
-
-        hook.__name__ = name
-        return hookimpl(hook)
-
-    return SimpleNamespace(**{name: implement(name, answer) for name, answer in hooks.items()})
-
-
-def probes(*offers):
-    return Registry.of(ours=plugin(register_probes=list(offers)))
-
-
 def offered(name, create=None, **more):
     return ProbeOffer(name, create or (lambda options, context: Probe(name)), **more)
 
@@ -79,27 +61,22 @@ def context(tmp_path):
 
 
 def test_each_kind_is_made_by_name_with_its_options():
-    registry = Registry.of(
-        ours=plugin(
-            register_scoring_policies=[ScoringOffer("s", lambda options: options, Options)],
-            register_migration_strategies=[MigrationOffer("m", lambda options: options, Options)],
-            register_checkpoint_policies=[CheckpointOffer("c", lambda options: options, Options)],
-        )
+    registry = registry_of(
+        ScoringOffer("s", lambda options: options, Options),
+        MigrationOffer("m", lambda options: options, Options),
+        CheckpointOffer("c", lambda options: options, Options),
     )
     assert registry.scoring("s", {"ratio": 1}) == Options(1.0)
     assert registry.migrations({"m": {}}) == {"m": Options()}
     assert registry.checkpoint("c") == Options()
     assert registry.checkpoint(None) is None
-    assert [(row.kind, row.state) for row in registry.rows()] == [
-        ("checkpoint", "selected"),
-        ("migration", "selected"),
-        ("scoring", "selected"),
-    ]
+    kinds = ("checkpoint", "migration", "scoring")
+    assert [(row.kind, row.state) for row in registry.rows()] == [(k, "selected") for k in kinds]
 
 
 def test_an_unknown_name_is_refused_with_what_is_there_and_what_is_broken():
     registry = Registry.of(
-        good=plugin(register_scoring_policies=[ScoringOffer("weighted", lambda options: None)]),
+        good=plugin(ScoringOffer("weighted", lambda options: None)),
         bad=plugin(register_scoring_policies=OSError("no such table")),
     )
     with pytest.raises(ConfigError) as refused:
@@ -117,9 +94,7 @@ def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
     """
     nameless = plugin(register_scoring_policies=OSError("no such table"))
     bare = ScoringOffer("s", lambda options: None, options=dict)
-    registry = Registry.of(
-        rosrm_rack=nameless, other=nameless, third=plugin(register_scoring_policies=[bare])
-    )
+    registry = Registry.of(rosrm_rack=nameless, other=nameless, third=plugin(bare))
     with pytest.raises(ConfigError) as refused:
         registry.scoring("rack")
     assert "Broken: plugin 'rosrm_rack': " in str(refused.value)
@@ -145,7 +120,7 @@ def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
 def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
     """The refusal comes at the start, not at the first decision."""
     offer = ScoringOffer("s", lambda options: made)
-    registry = Registry.of(ours=plugin(register_scoring_policies=[offer]))
+    registry = registry_of(offer)
     with pytest.raises(PluginError) as refused:
         registry.scoring("s")
     assert said in str(refused.value)
@@ -163,7 +138,7 @@ def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
 def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
     """The offer is broken, and is reported when plugins are loaded."""
     offer = ScoringOffer("s", lambda options: None, reads=reads)
-    (broken,) = Registry.of(ours=plugin(register_scoring_policies=[offer])).broken
+    (broken,) = registry_of(offer).broken
     assert said in broken.reason
     assert broken.name == "s"
 
@@ -174,6 +149,7 @@ def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
         (ResourceDescription("a", None, 1.0), "gives 'a' the unit None; text is required"),
         (ResourceDescription("a", "B", 1.0, None), "gives 'a' the scope None; text is required"),
         (ResourceDescription("Open Files", "1", 1.0), "names a resource 'Open Files'. Allowed"),
+        (ResourceDescription(3, "1", 1.0), "names a resource 3"),
         (ResourceDescription("a", "B", "10"), "gives 'a' a capacity of '10'; a number above 0"),
         ("a", "describes a resource by 'a', which is not a ResourceDescription"),
     ],
@@ -182,23 +158,21 @@ def test_a_resource_that_no_message_can_carry_is_refused(context, described, sai
     """Its probe fails with the class and its place, and the others are made."""
     probe = Probe("a")
     probe.resources = [described]
-    result = probes(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
+    result = registry_of(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
     assert result.absent == {}
     assert f"Probe ({__file__}:{inspect.getsourcelines(Probe)[1]}) {said}" in failed(result)["a"]
 
 
 def test_a_probe_reads_only_what_its_offer_declares(context):
     """Names of resources in a file can thus be checked before any probe is made."""
-    registry = probes(offered("fds", lambda options, context: Probe("files")))
+    registry = registry_of(offered("fds", lambda options, context: Probe("files")))
     reason = failed(registry.probes({"fds": {}}, context))["fds"]
     assert "which its offer does not declare: say ProbeOffer(..., resources=(" in reason
     assert registry.resources() == ("fds",)
 
 
 def test_a_wrong_option_is_refused_with_what_is_allowed():
-    registry = Registry.of(
-        ours=plugin(register_scoring_policies=[ScoringOffer("s", lambda options: None, Options)])
-    )
+    registry = registry_of(ScoringOffer("s", lambda options: None, Options))
     with pytest.raises(ConfigError, match=r"options of scoring policy 's': unknown a; allowed: ra"):
         registry.scoring("s", {"a": 1})
     with pytest.raises(ConfigError, match=r"ratio: float is required, not 'x'"):
@@ -209,7 +183,7 @@ def test_a_plugin_that_raises_when_it_is_made_is_named_with_its_definition():
     def create(options):
         return {}["weight"]
 
-    registry = Registry.of(ours=plugin(register_scoring_policies=[ScoringOffer("s", create)]))
+    registry = registry_of(ScoringOffer("s", create))
     with pytest.raises(PluginError) as refused:
         registry.scoring("s")
     said = str(refused.value)
@@ -224,15 +198,15 @@ def test_a_policy_that_is_absent_is_refused_with_its_reason():
     def create(options):
         raise SkipPlugin("no licence")
 
-    registry = Registry.of(ours=plugin(register_scoring_policies=[ScoringOffer("s", create)]))
+    registry = registry_of(ScoringOffer("s", create))
     with pytest.raises(ConfigError, match="scoring policy 's' is absent here: no licence"):
         registry.scoring("s")
 
 
 def test_a_name_offered_twice_belongs_to_neither_and_both_are_named():
     registry = Registry.of(
-        a=plugin(register_scoring_policies=[ScoringOffer("s", lambda options: 1)]),
-        b=plugin(register_scoring_policies=[ScoringOffer("s", lambda options: 2)]),
+        a=plugin(ScoringOffer("s", lambda options: 1)),
+        b=plugin(ScoringOffer("s", lambda options: 2)),
     )
     with pytest.raises(ConfigError, match="offered twice, by plugin 'a' and plugin 'b': uninstall"):
         registry.scoring("s")
@@ -255,40 +229,42 @@ def test_a_name_offered_twice_belongs_to_neither_and_both_are_named():
     ],
 )
 def test_a_hook_that_answers_nonsense_is_broken_and_the_others_go_on(answer, said):
-    registry = Registry.of(
-        bad=plugin(register_probes=answer), good=plugin(register_probes=[offered("fine")])
-    )
+    registry = Registry.of(bad=plugin(register_probes=answer), good=plugin(offered("fine")))
     assert registry.names("probe") == ("fine",)
     (broken,) = registry.broken
     assert said in broken.reason
     assert "register_probes (" in broken.reason
 
 
-def test_a_misspelt_hook_is_reported_with_the_allowed_ones():
-    @hookimpl
-    def register_probe():
-        return []
-
-    registry = Registry.of(ours=SimpleNamespace(register_probe=register_probe))
-    (broken,) = registry.broken
-    assert broken.reason.startswith("unknown hook 'register_probe' (")
-    assert "did you mean 'register_probes'? Allowed: register_probes, register_sc" in broken.reason
+@hookimpl
+def register_probe():
+    return []
 
 
-def test_a_hook_without_its_mark_is_reported():
-    registry = Registry.of(ours=SimpleNamespace(register_probes=list))
-    (broken,) = registry.broken
-    assert "lacks the mark @hookimpl" in broken.reason
+@hookimpl
+def register_probes(config):
+    return []
 
 
-def test_a_hook_with_an_argument_that_it_does_not_get_is_reported():
-    @hookimpl
-    def register_probes(config):
-        return []
+MISSPELT = (
+    r"^unknown hook 'register_probe' \(.*did you mean 'register_probes'\? "
+    r"Allowed: register_probes, register_sc"
+)
+SURPLUS = "{'config'} are declared in the hookimpl but can not be found"
 
-    registry = Registry.of(ours=SimpleNamespace(register_probes=register_probes))
-    (broken,) = registry.broken
-    assert "{'config'} are declared in the hookimpl but can not be found" in broken.reason
+
+@pytest.mark.parametrize(
+    ("name", "hook", "said"),
+    [
+        ("register_probe", register_probe, MISSPELT),
+        ("register_probes", list, "lacks the mark @hookimpl"),
+        ("register_probes", register_probes, SURPLUS),
+    ],
+    ids=["misspelt", "without its mark", "with an argument that it does not get"],
+)
+def test_a_wrong_hook_is_reported(name, hook, said):
+    (broken,) = Registry.of(ours=SimpleNamespace(**{name: hook})).broken
+    assert re.search(said, broken.reason)
 
 
 def test_only_a_probe_that_says_so_is_absent_and_any_other_fault_is_an_error(context):
@@ -300,7 +276,7 @@ def test_only_a_probe_that_says_so_is_absent_and_any_other_fault_is_an_error(con
     def fail(options, context):
         raise OSError("no /proc")
 
-    registry = probes(offered("cpu"), offered("gpu", skip), offered("net", fail))
+    registry = registry_of(offered("cpu"), offered("gpu", skip), offered("net", fail))
     result = registry.probes({"cpu": {}, "gpu": {}, "net": {}}, context)
     assert result.absent == {"gpu": "no NVIDIA driver"}
     cpu, net = result.made
@@ -315,7 +291,7 @@ def test_only_a_probe_that_says_so_is_absent_and_any_other_fault_is_an_error(con
 
 
 def test_the_default_probes_are_those_that_say_so(context):
-    registry = probes(offered("cpu", default=True, period=0.5, deadline=2.0), offered("other"))
+    registry = registry_of(offered("cpu", default=True, period=0.5, deadline=2.0), offered("other"))
     (made,) = registry.probes(None, context).made
     assert (made.name, made.period, made.deadline) == ("cpu", 0.5, 2.0)
     assert registry.probes({}, context).made == ()
@@ -328,16 +304,7 @@ def test_a_host_without_any_probe_must_say_so(context):
 
 def test_an_unknown_probe_stops_the_slave_at_its_start(context):
     with pytest.raises(ConfigError, match="unknown probe 'cqu'; did you mean 'cpu'"):
-        probes(offered("cpu")).probes({"cqu": {}}, context)
-
-
-def described(**fields):
-    """Return a probe whose description cannot be sent: it would end the slave's registration."""
-    return SimpleNamespace(
-        resources=[ResourceDescription(**{"name": "b", "unit": "1", "capacity": 1.0, **fields})],
-        read=None,
-        close=None,
-    )
+        registry_of(offered("cpu")).probes({"cqu": {}}, context)
 
 
 @pytest.mark.parametrize(
@@ -349,16 +316,11 @@ def described(**fields):
         (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
         (Probe(), "describes no resource; raise SkipPlugin in `create`"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
-        (described(unit=None), "gives 'b' the unit None; text is required"),
-        (described(scope=None), "gives 'b' the scope None; text is required"),
-        (described(name=3), "names a resource 3"),
-        (described(capacity="10"), "gives 'b' a capacity of '10'; a number above 0"),
-        (SimpleNamespace(resources=["b"], read=None, close=None), "describes a resource by 'b'"),
     ],
 )
 def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_fails(context, second, said):
     """Its stand-in has its declared resources that no other probe reads, up to 16."""
-    registry = probes(
+    registry = registry_of(
         offered("first", lambda options, context: Probe("a"), resources=("a",)),
         offered(
             "second",
@@ -380,8 +342,7 @@ def run(arguments):
 
 def moving(name, executors):
     """Return a plugin with one migration strategy."""
-    offer = MigrationOffer(name, lambda options: None, executors=executors)
-    return plugin(register_migration_strategies=[offer])
+    return plugin(MigrationOffer(name, lambda options: None, executors=executors))
 
 
 def test_executors_come_from_every_migration_offer():
@@ -428,7 +389,7 @@ def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
     """Otherwise every host would count as one without the plugin."""
     able = SimpleNamespace(propose=None, ability="m.abel", host_fault=max)
     offer = MigrationOffer("m", lambda options: able, executors={"m.able": dict})
-    registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
+    registry = registry_of(offer)
     with pytest.raises(PluginError, match=r"`ability` is 'm\.abel', no executor .*are: m\.able"):
         registry.migrations({"m": {}})
 
@@ -446,7 +407,7 @@ def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
     listed = SimpleNamespace(propose=None, ability=["m.able"], host_fault=max)
     for strategy, said in ((Angry(), "OSError: no"), (listed, "TypeError: ")):
         offer = MigrationOffer("m", lambda options, made=strategy: made)
-        registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
+        registry = registry_of(offer)
         with pytest.raises(PluginError, match=f"its `ability` raised {said}"):
             registry.migrations({"m": {}})
 
@@ -458,12 +419,7 @@ def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
     def hangs(*_):
         threading.Event().wait()
 
-    registry = Registry.of(
-        ours=plugin(
-            register_probes=[ProbeOffer("slow", hangs)],
-            register_scoring_policies=[ScoringOffer("s", hangs)],
-        )
-    )
+    registry = registry_of(ProbeOffer("slow", hangs), ScoringOffer("s", hangs))
     said = r"`create` \(.*\) raised TimeoutError: it did not return within 0.05 s; "
     said += r"correct what blocks it, or leave '{}' out of the configuration"
     with pytest.raises(PluginError, match=said.format("s")):
@@ -482,7 +438,7 @@ def test_a_hook_that_hangs_is_named_while_it_does_and_ended(monkeypatch, caplog)
         threading.Event().wait()
 
     slow = SimpleNamespace(register_probes=register_probes)
-    registry = Registry.of(slow=slow, good=plugin(register_probes=[offered("fine")]))
+    registry = Registry.of(slow=slow, good=plugin(offered("fine")))
     assert registry.names("probe") == ("fine",)
     (broken,) = registry.broken
     place = f"{__file__}:{register_probes.__code__.co_firstlineno}"
@@ -499,7 +455,7 @@ def test_options_that_cannot_be_read_are_the_plugins_fault():
         value: NoSuchType = 1  # noqa: F821 - this is what is wrong with it
 
     offer = ScoringOffer("s", lambda options: None, Unreadable)
-    registry = Registry.of(ours=plugin(register_scoring_policies=[offer]))
+    registry = registry_of(offer)
     with pytest.raises(PluginError, match="its options cannot be read: NameError: name 'NoSuchT"):
         registry.scoring("s")
 
@@ -510,6 +466,6 @@ def test_a_plugin_that_raises_when_it_is_looked_at_is_broken():
         def register_probes(self):
             raise OSError("no")
 
-    registry = Registry.of(angry=Angry(), good=plugin(register_probes=[offered("fine")]))
+    registry = Registry.of(angry=Angry(), good=plugin(offered("fine")))
     assert registry.names("probe") == ("fine",)
     assert registry.broken[0].reason.startswith("does not import: OSError: no (")
