@@ -35,9 +35,14 @@ def becomes(monkeypatch, tmp_path):
     return seen
 
 
-def test_a_master_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path):
+@pytest.fixture
+def cluster_file(tmp_path):
     (tmp_path / "c.yaml").write_text("name: lab\nstate: s\n", encoding="utf-8")
-    result = rosrm("master", "--config", tmp_path / "c.yaml", "--domain", 7)
+    return tmp_path / "c.yaml"
+
+
+def test_a_master_starts_with_the_settings_of_its_file(rosrm, becomes, cluster_file, tmp_path):
+    result = rosrm("master", "--config", cluster_file, "--domain", 7)
     assert result.code == 0
     assert result.err.startswith("master 'lab': domain 7, ")
     assert f"scoring weighted; migration relaunch; state in {tmp_path / 's'}" in result.err
@@ -64,15 +69,20 @@ def test_both_start_with_the_defaults_too(rosrm, becomes):
     assert [module for module, _ in becomes] == ["rosrm.master", "rosrm.slave"]
 
 
-def test_a_wrong_file_or_unknown_plugin_starts_nothing(rosrm, becomes, tmp_path):
+@pytest.mark.parametrize(
+    ("command", "name", "said"),
+    [
+        ("master", "c.yaml", ":1:11: unknown scoring policy 'weihgted'; did you mean 'weighted'?"),
+        ("slave", "none.yaml", ": cannot be read: No such file or directory"),
+    ],
+)
+def test_a_wrong_file_or_unknown_plugin_starts_nothing(
+    rosrm, becomes, tmp_path, command, name, said
+):
     (tmp_path / "c.yaml").write_text("scoring: {policy: weihgted}\n", encoding="utf-8")
-    result = rosrm("master", "--config", tmp_path / "c.yaml")
-    assert result.code == 2
-    assert "c.yaml:1:11: unknown scoring policy 'weihgted'; did you mean 'weighted'?" in result.err
-    result = rosrm("slave", "--config", tmp_path / "none.yaml")
-    assert result.code == 2
-    assert "none.yaml: cannot be read: No such file or directory" in result.err
-    assert becomes == []
+    result = rosrm(command, "--config", tmp_path / name)
+    assert (result.code, becomes) == (2, [])
+    assert f"{name}{said}" in result.err
 
 
 def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch):
@@ -91,10 +101,9 @@ def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch
     assert list(seen["handover"].plugins) == installed_plugins()
 
 
-def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes, tmp_path):
-    (tmp_path / "c.yaml").write_text("name: lab\nstate: s\n", encoding="utf-8")
-    path = tmp_path / "s" / "journal.sqlite"
-    command = ("master", "--config", tmp_path / "c.yaml", "--recover")
+def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes, cluster_file):
+    path = cluster_file.parent / "s" / "journal.sqlite"
+    command = ("master", "--config", cluster_file, "--recover")
 
     none = rosrm(*command)
     assert (none.code, becomes) == (1, [])
