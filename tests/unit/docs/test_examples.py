@@ -24,9 +24,6 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md
 
 TREE = typer.main.get_command(app)
 
-_FENCE = re.compile(
-    r"(?:^<!-- ([^\n]*) -->\n)?^```(\w+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL
-)
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -36,10 +33,9 @@ def name_of(page: Path) -> str:
 
 def blocks(page: Path, language: str) -> Iterator[tuple[str, str, str]]:
     """Yield mark, title and text of each fenced block of a language."""
-    for mark, found, info, text in _FENCE.findall(page.read_text(encoding="utf-8")):
-        if found == language:
-            title = re.search(r'title="([^"]+)"', info)
-            yield mark, title[1] if title else "", text
+    for found in pages.BLOCK.finditer(page.read_text(encoding="utf-8")):
+        if found["language"] == language:
+            yield found["mark"] or "", pages.title_of(found), found["text"]
 
 
 # --- files ------------------------------------------------------------------------------------
@@ -71,13 +67,13 @@ def test_every_file_that_is_shown_is_right(title, text, tmp_path, monkeypatch, r
 
 def test_no_two_pages_have_clusters_of_one_name():
     """Their processes would mix in the journal, whose path is below the name."""
-    pages = {}
+    used = {}
     for page in PAGES:
         for _, title, text in blocks(page, "yaml"):
             given = yaml.safe_load(text) if title.endswith("cluster.yaml") else {}
             if "state" not in given:
-                pages.setdefault(given.get("name"), set()).add(name_of(page))
-    assert {name: where for name, where in pages.items() if name and len(where) > 1} == {}
+                used.setdefault(given.get("name"), set()).add(name_of(page))
+    assert {name: where for name, where in used.items() if name and len(where) > 1} == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -108,7 +104,7 @@ def test_a_program_is_shown_as_it_is(mark, text):
 
 def links(page: Path) -> Iterator[str]:
     """Yield the relative links of a page, code left out."""
-    text = _FENCE.sub("", page.read_text(encoding="utf-8"))
+    text = pages.BLOCK.sub("", page.read_text(encoding="utf-8"))
     for target in _LINK.findall(re.sub(r"`[^`\n]*`", "`code`", text)):
         if not re.match(r"[a-z]+:", target):
             yield target
@@ -116,7 +112,7 @@ def links(page: Path) -> Iterator[str]:
 
 def anchors(page: Path) -> set[str]:
     """Return the anchors of the headings of a page, as GitHub makes them."""
-    text = _FENCE.sub("", page.read_text(encoding="utf-8"))
+    text = pages.BLOCK.sub("", page.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -214,14 +210,9 @@ def test_an_answer_is_compared_but_for_what_differs_each_time(given, same):
 # --- names ------------------------------------------------------------------------------------
 
 TOPICS = {
-    "resource_info",
-    "process_status",
-    "process_usage",
-    "kept_states",
-    "master_beat",
-    "master_load",
-    "state_config",
-}
+    "resource_info", "process_status", "process_usage", "kept_states", "master_beat",
+    "master_load", "state_config",
+}  # fmt: skip
 NAMES = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
 OF_A_HOST = {names.CONTROL, names.READ_LOG, names.KEEP_STATE, names.READ_KEPT}
 
@@ -241,10 +232,14 @@ def test_the_protocol_page_says_how_a_host_gets_its_name():
     assert example[2] == by_the_page == names.token(example[1])
 
 
-def test_the_security_policy_has_every_name_and_no_other():
-    root = ET.parse(DOCS / "how-to" / "rosrm.policy.xml").getroot()
-    topics = {one.text for one in root.iter("topic")} - {"/parameter_events"}
-    services = {one.text for one in root.iter("service")}
+@pytest.fixture
+def policy() -> ET.Element:
+    return ET.parse(DOCS / "how-to" / "rosrm.policy.xml").getroot()
+
+
+def test_the_security_policy_has_every_name_and_no_other(policy):
+    topics = {one.text for one in policy.iter("topic")} - {"/parameter_events"}
+    services = {one.text for one in policy.iter("service")}
     assert topics == TOPICS | {"handoff/*"}  # each handoff has its own channel
     assert {re.sub(r"^host/[^/]+/", "", service) for service in services} == NAMES - TOPICS
     for service in services:
@@ -252,11 +247,10 @@ def test_the_security_policy_has_every_name_and_no_other():
 
 
 @pytest.mark.parametrize("kind", ["reply", "request"])
-def test_what_one_part_serves_another_may_call(kind):
-    root = ET.parse(DOCS / "how-to" / "rosrm.policy.xml").getroot()
+def test_what_one_part_serves_another_may_call(policy, kind):
     found = {
         re.sub(r"^host/[^/]+/", "", one.text)
-        for services in root.iter("services")
+        for services in policy.iter("services")
         if services.get(kind) == "ALLOW"
         for one in services.iter("service")
     }

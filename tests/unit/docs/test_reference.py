@@ -21,7 +21,7 @@ from rosrm.extensions import contracts, hookspecs, installed
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.discovery import HOOKS
 from rosrm.model import plan
-from rosrm.model import rows as listing_rows
+from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.values import HostDescription
 from rosrm_checkpoint.other_host import OtherHostOptions
 from rosrm_criu.options import CriuOptions
@@ -29,6 +29,7 @@ from rosrm_migration.handoff import HandoffOptions
 from rosrm_migration.relaunch import RelaunchOptions
 from rosrm_scoring.threshold import ThresholdOptions
 from rosrm_scoring.weighted import WeightedOptions
+from tests.plugin_kit import HOOKS as OFFERS
 
 REFERENCE = Path(__file__).resolve().parents[3] / "docs" / "reference"
 
@@ -84,20 +85,17 @@ def test_every_option_of_the_checkpoint_policy_is_documented():
     assert named == {field.name for field in fields(OtherHostOptions)}
 
 
-@pytest.mark.parametrize("options", [WeightedOptions, ThresholdOptions])
-def test_every_option_of_a_scoring_policy_is_documented(options):
-    text = section(page("configuration.md"), "Options of the scoring policies")
-    name = options.__name__.removesuffix("Options").lower()
-    table = text[text.index(f"| `{name}` | default |") :].split("\n\n")[0]
-    named = {word for cell in re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)
-             for word in re.findall(r"`(\w+)`", cell)}  # fmt: skip
-    assert named - {name} == {field.name for field in fields(options)}
-
-
-@pytest.mark.parametrize("options", [RelaunchOptions, HandoffOptions, CriuOptions])
-def test_every_option_of_a_strategy_is_documented(options):
-    """Each shipped strategy has a table with all its options."""
-    text = section(page("configuration.md"), "Options of the strategies")
+@pytest.mark.parametrize(
+    ("heading", "options"),
+    [
+        ("scoring policies", WeightedOptions), ("scoring policies", ThresholdOptions),
+        ("strategies", RelaunchOptions), ("strategies", HandoffOptions),
+        ("strategies", CriuOptions),
+    ],
+)  # fmt: skip
+def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options):
+    """Each shipped one has a table with all its options."""
+    text = section(page("configuration.md"), f"Options of the {heading}")
     name = options.__name__.removesuffix("Options").lower()
     table = text[text.index(f"| `{name}` | default |") :].split("\n\n")[0]
     named = {word for cell in re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)
@@ -112,27 +110,34 @@ def test_every_word_of_a_process_is_documented_and_nothing_else():
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted
 
 
+@pytest.fixture
+def marked(tmp_path):
+    """Return a function that saves the YAML block with a mark; its result is text and file."""
+
+    def save(mark):
+        text = page("configuration.md")
+        block = re.search(rf"<!-- {mark} -->\n```yaml\n(.*?)```", text, re.DOTALL)
+        (tmp_path / "f.yaml").write_text(block[1], encoding="utf-8")
+        return block[1], tmp_path / "f.yaml"
+
+    return save
+
+
 @pytest.mark.parametrize(
     ("mark", "load", "defaults"),
-    [
-        ("defaults: cluster", load_cluster, ClusterConfig()),
-        ("defaults: host", load_host, HostConfig()),
-    ],
+    [("cluster", load_cluster, ClusterConfig()), ("host", load_host, HostConfig())],
 )
-def test_the_defaults_in_the_page_are_the_defaults(mark, load, defaults, tmp_path, monkeypatch):
+def test_the_defaults_in_the_page_are_the_defaults(mark, load, defaults, marked):
     """The example has every key but the host's name, which is the machine's."""
-    block = re.search(rf"<!-- {mark} -->\n```yaml\n(.*?)```", page("configuration.md"), re.DOTALL)
-    (tmp_path / "f.yaml").write_text(block[1], encoding="utf-8")
-    assert load(tmp_path / "f.yaml") == defaults
+    text, file = marked(f"defaults: {mark}")
+    assert load(file) == defaults
     for key in keys(type(defaults)):
         name = key.rsplit(".", 1)[-1]
-        assert key == "host" or re.search(rf"\b{name}:", block[1]), f"{key} is not in the example"
+        assert key == "host" or re.search(rf"\b{name}:", text), f"{key} is not in the example"
 
 
-def test_the_work_file_in_the_page_is_right(tmp_path):
-    block = re.search(r"<!-- work -->\n```yaml\n(.*?)```", page("configuration.md"), re.DOTALL)
-    (tmp_path / "work.yaml").write_text(block[1], encoding="utf-8")
-    assert len(load_work(tmp_path / "work.yaml")) == 22
+def test_the_work_file_in_the_page_is_right(marked):
+    assert len(load_work(marked("work")[1])) == 22
 
 
 def hook_names() -> list[str]:
@@ -155,17 +160,7 @@ def test_every_hook_and_its_parameters_are_documented(hook):
         assert f"`{parameter}`" in section(text, "Hooks")
 
 
-@pytest.mark.parametrize(
-    "offer",
-    [
-        contracts.ProbeOffer,
-        contracts.ScoringOffer,
-        contracts.MigrationOffer,
-        contracts.CheckpointOffer,
-        contracts.LauncherOffer,
-    ],
-    ids=lambda offer: offer.__name__,
-)
+@pytest.mark.parametrize("offer", OFFERS, ids=lambda offer: offer.__name__)
 def test_every_field_of_an_offer_is_documented(offer):
     text = page("plugins.md")
     common = section(text, "Offers").split("\n### ")[0]
@@ -175,33 +170,23 @@ def test_every_field_of_an_offer_is_documented(offer):
 
 
 @pytest.mark.parametrize(
-    ("heading", "kinds"),
+    ("offer", "kinds"),
     [
-        ("`ProbeOffer`", [contracts.Probe, contracts.ProbeContext, contracts.Sessions]),
-        (
-            "`ScoringOffer`",
-            [contracts.ScoringPolicy, contracts.HostView, contracts.ProcessView, contracts.Scores],
-        ),
-        ("`MigrationOffer`", [contracts.MigrationStrategy, plan.Move, plan.Plan]),
-        (
-            "`CheckpointOffer`",
-            [contracts.CheckpointPolicy, contracts.CheckpointView, contracts.CheckpointChoice],
-        ),
+        ("Probe", [contracts.Probe, contracts.ProbeContext, contracts.Sessions]),
+        ("Scoring", [contracts.ScoringPolicy, contracts.HostView, contracts.ProcessView,
+                     contracts.Scores]),
+        ("Migration", [contracts.MigrationStrategy, plan.Move, plan.Plan]),
+        ("Checkpoint", [contracts.CheckpointPolicy, contracts.CheckpointView,
+                        contracts.CheckpointChoice]),
     ],
-)
-def test_all_that_a_plugin_meets_is_documented(heading, kinds):
-    text = section(page("plugins.md"), heading)
+)  # fmt: skip
+def test_all_that_a_plugin_meets_is_documented(offer, kinds):
+    text = section(page("plugins.md"), f"`{offer}Offer`")
     for kind in kinds:
         assert kind.__name__ in text or kind is contracts.Sessions
         for name in set(vars(kind)) | set(getattr(kind, "__annotations__", ())):
             if not name.startswith("_"):
                 assert re.search(rf"`{name}[`(]", text), f"{kind.__name__}.{name}"
-
-
-def test_every_step_of_a_plan_is_documented():
-    text = section(page("plugins.md"), "`MigrationOffer`")
-    for step in get_args(plan.Step):
-        assert f"`{step.__name__}`" in text
 
 
 def test_every_step_of_a_plan_is_public_and_its_arguments_are_documented():
@@ -260,16 +245,13 @@ def test_the_common_options_are_documented():
 @pytest.mark.parametrize(
     ("title", "kinds"),
     [
-        ("A process", [listing_rows.ProcessRow]),
-        ("A host", [listing_rows.HostRow, HostDescription, listing_rows.ResourceRow]),
-        ("An event", [listing_rows.EventRow]),
-        ("A plugin", [listing_rows.PluginRow]),
+        ("A process", [ProcessRow]), ("A host", [HostRow, HostDescription, ResourceRow]),
+        ("An event", [EventRow]), ("A plugin", [PluginRow]),
     ],
-)
+)  # fmt: skip
 def test_every_field_of_the_json_is_documented(title, kinds):
-    found = re.search(
-        rf"^\*\*{title}\*\*.*?\n\n", page("command-line.md") + "\n", re.MULTILINE | re.DOTALL
-    )
+    text = f"{page('command-line.md')}\n"
+    found = re.search(rf"^\*\*{title}\*\*.*?\n\n", text, re.MULTILINE | re.DOTALL)
     for kind in kinds:
         for f in fields(kind):
             if f.name != "description":  # fields of a host are documented beside the others
