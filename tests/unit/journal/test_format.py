@@ -97,10 +97,9 @@ def state(path: Path) -> MasterState:
 
 def written(state: MasterState) -> dict[tuple[str, str], Any]:
     """Return the newest intents that the state has emitted."""
-    intents = [one for one in state.take() if isinstance(one, Intent)]
-    return {
-        (one.table, one.key): json.loads(json.dumps(one.value, default=dict)) for one in intents
-    }
+    intents = (one for one in state.take() if isinstance(one, Intent))
+    plain = ((one, json.loads(json.dumps(one.value, default=dict))) for one in intents)
+    return {(one.table, one.key): value for one, value in plain}
 
 
 def test_a_new_journal_has_the_tables_of_the_fixture(tmp_path: Path, path: Path) -> None:

@@ -32,27 +32,32 @@ def path(tmp_path):
     return path
 
 
-def pages_of(path, name: str) -> list[int]:
-    """Return the pages that hold rows of a table, as far as they can be recognised."""
-    marks = {"intent": b'{"order": ', "record": b"assigned"}
-    raw = path.read_bytes()
-    return [
-        at
-        for at in range(PAGE, len(raw), PAGE)
-        if marks[name] in raw[at : at + PAGE] and raw[at] in (10, 13)
-    ]
+@pytest.fixture
+def recovered(path):
+    """Return a function that recovers the journal and opens it until the end of the test."""
+    with contextlib.ExitStack() as stack:
+
+        def recover_and_open() -> SqliteJournal:
+            recover(path)
+            return stack.enter_context(contextlib.closing(SqliteJournal(path)))
+
+        yield recover_and_open
 
 
-def spoil(path, at: int) -> None:
+def spoil(path, table: str, which: int) -> None:
+    """Overwrite one of the pages that are known to hold rows of a table."""
+    mark = {"intent": b'{"order": ', "record": b"assigned"}[table]
     raw = bytearray(path.read_bytes())
-    raw[at : at + PAGE] = os.urandom(PAGE)
+    pages = [slice(at, at + PAGE) for at in range(PAGE, len(raw), PAGE)]
+    holding = [page for page in pages if mark in raw[page] and raw[page.start] in (10, 13)]
+    raw[holding[which]] = os.urandom(PAGE)
     path.write_bytes(raw)
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])
 def test_what_can_be_read_goes_on(path, which) -> None:
     """With one damaged page of intents the others are restored, in both directions from it."""
-    spoil(path, pages_of(path, "intent")[which])
+    spoil(path, "intent", which)
     damaged = path.read_bytes()
     with pytest.raises(JournalError, match="--recover"):
         SqliteJournal(path)
@@ -72,42 +77,35 @@ def test_what_can_be_read_goes_on(path, which) -> None:
     journal.close()
 
 
-def test_of_a_file_that_was_cut_short_the_rest_goes_on(path) -> None:
+def test_of_a_file_that_was_cut_short_the_rest_goes_on(path, recovered) -> None:
     """SQLite alone would read nothing of it; the amount depends on the remaining pages."""
     raw = path.read_bytes()
     path.write_bytes(raw[: len(raw) * 3 // 4])
-    recover(path)
-    journal = SqliteJournal(path)
-    assert 0 < len(journal.intents("process")) < COUNT
-    journal.close()
+    assert 0 < len(recovered().intents("process")) < COUNT
 
 
-def test_damaged_events_cost_no_intent(path) -> None:
+def test_damaged_events_cost_no_intent(path, recovered) -> None:
     """Events are information for users only."""
-    spoil(path, pages_of(path, "record")[1])
-    recover(path)
-    journal = SqliteJournal(path)
+    spoil(path, "record", 1)
+    journal = recovered()
     assert len(journal.intents("process")) == COUNT
     assert journal.intents("cluster")["instances"] == {"next": 2001}
     assert COUNT / 2 < len(journal.records(newest=10**6)) <= COUNT
-    journal.close()
 
 
-def test_what_is_left_is_put_right(path) -> None:
+def test_what_is_left_is_put_right(path, recovered) -> None:
     """Hosts of processes are expected, and no number is used twice."""
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM intent WHERE tbl IN ('host', 'cluster')")
-    spoil(path, pages_of(path, "record")[0])
-    recover(path)
-    journal = SqliteJournal(path)
+    spoil(path, "record", 0)
+    journal = recovered()
     hosts = journal.intents("host")
     assert set(hosts) == {"h0", "h1", "h2"}
     assert len({host["host_id"] for host in hosts.values()}) == 3
     assert journal.intents("cluster")["instances"]["next"] >= COUNT
-    journal.close()
 
 
-def test_numbers_go_on_above_all_that_events_know(path) -> None:
+def test_numbers_go_on_above_all_that_events_know(path, recovered) -> None:
     """Supervisors refuse numbers whose end they have seen, however few instances live now."""
     journal = SqliteJournal(path)
     ended = Record("ended", "p000", facts={"number": 70_000, "pid": 1})
@@ -115,11 +113,8 @@ def test_numbers_go_on_above_all_that_events_know(path) -> None:
     odd = Record("odd", "p000", facts={"number": "100000", "destination": True})
     journal.write([ended, moved, odd], [Intent("cluster", "instances", None)], 0.0)
     journal.close()
-    spoil(path, pages_of(path, "record")[0])
-    recover(path)
-    journal = SqliteJournal(path)
-    assert 90_000 < journal.intents("cluster")["instances"]["next"] < 100_000
-    journal.close()
+    spoil(path, "record", 0)
+    assert 90_000 < recovered().intents("cluster")["instances"]["next"] < 100_000
 
 
 class Killed(BaseException):
@@ -131,7 +126,7 @@ def test_killed_at_any_step_the_journal_is_the_damaged_one_or_the_new_one(
     path, monkeypatch, step
 ) -> None:
     """A missing journal would start a new cluster; after the kill the recovery can be repeated."""
-    spoil(path, pages_of(path, "intent")[1])
+    spoil(path, "intent", 1)
     damaged = path.read_bytes()
     steps = iter(range(100))
 
@@ -159,13 +154,10 @@ def test_killed_at_any_step_the_journal_is_the_damaged_one_or_the_new_one(
     assert all(one == damaged for one in kept)
 
 
-def test_all_hosts_are_heard_before_work_is_given(path) -> None:
+def test_all_hosts_are_heard_before_work_is_given(path, recovered) -> None:
     """A recovered journal counts as after a power loss: its `boot` is empty."""
-    spoil(path, pages_of(path, "intent")[1])
-    recover(path)
-    journal = SqliteJournal(path)
-    assert journal.intents("cluster")["epoch"] == {"epoch": 4, "boot": "recovered"}
-    journal.close()
+    spoil(path, "intent", 1)
+    assert recovered().intents("cluster")["epoch"] == {"epoch": 4, "boot": "recovered"}
 
 
 def test_a_whole_journal_is_left_alone(path) -> None:

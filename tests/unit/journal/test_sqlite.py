@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import resource
 import signal
 import sqlite3
 import subprocess
@@ -23,11 +23,38 @@ def path(tmp_path):
     return tmp_path / "state" / "journal.sqlite"
 
 
+@pytest.fixture
+def opened(path):
+    """Return a function that opens the journal; it is closed at the end of the test."""
+    with contextlib.ExitStack() as stack:
+
+        def open_(**options) -> SqliteJournal:
+            return stack.enter_context(contextlib.closing(SqliteJournal(path, **options)))
+
+        yield open_
+
+
+@pytest.fixture
+def mounted(tmp_path):
+    """Return a function that mounts a file system in memory on a folder."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+
+    def mount(*options):
+        words = ["mount", "-t", "tmpfs", *options, "tmpfs", disk]
+        done = subprocess.run(words, capture_output=True, check=False)
+        if done.returncode:
+            pytest.skip(f"cannot mount here: {done.stderr.decode()}")
+        return disk
+
+    yield mount
+    subprocess.run(["umount", "-l", disk], check=False, stderr=subprocess.DEVNULL)
+
+
 def fill(path, count=3) -> None:
-    journal = SqliteJournal(path)
-    for number in range(count):
-        journal.write([Record("n", str(number))], [Intent("process", "p", {"n": number})], 0.0)
-    journal.close()
+    with contextlib.closing(SqliteJournal(path)) as journal:
+        for number in range(count):
+            journal.write([Record("n", str(number))], [Intent("process", "p", {"n": number})], 0.0)
 
 
 def run(code: str, path, **options) -> subprocess.Popen:
@@ -58,7 +85,7 @@ WRITER = """
 
 
 @pytest.mark.parametrize("after", [1, 7, 150, 1200])
-def test_sigkill_loses_nothing_that_was_answered(path, after) -> None:
+def test_sigkill_loses_nothing_that_was_answered(path, opened, after) -> None:
     """Every acknowledged write is complete; an unacknowledged one is complete or absent."""
     writer = run(WRITER, path)
     for _ in range(after):
@@ -69,10 +96,9 @@ def test_sigkill_loses_nothing_that_was_answered(path, after) -> None:
     if lines := rest.split("\n")[:-1]:
         answered = int(lines[-1])
 
-    journal = SqliteJournal(path)
+    journal = opened()
     records = journal.records(newest=10**6)
     last = journal.intents("process")["p"]["n"]
-    journal.close()
 
     assert answered <= last <= answered + 1
     assert [r.sequence for r in records] == list(range(1, 2 * last + 1))
@@ -80,9 +106,9 @@ def test_sigkill_loses_nothing_that_was_answered(path, after) -> None:
     assert records[-1].record.process == str(last)
 
 
-def test_a_group_is_whole_or_not_at_all(path) -> None:
+def test_a_group_is_whole_or_not_at_all(opened) -> None:
     """A group with an invalid value changes nothing, and the next group is written."""
-    journal = SqliteJournal(path)
+    journal = opened()
     journal.write([Record("a")], [Intent("host", "h", {"n": 1})], 0.0)
     with pytest.raises(TypeError, match="no JSON"):
         journal.write([Record("b")], [Intent("host", "h", {"n": object()})], 0.0)
@@ -90,47 +116,37 @@ def test_a_group_is_whole_or_not_at_all(path) -> None:
     assert [s.sequence for s in stored] == [2]
     assert [s.record.kind for s in journal.records()] == ["a", "c"]
     assert journal.intents("host") == {"h": {"n": 1}}
-    journal.close()
 
 
-def spoil_header(path):
-    path.write_bytes(b"this is no database at all, but text" * 100)
-
-
-def spoil_middle(path):
-    raw = bytearray(path.read_bytes())
-    raw[4096 : 2 * 4096] = os.urandom(4096)
-    path.write_bytes(raw)
-
-
-def spoil_end(path):
-    path.write_bytes(path.read_bytes()[:5000])
-
-
-def spoil_value(path):
+def change(path, *statements: str) -> None:
+    """Execute statements on the file, without rosrm."""
     with sqlite3.connect(path) as database:
-        database.execute("UPDATE intent SET value = '{'")
+        for statement in statements:
+            database.execute(statement)
 
 
-def spoil_all(path):
-    path.write_bytes(b"")
-
-
-def spoil_index(path):
-    with sqlite3.connect(path) as database:
-        database.execute("PRAGMA writable_schema = ON")
-        database.execute(
-            "UPDATE sqlite_schema SET sql = replace(sql, '!= ', '= ') WHERE name = 'record_process'"
-        )
+INDEX = "UPDATE sqlite_schema SET sql = replace(sql, '!= ', '= ') WHERE name = 'record_process'"
 
 
 @pytest.mark.parametrize(
-    "spoil", [spoil_header, spoil_middle, spoil_end, spoil_value, spoil_all, spoil_index]
+    "spoil",
+    [
+        lambda raw: b"this is no database at all, but text" * 100,
+        lambda raw: raw[:4096] + os.urandom(4096) + raw[2 * 4096 :],
+        lambda raw: raw[:5000],
+        lambda raw: b"",
+        ("UPDATE intent SET value = '{'",),
+        ("PRAGMA writable_schema = ON", INDEX),
+    ],
+    ids=["header", "middle", "end", "all", "value", "index"],
 )
 def test_a_damaged_file_is_refused(path, spoil) -> None:
     """The error has its path and the remedy; the file is not changed or taken for an empty one."""
     fill(path, 200)
-    spoil(path)
+    if isinstance(spoil, tuple):
+        change(path, *spoil)
+    else:
+        path.write_bytes(spoil(path.read_bytes()))
     before = path.read_bytes()
 
     with pytest.raises(JournalError) as refusal:
@@ -141,7 +157,7 @@ def test_a_damaged_file_is_refused(path, spoil) -> None:
     assert path.read_bytes() == before
 
 
-def test_a_damaged_log_costs_what_is_behind_the_damage(path) -> None:
+def test_a_damaged_log_costs_what_is_behind_the_damage(path, opened) -> None:
     """SQLite raises no error; only the number of the newest record reveals the loss."""
     writer = run(WRITER, path)
     for _ in range(20):
@@ -156,11 +172,10 @@ def test_a_damaged_log_costs_what_is_behind_the_damage(path) -> None:
     raw[len(raw) // 2 :] = os.urandom(len(raw) - len(raw) // 2)
     log.write_bytes(raw)
 
-    journal = SqliteJournal(path)
+    journal = opened()
     last = journal.intents("process")["p"]["n"]
     assert 0 < last < answered
     assert journal.last_sequence == 2 * last
-    journal.close()
 
 
 def test_a_log_that_can_be_none_is_said(path) -> None:
@@ -172,26 +187,19 @@ def test_a_log_that_can_be_none_is_said(path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a file system")
-def test_a_file_system_that_is_read_only_is_said(tmp_path) -> None:
+def test_a_file_system_that_is_read_only_is_said(mounted) -> None:
     """The message has the path and the remedy, and claims no damage."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "tmpfs", disk], check=False).returncode:
-        pytest.skip("cannot mount here")
-    try:
-        fill(disk / "journal.sqlite")
-        subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
-        with pytest.raises(JournalBlocked, match="check owner and permissions"):
-            SqliteJournal(disk / "journal.sqlite").write([Record("a")], [], 0.0)
-    finally:
-        subprocess.run(["umount", "-l", disk], check=True)
+    disk = mounted()
+    fill(disk / "journal.sqlite")
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+    with pytest.raises(JournalBlocked, match="check owner and permissions"):
+        SqliteJournal(disk / "journal.sqlite").write([Record("a")], [], 0.0)
 
 
 def test_another_version_is_refused(path) -> None:
     """A file of a later version of rosrm is not misread."""
     fill(path)
-    with sqlite3.connect(path) as database:
-        database.execute("PRAGMA user_version = 99")
+    change(path, "PRAGMA user_version = 99")
     with pytest.raises(JournalError, match="tables 99, here 1"):
         SqliteJournal(path)
 
@@ -199,8 +207,7 @@ def test_another_version_is_refused(path) -> None:
 def test_a_stranger_s_database_is_refused(path) -> None:
     """The file of another program is not changed."""
     path.parent.mkdir()
-    with sqlite3.connect(path) as database:
-        database.execute("CREATE TABLE record (something INTEGER)")
+    change(path, "CREATE TABLE record (something INTEGER)")
     with pytest.raises(JournalError, match="database of another program"):
         SqliteJournal(path)
 
@@ -215,7 +222,7 @@ def test_a_locked_file_is_refused(path) -> None:
     holder.close()
 
 
-def test_a_full_disk_is_said(path) -> None:
+def test_a_full_disk_is_said(path, opened) -> None:
     """Acknowledged writes stay; the message has the full disk and the remedy."""
     code = """
         import json, resource, sys
@@ -242,25 +249,18 @@ def test_a_full_disk_is_said(path) -> None:
     assert str(path) in message
     assert "make room" in message
     assert "damaged" not in message
-    journal = SqliteJournal(path)
+    journal = opened()
     assert journal.intents("a") == {"b": {"n": answered}}
     assert journal.last_sequence == answered
-    journal.close()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
-def test_a_full_file_system_is_said(tmp_path) -> None:
+def test_a_full_file_system_is_said(mounted) -> None:
     """The error has the file system, and writes succeed again once there is room.
 
     The group that failed is then written unchanged, and its numbers have no gap.
     """
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", disk], capture_output=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"cannot mount here: {mounted.stderr.decode()}")
+    disk = mounted("-o", "size=400k")
     answered = []
 
     def fill_up(journal) -> None:
@@ -268,23 +268,20 @@ def test_a_full_file_system_is_said(tmp_path) -> None:
             journal.write([Record("n", "x" * 500)], [Intent("a", "b", {"n": number})], 0.0)
             answered.append(number)
 
-    try:
-        (disk / "filler").write_bytes(bytes(100_000))
-        journal = SqliteJournal(disk / "journal.sqlite")
-        free = rf"the disk is full \(the file system {disk} has \d.* free of 400.0 KiB\): make room"
-        for _ in range(3):
-            with pytest.raises(JournalBlocked, match=free):
-                fill_up(journal)
-        count = len(answered)
-        assert journal.intents("a") == {"b": {"n": answered[-1]}}
-        assert journal.last_sequence == count
-        (disk / "filler").unlink()
-        journal.write([Record("at last")], [Intent("a", "b", {"n": -1})], 0.0)
-        assert journal.intents("a") == {"b": {"n": -1}}
-        assert [one.sequence for one in journal.records(newest=10**6)] == [*range(1, count + 2)]
-        journal._database.close()
-    finally:
-        subprocess.run(["umount", "-l", disk], check=True)
+    (disk / "filler").write_bytes(bytes(100_000))
+    journal = SqliteJournal(disk / "journal.sqlite")
+    free = rf"the disk is full \(the file system {disk} has \d.* free of 400.0 KiB\): make room"
+    for _ in range(3):
+        with pytest.raises(JournalBlocked, match=free):
+            fill_up(journal)
+    count = len(answered)
+    assert journal.intents("a") == {"b": {"n": answered[-1]}}
+    assert journal.last_sequence == count
+    (disk / "filler").unlink()
+    journal.write([Record("at last")], [Intent("a", "b", {"n": -1})], 0.0)
+    assert journal.intents("a") == {"b": {"n": -1}}
+    assert [one.sequence for one in journal.records(newest=10**6)] == [*range(1, count + 2)]
+    journal._database.close()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -304,39 +301,33 @@ def test_a_path_that_can_be_none_is_said(tmp_path) -> None:
             SqliteJournal(path)
 
 
-def test_old_events_are_pruned(path) -> None:
+def test_old_events_are_pruned(opened) -> None:
     """The newest events are kept, and their numbers continue after a restart."""
-    journal = SqliteJournal(path, keep_events=50)
+    journal = opened(keep_events=50)
     for _ in range(25):
         journal.write([Record("n")] * 100, [], 0.0)
     kept = journal.records(newest=10**6)
     assert kept[-1].sequence == 2500
     assert 50 <= len(kept) <= 50 + 1000
     journal.close()
-    again = SqliteJournal(path, keep_events=50)
-    assert again.last_sequence == 2500
-    again.close()
+    assert opened(keep_events=50).last_sequence == 2500
 
 
-def test_damaged_facts_of_an_event_hide_no_other(path) -> None:
+def test_damaged_facts_of_an_event_hide_no_other(path, opened) -> None:
     """Facts are information for users only, and the event shows the damage."""
     fill(path)
-    with sqlite3.connect(path) as database:
-        database.execute("UPDATE record SET facts = '{' WHERE sequence = 2")
-    journal = SqliteJournal(path)
-    assert [one.record.facts for one in journal.records()] == [{}, {"unreadable": "{"}, {}]
-    journal.close()
+    change(path, "UPDATE record SET facts = '{' WHERE sequence = 2")
+    assert [one.record.facts for one in opened().records()] == [{}, {"unreadable": "{"}, {}]
 
 
-def test_pruning_that_fails_fails_no_write(path) -> None:
+def test_pruning_that_fails_fails_no_write(opened) -> None:
     """The write itself succeeded, and a retry would write it twice."""
-    journal = SqliteJournal(path, keep_events=0)
+    journal = opened(keep_events=0)
     journal._database.execute(
         "CREATE TRIGGER t BEFORE DELETE ON record BEGIN SELECT raise(ABORT, 'disk is full'); END"
     )
     stored = journal.write([Record("n")] * 1000, [], 0.0)
     assert len(stored) == len(journal.records(newest=10**6)) == 1000
-    journal.close()
 
 
 def test_the_folder_is_private(path) -> None:
@@ -345,14 +336,8 @@ def test_the_folder_is_private(path) -> None:
     assert path.parent.stat().st_mode & 0o077 == 0
 
 
-def test_full_sync_works_the_same(path) -> None:
+def test_full_sync_works_the_same(opened) -> None:
     """`sync: full` flushes to the disk with every group."""
-    journal = SqliteJournal(path, sync="full")
+    journal = opened(sync="full")
     journal.write([Record("a")], [], 0.0)
     assert journal._database.execute("PRAGMA synchronous").fetchone() == (2,)
-    journal.close()
-
-
-def test_a_limit_is_not_left_behind() -> None:
-    """The test of the full disk limits a process of its own, not this one."""
-    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] != 200_000
