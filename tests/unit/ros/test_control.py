@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rosrm.ros.control import Gate, check_answer, refused, version_refusal
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import Envelope
@@ -37,18 +39,22 @@ def test_a_fresh_request_passes() -> None:
         assert gate().refusal(envelope((100 - age) * S)) is None
 
 
-def test_a_late_request_is_refused() -> None:
-    """DDS delivers requests seconds late after a cut; they are no longer carried out."""
-    answer = gate().refusal(envelope(94 * S))
-    assert (answer.accepted, answer.code) == (False, "stale")
-    assert "6.0 s" in answer.message
-    assert "client test" in answer.message
-
-
-def test_a_request_for_another_run_is_refused() -> None:
-    """A missing beat, or one that this receiver's clock has not reached, belongs to another run."""
-    for beat in (0, 101 * S, 2**63):
-        assert gate().refusal(envelope(beat)).code == "stale"
+@pytest.mark.parametrize(
+    ("changes", "code", "said"),
+    [
+        ({"receiver_beat": 94 * S}, "stale", ["6.0 s", "client test"]),  # late by DDS after a cut
+        ({"receiver_beat": 0}, "stale", []),  # of another run, as a beat that is still to come
+        ({"receiver_beat": 101 * S}, "stale", []),
+        ({"receiver_beat": 2**63}, "stale", []),
+        ({"request_id": ""}, "invalid", []),  # a repetition could not be recognised
+        # The other fields of another version are not used.
+        ({"protocol_version": 99, "receiver_beat": 0}, "version", ["99", str(PROTOCOL_VERSION)]),
+    ],
+)
+def test_what_is_stale_or_invalid_is_refused(changes, code, said) -> None:
+    answer = gate().refusal(envelope(100 * S, **changes))
+    assert (answer.accepted, answer.code) == (False, code)
+    assert [text for text in said if text not in answer.message] == []
 
 
 def test_an_older_epoch_is_refused() -> None:
@@ -58,36 +64,15 @@ def test_an_older_epoch_is_refused() -> None:
     assert gate().refusal(envelope(100 * S, epoch=4), epoch=3) is None
 
 
-def test_another_version_is_refused_first() -> None:
-    """The other fields of such an envelope are not used."""
-    answer = gate().refusal(envelope(0, protocol_version=99))
-    assert answer.code == "version"
-    assert "99" in answer.message
-    assert str(PROTOCOL_VERSION) in answer.message
-
-
-def test_a_request_without_an_id_is_refused() -> None:
-    """Without an id a repetition could not be recognised."""
-    assert gate().refusal(envelope(100 * S, request_id="")).code == "invalid"
-
-
-def test_a_repeated_request_gets_the_same_answer() -> None:
-    """A repeated request is not carried out again."""
-    judge, first, again = gate(), Requested(), Requested()
-    assert not judge.repeated(envelope(1), first)
-    judge.remember(envelope(1), "done")
-    assert judge.repeated(envelope(1), again)
-    assert again.answers == ["done"]
-
-
-def test_a_request_repeated_while_it_is_carried_out_gets_the_answer_too() -> None:
-    """The pending answer goes to every sender of the request."""
-    judge, first, again = gate(), Requested(), Requested()
+def test_a_repeated_request_gets_the_same_answer_also_while_it_is_carried_out() -> None:
+    """A repeated request is not carried out again; the answer goes to every sender of it."""
+    judge, first, again, later = gate(), Requested(), Requested(), Requested()
     assert not judge.repeated(envelope(1), first)
     assert judge.repeated(envelope(1), again)
     assert again.answers == []
     judge.remember(envelope(1), "done")
-    assert again.answers == ["done"]
+    assert judge.repeated(envelope(1), later)
+    assert again.answers == later.answers == ["done"]
     assert first.answers == []  # the code that carries out the first request answers it
 
 

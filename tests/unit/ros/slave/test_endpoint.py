@@ -135,20 +135,19 @@ class Master:
         self._slave.wire.hear[msg.MasterBeat](beat)
 
     def greet(self) -> None:
-        self._slave.newest(srv.Handshake).answer(
-            srv.Handshake.Response(
-                protocol_version=PROTOCOL_VERSION,
-                accepted=True,
-                master="m",
-                beat=self._slave.clock.monotonic_ns(),
-                **self._is,
-            )
-        )
+        response = srv.Handshake.Response(
+            protocol_version=PROTOCOL_VERSION, accepted=True, master="m",
+            beat=self._slave.clock.monotonic_ns(), **self._is,
+        )  # fmt: skip
+        self._slave.newest(srv.Handshake).answer(response)
 
-    def take_in(self) -> None:
-        answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True, epoch=self._epoch)
+    def take_in(self, **refusal) -> None:
+        """Answer the slave's registration; `refusal` has the fields of a refusal."""
+        answer = {"protocol_version": PROTOCOL_VERSION, "accepted": not refusal, **refusal}
         self._slave.newest(srv.RegisterHost).answer(
-            srv.RegisterHost.Response(answer=answer, host_id=1, beat_period=PERIOD)
+            srv.RegisterHost.Response(
+                answer=msg.Answer(epoch=self._epoch, **answer), host_id=1, beat_period=PERIOD
+            )
         )
 
 
@@ -179,11 +178,15 @@ class Slave:
             self.endpoint.go_on(self.clock.now)
             self.endpoint.ask(self.clock.now)
 
-    def join(self, master: Master) -> None:
-        """Greet the slave, send beats and accept its registration."""
+    def find(self, master: Master) -> None:
+        """Greet the slave and send a beat, so that it registers."""
         self.pass_time(PERIOD)
         master.beat()
         master.greet()
+
+    def join(self, master: Master) -> None:
+        """Greet the slave, send beats and accept its registration."""
+        self.find(master)
         master.take_in()
         assert self.link is Link.REGISTERED
 
@@ -366,12 +369,9 @@ def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
 def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
     """The slave retries for a moment, and logs the conflict once."""
     ours = Master(slave, 11)
-    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, code="name_taken", message="a live one")
     for _ in range(3):
-        slave.pass_time(PERIOD)
-        ours.beat()
-        ours.greet()
-        slave.newest(srv.RegisterHost).answer(srv.RegisterHost.Response(answer=answer))
+        slave.find(ours)
+        ours.take_in(code="name_taken", message="a live one")
     (said,) = slave.host.said
     assert said.startswith("a live one. Asking again for 5 s")
     assert slave.endpoint.failure == ""
@@ -420,16 +420,11 @@ def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -
 def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
     """A master with a journal stall accepts no host for now: the slave retries and logs it once."""
     ours = Master(slave, 11)
-    slave.pass_time(PERIOD)
-    ours.beat()
-    ours.greet()
-    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, code="journal", message="a full disk")
     for _ in range(3):
-        slave.newest(srv.RegisterHost).answer(srv.RegisterHost.Response(answer=answer))
+        slave.find(ours)
+        ours.take_in(code="journal", message="a full disk")
         assert slave.link is Link.SEARCHING
-        slave.pass_time(PERIOD)
-        ours.beat()
-        ours.greet()
+    slave.find(ours)
     assert slave.endpoint.failure == ""
     assert [word for word in slave.host.said if "a full disk" in word] == slave.host.said[:1]
     ours.take_in()
@@ -439,9 +434,7 @@ def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
 def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) -> None:
     """The slave repeats its request, instead of waiting forever during a registration."""
     master = Master(slave, 11)
-    slave.pass_time(PERIOD)
-    master.beat()
-    master.greet()
+    slave.find(master)
 
     def fails(*_arguments) -> None:
         raise KeyError("oops")
