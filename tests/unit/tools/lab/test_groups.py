@@ -65,25 +65,20 @@ def test_a_missing_controller_is_named(tmp_path, mounts, missing):
         find_hierarchies(tree(tmp_path, *mounts))
 
 
-def test_limits_of_version_1():
+@pytest.mark.parametrize(
+    ("version", "controllers", "expected"),
+    [
+        (1, ("memory",), {"memory.limit_in_bytes": str(GIB),
+                          "memory.memsw.limit_in_bytes": str(GIB)}),
+        (1, ("cpu", "cpuacct"), {"cpu.cfs_period_us": "20000", "cpu.cfs_quota_us": "10000"}),
+        (2, ("memory", "cpu"), {"memory.max": str(GIB), "memory.swap.max": "0",
+                                "cpu.max": "10000 20000"}),
+    ],
+)  # fmt: skip
+def test_limits_of_both_versions(version, controllers, expected):
     """Swap counts as memory; half a core is 10 ms of each 20."""
-    assert list(limits(Hierarchy(1, Path("/m"), ("memory",)), HOST)) == [
-        ("memory.limit_in_bytes", str(GIB)),
-        ("memory.memsw.limit_in_bytes", str(GIB)),
-    ]
-    assert list(limits(Hierarchy(1, Path("/c"), ("cpu", "cpuacct")), HOST)) == [
-        ("cpu.cfs_period_us", "20000"),
-        ("cpu.cfs_quota_us", "10000"),
-    ]
-
-
-def test_limits_of_version_2():
-    """The limits are those of version 1 in other files."""
-    assert list(limits(Hierarchy(2, Path("/m"), ("memory", "cpu")), HOST)) == [
-        ("memory.max", str(GIB)),
-        ("memory.swap.max", "0"),
-        ("cpu.max", "10000 20000"),
-    ]
+    found = limits(Hierarchy(version, Path("/m"), controllers), HOST)
+    assert list(found) == list(expected.items())
 
 
 @pytest.mark.parametrize("cpu", [0.01, 0.02, 0.049, 0.05, 0.3, 7.5])
@@ -174,17 +169,10 @@ def test_memory_in_use_is_without_cache(tmp_path):
         (2, {"max": "1000", "current": "1300", "stat": ""}, 0),
         (2, {"max": "max", "current": "300", "stat": ""}, None),
         (2, {}, None),
-        (
-            1,
-            {
-                "limit_in_bytes": "1000",
-                "usage_in_bytes": "300",
-                "stat": "inactive_file 1\ntotal_inactive_file 50",
-            },
-            750,
-        ),
+        (1, {"limit_in_bytes": "1000", "usage_in_bytes": "300",
+             "stat": "inactive_file 1\ntotal_inactive_file 50"}, 750),
     ],
-)
+)  # fmt: skip
 def test_what_a_container_may_still_use(tmp_path, version, files, left):
     """The result is the limit less the usage; the machine's own group of version 2 has no limit."""
     for name, content in files.items():

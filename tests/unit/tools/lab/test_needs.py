@@ -72,29 +72,22 @@ def test_a_missing_command_is_named_with_its_package(monkeypatch, command):
         needs.find_command(command)
 
 
-def test_too_little_memory_is_refused(monkeypatch):
-    """The error has the available and the requested memory."""
-    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=GIB))
+@pytest.mark.parametrize(
+    ("machine", "limit", "said"),
+    [
+        (GIB, None, "1024 MiB are available"),
+        (64 * GIB, 2 * GIB, "1024 MiB are available within the limit of this c"),
+        (GIB // 2, 2 * GIB, "512 MiB are available on this machine"),
+    ],
+)
+def test_too_little_memory_is_refused(monkeypatch, tmp_path, machine, limit, said):
+    """A container has no more memory than its limit leaves, or than the machine."""
+    container = [Hierarchy(2, tmp_path, ("memory", "cpu"))] if limit else []
+    for name, text in (("max", limit), ("current", GIB), ("stat", "inactive_file 0")):
+        (tmp_path / f"memory.{name}").write_text(f"{text}\n")
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=machine))
     hosts = uniform(3, memory=512 * MIB, disk=16 * MIB)
-    with pytest.raises(LabError, match="1536 MiB of memory together, and 1024 MiB are available"):
-        needs.check_machine(hosts, Path("/"))
-
-
-def test_a_container_has_no_more_memory_than_its_own_limit(monkeypatch, tmp_path):
-    """A smaller amount on the machine takes precedence."""
-    (tmp_path / "memory.max").write_text(f"{2 * GIB}\n")
-    (tmp_path / "memory.current").write_text(f"{GIB}\n")
-    (tmp_path / "memory.stat").write_text("inactive_file 0\n")
-    container = [Hierarchy(2, tmp_path, ("memory", "cpu"))]
-    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=64 * GIB))
-    hosts = uniform(3, memory=512 * MIB, disk=16 * MIB)
-    with pytest.raises(
-        LabError,
-        match="1536 MiB of memory together, and 1024 MiB are available within the limit of this c",
-    ):
-        needs.check_machine(hosts, Path("/"), container)
-    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=GIB // 2))
-    with pytest.raises(LabError, match="512 MiB are available on this machine"):
+    with pytest.raises(LabError, match=f"1536 MiB of memory together, and {said}"):
         needs.check_machine(hosts, Path("/"), container)
 
 
@@ -111,9 +104,8 @@ def test_too_little_disk_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(needs, "find_command", lambda name: name)
     monkeypatch.setattr(needs, "_DEVICE", tmp_path)
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=GIB))
-    with pytest.raises(
-        LabError, match=f"2048 MiB together, and 1024 MiB are free under {tmp_path}"
-    ):
+    said = f"2048 MiB together, and 1024 MiB are free under {tmp_path}"
+    with pytest.raises(LabError, match=said):
         needs.check_machine(uniform(2), tmp_path / "not" / "there")
 
 
@@ -129,6 +121,5 @@ def test_more_cores_than_there_are_is_only_noted(monkeypatch):
     """Overbooked cores are slow, but allowed."""
     monkeypatch.setattr("psutil.cpu_count", lambda: 2)
     assert needs.overbooked(uniform(4, cpu=0.5)) == ""
-    assert "may use 2.5 cores together and this machine has 2" in needs.overbooked(
-        uniform(5, cpu=0.5)
-    )
+    said = "may use 2.5 cores together and this machine has 2"
+    assert said in needs.overbooked(uniform(5, cpu=0.5))

@@ -14,42 +14,32 @@ def rules(**links):
     return [line.strip() for line in ruleset(links).splitlines() if "port" in line]
 
 
-def test_what_a_host_hears_leaves_the_switch_through_its_port():
-    """`in` is the host's view; the rule applies at the switch."""
-    assert rules(port1=Link().changed("in", cut=True)) == ['oifname "port1" drop']
+CHANCE = "numgen random mod 1000000 <"
 
 
-def test_what_is_heard_of_a_host_enters_the_switch_through_its_port():
-    """The other direction has no rule."""
-    assert rules(port1=Link().changed("out", cut=True)) == ['iifname "port1" drop']
+@pytest.mark.parametrize(
+    ("link", "expected"),
+    [
+        (Link(), []),
+        (Link().changed("in", cut=True), ['oifname "port1" drop']),
+        (Link().changed("out", cut=True), ['iifname "port1" drop']),
+        (Link().changed("both", loss=0.01),
+         [f'oifname "port1" {CHANCE} 10000 drop', f'iifname "port1" {CHANCE} 10000 drop']),
+        # nft knows no number as large as its own modulus
+        (Link().changed("in", loss=1.0), ['oifname "port1" drop']),
+        # a cut covers all that a loss would drop
+        (Link().changed("both", loss=0.5).changed("out", cut=True),
+         [f'oifname "port1" {CHANCE} 500000 drop', 'iifname "port1" drop']),
+    ],
+    ids=["whole", "in", "out", "loss", "loss of everything", "loss and cut"],
+)  # fmt: skip
+def test_each_faulty_direction_has_one_rule_at_the_switch(link, expected):
+    """What a host receives leaves the switch through its port; a whole port has no rule."""
+    assert rules(port1=link, port2=Link()) == expected
 
 
-def test_a_whole_port_is_sound():
-    """Without faults there are no rules, and all frames pass."""
-    assert rules(port1=Link(), port2=Link()) == []
+def test_all_other_frames_pass():
     assert "policy accept" in ruleset({})
-
-
-def test_loss_is_by_chance_in_each_direction():
-    """1 % is 10,000 in a million."""
-    assert rules(port2=Link().changed("both", loss=0.01)) == [
-        'oifname "port2" numgen random mod 1000000 < 10000 drop',
-        'iifname "port2" numgen random mod 1000000 < 10000 drop',
-    ]
-
-
-def test_a_loss_of_everything_is_a_cut():
-    """Nft knows no number as large as its own modulus."""
-    assert rules(port1=Link().changed("in", loss=1.0)) == ['oifname "port1" drop']
-
-
-def test_a_cut_says_all_that_loss_would():
-    """Each direction has one rule."""
-    link = Link().changed("both", loss=0.5).changed("out", cut=True)
-    assert rules(port1=link) == [
-        'oifname "port1" numgen random mod 1000000 < 500000 drop',
-        'iifname "port1" drop',
-    ]
 
 
 def test_addresses_can_be_asked_for_during_a_cut():
