@@ -9,7 +9,10 @@ from rclpy.validate_node_name import validate_node_name
 
 from rosrm.ros.names import Names, token
 
-AWKWARD = "robot-1 robot_1 robot.1 robot--1 3d h3d - _ a__b a_ ö Ω-1".split()
+AWKWARD = {
+    "robot-1", "robot_1", "robot.1", "robot--1", "3d", "h3d", "-", "_", "a__b", "a_", "ö", "Ω-1",
+    "x" * 100,
+}  # fmt: skip
 
 
 def test_a_plain_name_stays() -> None:
@@ -17,7 +20,7 @@ def test_a_plain_name_stays() -> None:
     assert Names("/rosrm").of_host("robot_1", "control") == "/rosrm/host/robot_1/control"
 
 
-@given(st.sets(st.text(min_size=1, max_size=8)).map(lambda some: {*AWKWARD, "x" * 100, *some}))
+@given(st.sets(st.text(min_size=1, max_size=8)).map(lambda some: {*AWKWARD, *some}))
 def test_different_hosts_have_different_valid_names(hosts) -> None:
     """All servers of a name execute a request, so robot-1 must not receive requests for robot_1.
 
