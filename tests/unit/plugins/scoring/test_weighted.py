@@ -1,11 +1,10 @@
 """The policy `weighted`: Eq. 1 of the paper."""
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosrm.testing import host_view, one_row, process_view
+from rosrm.testing import host_view, process_view
 from rosrm_scoring.threshold import Threshold, ThresholdOptions
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 
@@ -50,19 +49,15 @@ def test_named_weights_replace_all_defaults():
 
 
 @pytest.mark.parametrize("policy", [Weighted, Threshold])
-@pytest.mark.parametrize(("missing", "value"), [("worst", 1.5), ("ignore", 0.5)])
+@pytest.mark.parametrize(
+    ("missing", "value"), [({}, 1.5), ({"missing": "worst"}, 1.5), ({"missing": "ignore"}, 0.5)]
+)
 def test_a_host_that_does_not_measure_counts_as_full_unless_that_is_ignored(policy, missing, value):
-    """A host without a probe is not preferred to those that have it."""
+    """A host without a probe is not preferred to those that have it, by default."""
     options = WeightedOptions if policy is Weighted else ThresholdOptions
     view = host_view({"memory": [0.5, 0.5], "gpu": [float("nan"), 0.2]})
-    made = policy(options({"memory": 1.0, "gpu": 1.0}, missing=missing))
+    made = policy(options({"memory": 1.0, "gpu": 1.0}, **missing))
     assert made.score(view, process_view(view)).value == pytest.approx([value, 0.7])
-
-
-def test_what_is_not_measured_counts_as_full_by_default():
-    """The default of `missing` is `worst`."""
-    view = host_view({"memory": [0.5, 0.5], "fds": [float("nan"), 0.9]})
-    assert score(view, memory=1.0, fds=0.3).value.argmin() == 1
 
 
 def test_reason_is_the_sum_written_out():
@@ -71,18 +66,6 @@ def test_reason_is_the_sum_written_out():
     assert score(view).reason(0) == "1 x memory 50.0% + 0.5 x cpu 10.0%"
     assert score(view).reason(1) == "1 x memory 25.0% + 0.5 x cpu 100.0% (not measured there)"
     assert "no resource" in score(view, network=1.0).reason(0)
-
-
-@settings(deadline=None)
-@given(hosts(), weights)
-def test_rows_are_independent(view, given_weights):
-    """A host's score is the same alone and among others, to the last bit."""
-    policy = Weighted(WeightedOptions(given_weights))
-    process = process_view(view)
-    together = policy.score(view, process).value
-    assert np.isfinite(together).all()
-    for row in range(len(view.names)):
-        assert policy.score(*one_row(view, process, row)).value[0] == together[row]
 
 
 @settings(deadline=None)
