@@ -65,19 +65,32 @@ def test_a_full_record_ends_there_and_says_so(start, caplog):
     assert "ends here" in caplog.text
 
 
-class Hung:
-    """File whose writes wait for a release."""
+class Opened:
+    """Open file, for a test that replaces its writes."""
 
     def __init__(self, inner):
         self.inner = inner
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.inner.close()
+
+
+class Hung(Opened):
+    """File whose writes wait for a release."""
+
+    def __init__(self, inner):
+        super().__init__(inner)
         self.go = threading.Event()
 
     def write(self, content):
         assert self.go.wait(20.0), "nobody let the write go"
         return self.inner.write(content)
-
-    def __getattr__(self, name):
-        return getattr(self.inner, name)
 
 
 def batch(hosts: int) -> happened.ReadingsReceived:
@@ -148,26 +161,13 @@ def test_what_cannot_be_encoded_ends_the_record_with_its_reason(start, monkeypat
 
 
 def test_a_write_that_fails_ends_the_record_and_is_said_once(start, caplog):
-    made = start()
-
-    class Full:
+    class Full(Opened):
         """File on a full disk."""
-
-        def __init__(self, inner):
-            self.inner = inner
 
         def write(self, _content):
             raise OSError(28, "No space left on device")
 
-        def flush(self):
-            self.inner.flush()
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            self.inner.close()
-
+    made = start()
     made._file = Full(made._file)
     note(made, 100)
     made.close("the master stopped: SIGINT")

@@ -77,27 +77,19 @@ def test_usage_is_a_mean_between_walks(tree, table):
     assert table.usage() == {10: SessionUsage(pytest.approx(1.5), 170 * PAGE)}
 
 
-def test_child_that_was_waited_for_stays_counted(tree, table):
-    """The time of an ended child is its parent's: usage does not fall below zero, nor jump."""
+@pytest.mark.parametrize(
+    ("parent", "cpu"), [({"own": 1.5, "children": 100.0}, 0.5), ({"own": 1.0}, 0.0)]
+)
+def test_a_child_that_ends_makes_no_negative_usage_and_no_jump(tree, table, parent, cpu):
+    """The time of an ended child is its parent's; the time of an orphan is lost."""
     tree.put(10, 10, own=1.0)
     tree.put(11, 10, own=100.0)
     table.add(10)
     table.refresh(0.0)
     tree.end(11)
-    tree.put(10, 10, own=1.5, children=100.0)
+    tree.put(10, 10, **parent)
     table.refresh(1.0)
-    assert table.usage()[10].cpu == pytest.approx(0.5)
-
-
-def test_lost_time_is_no_negative_usage(tree, table):
-    """The time of an orphan is lost at its end."""
-    tree.put(10, 10, own=1.0)
-    tree.put(11, 10, own=100.0)
-    table.add(10)
-    table.refresh(0.0)
-    tree.end(11)
-    table.refresh(1.0)
-    assert table.usage()[10].cpu == 0.0
+    assert table.usage()[10].cpu == pytest.approx(cpu)
 
 
 def test_removed_session_is_gone_and_its_time_kept(tree, table):
@@ -122,20 +114,12 @@ def test_ended_time_never_falls(table):
 
 
 def test_process_that_ends_during_the_walk_is_no_error(tree, table):
-    """The process was listed a moment earlier."""
-    tree.put(10, 10, pages=10)
+    """The process was listed a moment earlier. A program may have any name."""
+    tree.put(10, 10, pages=10, name="a) S 1 (b c")  # like the end of the name field
     tree.put(11, 10, pages=10)
     table.add(10)
     (tree.path / "11" / "stat").unlink()
     (tree.path / "12").mkdir()  # ended before its session was read
-    table.refresh(0.0)
-    assert table.usage()[10].memory == 10 * PAGE
-
-
-def test_strange_names(tree, table):
-    """A program may have any name, also one like the end of the name field."""
-    tree.put(10, 10, pages=10, name="a) S 1 (b c")
-    table.add(10)
     table.refresh(0.0)
     assert table.usage()[10].memory == 10 * PAGE
 

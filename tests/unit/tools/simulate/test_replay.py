@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 from hypothesis import given, settings
@@ -32,7 +31,13 @@ from .workloads import (
     simulation,
 )
 
-replay = partial(replay_declared, declared=declared_by(STRATEGIES))
+
+def replay(record, *, policy=EQ1, settings=None, watch=None, **options):
+    """Replay a record with the strategies and settings of its run."""
+    declared = declared_by(STRATEGIES)
+    core = settings or CoreSettings()
+    return replay_declared(record, core, policy, STRATEGIES, watch, declared=declared, **options)
+
 
 BY_CPU = ("weighted", Weighted(WeightedOptions({"cpu": 1.0})))
 
@@ -56,11 +61,14 @@ def record() -> Recording:
     return read(recorded(busy()))
 
 
-def test_its_own_settings_decide_the_same(record):
-    again = replay(record, CoreSettings(), EQ1, STRATEGIES)
+def test_its_own_settings_decide_the_same_and_give_the_same_outcome(record):
+    run, again = busy().run(), replay(record)
     assert again.decisions > 20
-    assert again.different == 0
-    assert again.differences == ()
+    assert (again.different, again.differences) == (0, ())
+    assert again.outcome.placements == run.placements
+    assert again.outcome.ends == run.ends
+    assert again.outcome.migrations == run.migrations > 0
+    assert again.outcome.over_limit == pytest.approx(run.over_limit)
 
 
 @settings(max_examples=15)
@@ -78,7 +86,7 @@ def test_any_run_is_replayed_to_the_same_decisions(loads, growth, backfill):
         for n, (at, memory, cpu, d) in enumerate(loads)
     ]
     made = simulation([host("a", 500), host("b", 500)], plans, until=40.0, backfill=backfill)
-    again = replay(read(recorded(made)), CoreSettings(backfill=backfill), EQ1, STRATEGIES)
+    again = replay(read(recorded(made)), settings=CoreSettings(backfill=backfill))
     assert again.different == 0
 
 
@@ -93,12 +101,12 @@ def test_where_the_journal_had_lost_its_end_the_replay_gives_no_work_either(reco
     for newest, held_up in ((9, False), (3, True)):
         intents = {"cluster": {"tail": {"newest": newest, "fell": False}}}
         header = replace(record.header, intents=intents)
-        again = replay(replace(record, header=header, events=told), CoreSettings(), EQ1, STRATEGIES)
+        again = replay(replace(record, header=header, events=told))
         assert (again.different > 0) is held_up
 
 
 def test_other_weights_decide_otherwise_and_the_first_difference_is_told(record):
-    again = replay(record, CoreSettings(), BY_CPU, STRATEGIES)
+    again = replay(record, policy=BY_CPU)
     assert again.different > 0
     assert "recorded assign" in str(again.differences[0])
     assert 0.0 < again.differences[0].elapsed < 60.0
@@ -111,24 +119,15 @@ def test_a_core_that_decides_by_chance_would_be_found(record):
     one = events[at]
     events[at] = Happened(one.now, one.wall, one.event, ("assign p0#99 to host 2",))
     tampered = Recording(record.name, record.header, tuple(events), record.end)
-    again = replay(tampered, CoreSettings(), EQ1, STRATEGIES)
+    again = replay(tampered)
     assert again.different == 1
     assert again.differences[0].recorded == ("assign p0#99 to host 2",)
-
-
-def test_the_outcome_of_a_replay_is_that_of_the_run(record):
-    run, again = busy().run(), replay(record, CoreSettings(), EQ1, STRATEGIES).outcome
-    assert again.placements == run.placements
-    assert again.ends == run.ends
-    assert again.migrations == run.migrations > 0
-    assert again.over_limit == pytest.approx(run.over_limit)
 
 
 def test_measured_up_to_a_time_a_replay_is_the_run_up_to_there(record):
     """Later events do not change its numbers; the decisions are compared to the end."""
     run = busy(until=6.5).run()
-    again = replay(record, CoreSettings(), EQ1, STRATEGIES, until=6.5)
-    whole = replay(record, CoreSettings(), EQ1, STRATEGIES)
+    again, whole = replay(record, until=6.5), replay(record)
     cut = again.outcome
     assert (cut.placements, cut.arrivals, cut.ends) == (run.placements, run.arrivals, run.ends)
     assert (cut.running, cut.waiting, cut.makespan) == (run.running, run.waiting, run.makespan)
@@ -154,7 +153,7 @@ def test_what_runs_when_the_record_begins_is_where_it_is():
     made.meter.take = note
     before = made.run()
     header = Header("1", "test", {}, 2, 5.0, tables)
-    after = replay(Recording("r", header, (), "stopped"), CoreSettings(), EQ1, STRATEGIES).outcome
+    after = replay(Recording("r", header, (), "stopped")).outcome
     assert after.placements == before.placements != {}
     assert list(after.never_placed) == ["large"]
     assert after.arrivals == {"p0": 0.0, "p1": 0.0, "large": 0.0}
@@ -165,14 +164,14 @@ def test_a_process_of_a_record_that_ended_without_a_host_is_named_with_its_reaso
     plans = [plan("p0", 100.0), plan("large", 900.0)]
     requests = [(3.0, happened.CancelRequested(0, ("large",)))]
     made = simulation([host("a")], plans, until=5.0, requests=requests)
-    outcome = replay(read(recorded(made)), CoreSettings(), EQ1, STRATEGIES).outcome
+    outcome = replay(read(recorded(made))).outcome
     assert outcome.never_placed == {"large": "it was cancelled"}
 
 
 def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
     """The workload is simulated, recorded, extracted and simulated again."""
     extraction = Extraction(record)
-    first = replay(record, CoreSettings(), EQ1, STRATEGIES, extraction.watch).outcome
+    first = replay(record, watch=extraction.watch).outcome
     workload = extraction.workload()
     second = Simulation(workload, CoreSettings(), EQ1, STRATEGIES, declared_by(STRATEGIES)).run()
 
@@ -195,7 +194,7 @@ def test_what_hands_over_keeps_its_age_in_the_workload_made_of_it():
     grows = plan("node", 50.0, growth=10.0, most=250.0, ros=True, strategy="handoff")
     made = simulation([host("a"), host("b")], [grows], requests=[move], until=30.0)
     extraction = Extraction(record := read(recorded(made)))
-    assert replay(record, CoreSettings(), EQ1, STRATEGIES, extraction.watch).outcome.migrations
+    assert replay(record, watch=extraction.watch).outcome.migrations
     (found,) = extraction.workload().processes
     seen = [found.memory.at(age) / MIB for age in (2.0, 8.0, 14.0, 25.0)]
     assert seen == pytest.approx([70.0, 130.0, 190.0, 250.0], abs=12.0)

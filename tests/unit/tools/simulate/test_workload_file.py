@@ -185,12 +185,9 @@ def test_every_key_is_documented_and_nothing_else(heading, names):
 
 def test_variants_are_judged_beside_a_wrong_workload(load):
     """The message lists all errors at once: those of the file and of each variant."""
+    variants = ["scoring: {policy: wieghted}", "queue: {backfil: true}",
+                "scoring: {policy: treshold}"]  # fmt: skip
     with pytest.raises(ConfigError) as raised:
-        load(
-            BOTH + "seed: x",
-            "scoring: {policy: wieghted}",
-            "queue: {backfil: true}",
-            "scoring: {policy: treshold}",
-        )
+        load(BOTH + "seed: x", *variants)
     for said in ("seed: 'x'", "policy 'wieghted'", "key 'backfil'", "policy 'treshold'"):
         assert said in str(raised.value)
