@@ -57,32 +57,24 @@ def capacities(probe):
     return {resource.name: resource.capacity for resource in probe.resources}
 
 
-def test_one_gpu():
+@pytest.mark.parametrize(
+    ("options", "devices", "capacity", "usage"),
+    [
+        (GpuOptions(), [(40, 20, 80)], (1.0, 80.0), (0.4, 0.25)),
+        # A process that fits the fullest GPU fits whichever GPU it gets.
+        (GpuOptions(), [(10, 8, 16), (90, 8, 80)], (1.0, 16.0), (0.9, 0.5)),
+        # A process may use several GPUs: capacity and usage are those of all together.
+        (GpuOptions(combine="mean"), [(10, 8, 16), (90, 0, 16)], (2.0, 32.0), (0.5, 0.25)),
+        (GpuOptions(devices=(1,)), [(100, 1, 1), (20, 4, 8)], (1.0, 8.0), (0.2, 0.5)),
+    ],
+    ids=["one", "the fullest", "the mean", "the chosen one"],
+)
+def test_capacity_and_usage(options, devices, capacity, usage):
     """Utilisation is a fraction, and memory is relative to its size."""
-    probe = GpuProbe(GpuOptions(), FakeNvml((40, 20 * GIB, 80 * GIB)))
-    assert capacities(probe) == {"gpu": 1.0, "gpu_memory": 80.0 * GIB}
-    assert readings(probe) == pytest.approx({"gpu": 0.4, "gpu_memory": 0.25})
-
-
-def test_of_several_the_fullest_counts():
-    """A process that fits the fullest GPU fits whichever GPU it gets."""
-    probe = GpuProbe(GpuOptions(), FakeNvml((10, 8 * GIB, 16 * GIB), (90, 8 * GIB, 80 * GIB)))
-    assert capacities(probe) == {"gpu": 1.0, "gpu_memory": 16.0 * GIB}
-    assert readings(probe) == pytest.approx({"gpu": 0.9, "gpu_memory": 0.5})
-
-
-def test_of_several_the_mean():
-    """For processes that use several GPUs, capacity and usage are those of all together."""
-    nvml = FakeNvml((10, 8 * GIB, 16 * GIB), (90, 0, 16 * GIB))
-    probe = GpuProbe(GpuOptions(combine="mean"), nvml)
-    assert capacities(probe) == {"gpu": 2.0, "gpu_memory": 32.0 * GIB}
-    assert readings(probe) == pytest.approx({"gpu": 0.5, "gpu_memory": 0.25})
-
-
-def test_chosen_devices_only():
-    """Devices that were not chosen are not measured."""
-    probe = GpuProbe(GpuOptions(devices=(1,)), FakeNvml((100, 1, 1), (20, 4, 8)))
-    assert readings(probe) == pytest.approx({"gpu": 0.2, "gpu_memory": 0.5})
+    nvml = FakeNvml(*((busy, used * GIB, total * GIB) for busy, used, total in devices))
+    probe = GpuProbe(options, nvml)
+    assert capacities(probe) == {"gpu": capacity[0], "gpu_memory": capacity[1] * GIB}
+    assert readings(probe) == pytest.approx({"gpu": usage[0], "gpu_memory": usage[1]})
 
 
 def test_unknown_device_is_refused():
@@ -135,16 +127,12 @@ def test_driver_that_does_not_run_is_absent(driver):
         gpu.create(GpuOptions(), probe_context())
 
 
-def test_driver_without_a_gpu_is_absent_and_let_go(driver):
-    """The driver is closed again."""
+def test_the_driver_is_closed_once(driver):
+    """It is closed with the probe, and where it sees no GPU."""
     nvml = driver(FakeNvml())
     with pytest.raises(SkipPlugin, match="sees no GPU"):
         gpu.create(GpuOptions(), probe_context())
     assert nvml.shut_down == 1
-
-
-def test_close_lets_go_of_the_driver(driver):
-    """The driver is closed once."""
     nvml = driver(FakeNvml((0, 0, 1)))
     gpu.create(GpuOptions(), probe_context()).close()
     assert nvml.shut_down == 1

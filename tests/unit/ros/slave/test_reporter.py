@@ -79,8 +79,8 @@ def test_what_decides_goes_out_in_its_own_cycle(facts) -> None:
     assert slave.cycle(facts) == 0
 
 
-def test_a_limit_that_is_reached_or_left_goes_out_at_once() -> None:
-    """The size of the step across the limit makes no difference."""
+def test_a_limit_that_is_reached_left_or_changed_goes_out_at_once() -> None:
+    """Placement compares with it; the size of the step across the limit makes no difference."""
     slave = Slave()
     slave.usage[0] = 0.799
     slave.cycle()
@@ -89,12 +89,6 @@ def test_a_limit_that_is_reached_or_left_goes_out_at_once() -> None:
         slave.usage[0] = value
         assert slave.cycle() == 1
         assert decode(slave.sent[-1:]).readings.usage[0, 0] == np.float32(value)
-
-
-def test_another_limit_goes_out_at_once() -> None:
-    """Placement compares with the limit."""
-    slave = Slave()
-    slave.cycle()
     slave.limit[1] = 0.9
     assert slave.cycle() == 1
 
