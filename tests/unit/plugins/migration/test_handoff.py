@@ -107,7 +107,7 @@ def test_nonsense_is_refused_when_the_process_is_submitted(given: Any, said: str
 
 
 def test_a_process_that_handoff_cannot_move_is_refused() -> None:
-    """It has no node; or it may never run twice, as the paper's protocol needs."""
+    """A process needs a node, and for the paper's protocol it may overlap."""
     strategy, spec = Handoff(HandoffOptions()), move(**PAPER).spec
     assert "set `ros: true`" in strategy.spec_fault(replace(move().spec, ros=False))
     alone = replace(spec, migration=replace(spec.migration, overlap=False))

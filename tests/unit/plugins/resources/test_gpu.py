@@ -128,7 +128,7 @@ def test_driver_that_does_not_run_is_absent(driver):
 
 
 def test_the_driver_is_closed_once(driver):
-    """It is closed with the probe, and where it sees no GPU."""
+    """The probe closes the driver, also where no GPU is found."""
     nvml = driver(FakeNvml())
     with pytest.raises(SkipPlugin, match="sees no GPU"):
         gpu.create(GpuOptions(), probe_context())

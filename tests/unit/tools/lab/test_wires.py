@@ -34,7 +34,7 @@ CHANCE = "numgen random mod 1000000 <"
     ids=["whole", "in", "out", "loss", "loss of everything", "loss and cut"],
 )  # fmt: skip
 def test_each_faulty_direction_has_one_rule_at_the_switch(link, expected):
-    """What a host receives leaves the switch through its port; a whole port has no rule."""
+    """Frames to a host leave the switch through its port; a whole port has no rule."""
     assert rules(port1=link, port2=Link()) == expected
 
 
