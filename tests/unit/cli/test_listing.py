@@ -73,11 +73,6 @@ def test_a_master_that_takes_no_work_is_told_beside_the_listing(rosrm, client, c
         assert result.out == whole.out
 
 
-def test_status_of_an_empty_cluster(rosrm, client):
-    client.hosts, client.processes, client.events = [], [], []
-    assert rosrm("status").out.splitlines()[1:3] == ["hosts      none", "processes  none"]
-
-
 def test_ps_lists_what_is_not_over_and_says_what_it_leaves_out(rosrm, client):
     out = rosrm("ps").out
     assert "done" not in out
@@ -99,13 +94,20 @@ def test_a_listing_shows_values_and_reasons(rosrm, client, command, shown):
     assert [text for text in shown if text not in out] == []
 
 
-def test_ps_of_one_host_and_of_nothing(rosrm, client):
+def test_ps_of_one_host(rosrm, client):
     out = rosrm("ps", "--host", "alpha").out
     assert "talker" in out
     assert "next" not in out
-    client.processes, client.hosts = [], []
+
+
+def test_an_empty_cluster_and_a_drained_host(rosrm, client):
+    client.hosts, client.processes, client.events = [], [], []
     assert rosrm("ps").out == "no process\n"
     assert rosrm("hosts").out == "no host; start `rosrm slave` on each\n"
+    assert rosrm("status").out.splitlines()[1:3] == ["hosts      none", "processes  none"]
+    client.hosts = [host("a", draining=True, drained=True)]
+    assert "up, drained" in rosrm("hosts").out
+    assert "(1 drained)" in rosrm("status").out
 
 
 def test_ps_json_has_every_process_with_every_field(rosrm, client):
@@ -129,12 +131,6 @@ def test_a_stale_or_missing_reading_is_marked(rosrm, client):
         assert [text for text in shown if text not in out] == []
     (row,) = json.loads(rosrm("ps", "--json").out)
     assert row["stale"] is True
-
-
-def test_a_drained_host_is_shown_as_one(rosrm, client):
-    client.hosts = [host("a", draining=True, drained=True)]
-    assert "up, drained" in rosrm("hosts").out
-    assert "(1 drained)" in rosrm("status").out
 
 
 @pytest.mark.parametrize("command", ["status", "ps", "hosts", "plugins", "explain"])

@@ -118,14 +118,6 @@ def test_a_log_is_copied_byte_by_byte_in_parts(rosrm, client, slaves, monkeypatc
     assert (result.code, result.out) == (0, "one\ntwo ä\nend")
 
 
-def test_rotated_files_are_part_of_it(rosrm, client, slaves):
-    for word in (b"one\n", b"two\n"):
-        slaves.write("alpha", 1, word)
-        slaves.rotate("alpha", 1)
-    slaves.write("alpha", 1, b"three\n")
-    assert rosrm("logs", "talker").out == "one\ntwo\nthree\n"
-
-
 def test_what_was_dropped_is_said_with_its_size(rosrm, client, slaves):
     """Gaps are at the beginning, in place of removed files, and between two files."""
     slaves.write("alpha", 1, b"x" * 2000 + b"\n")
