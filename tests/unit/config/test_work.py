@@ -156,6 +156,7 @@ def test_braces_are_plain_without_foreach(file):
         ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is required, not a list"),
         ("[{i: 1}, {j: 1}]", "n{i}", "f.yaml:1:46: foreach: gives j, and the first of the list i"),
         ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is required"),
+        ("[1]", "n", "f.yaml:1:35: foreach: each of a list is a mapping from names to values"),
     ],
 )
 def test_a_wrong_foreach_is_refused_with_its_place(refusal, foreach, name, said):

@@ -307,6 +307,10 @@ def test_an_unknown_probe_stops_the_slave_at_its_start(context):
         registry_of(offered("cpu")).probes({"cqu": {}}, context)
 
 
+NOTHING = ResourceDescription("b", "1", 0.0)
+UNCLOSABLE = SimpleNamespace(resources=[NOTHING], read=None, close=None)  # None() raises
+
+
 @pytest.mark.parametrize(
     ("second", "said"),
     [
@@ -316,6 +320,7 @@ def test_an_unknown_probe_stops_the_slave_at_its_start(context):
         (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
         (Probe(), "describes no resource; raise SkipPlugin in `create`"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
+        (UNCLOSABLE, "gives 'b' a capacity of 0.0; a number above 0"),
     ],
 )
 def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_fails(context, second, said):
