@@ -60,10 +60,9 @@ def test_memos_of_the_slave(memo: Memo, text: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "", "[]", '{"awaited": null}', '{"awaited": ["a", 1.0], "watch": 1}',
+        "", "[]", '{"awaited": ["a", 1.0], "watch": 1}',
         '{"awaited": ["/n", "long", 0], "watch": null}', '{"awaited": [1.0], "watch": null}',
         '{"awaited": ["/n", 1.0, 0, 0], "watch": null}',
-        '{"awaited": null, "watch": [["", 0.0, ""], [], [], true, false]}',
     ],
 )  # fmt: skip
 def test_a_memo_of_another_version_is_none(text: str) -> None:

@@ -17,7 +17,7 @@ from rosrm.model.codec import from_plain, to_plain
 def test_settings_and_registry_import_without_pydantic_yaml_or_typer():
     """The memory budget of a slave excludes modules that only files and terminals need."""
     code = (
-        "import sys, rosrm.config.settings, rosrm.extensions.registry, rosrm.model.spec_json;"
+        "import sys, rosrm.config.settings, rosrm.extensions.registry;"
         "print(*sorted({'pydantic', 'yaml', 'typer', 'rich', 'rclpy'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
