@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -49,12 +50,15 @@ class Outer:
     many: tuple[Inner, ...] = ()
     names: list[str] = field(default_factory=list)
     table: dict[str, Inner] = field(default_factory=dict)
+    word: Literal["a", "b"] = "a"
+    pair: tuple[int, str] = (1, "")
 
 
 def test_plain_values_come_back_as_they_were():
     value = Outer("a", 1.5, Path("/x"), 3, Inner(2), (Inner(3),), ["b"], {"c": Inner(4)})
     assert from_plain(Outer, to_plain(value)) == value
     assert from_plain(Outer, {"ratio": 2}).ratio == 2.0
+    assert from_plain(Outer, {"inner": [5]}).inner == Inner(5), "as `astuple` has it"
 
 
 @pytest.mark.parametrize(
@@ -68,6 +72,11 @@ def test_plain_values_come_back_as_they_were():
         ({"names": "abc"}, "names: a list is required, not 'abc'"),
         ({"table": {"a": 5}}, "table.a: a mapping is required, not 5"),
         ({"maybe": "x"}, "maybe: int is required, not 'x'"),
+        ({"many": [{}, {"number": "x"}]}, "many[1].number: int is required, not 'x'"),
+        ({"inner": {"nummer": 1}}, "inner: unknown nummer; allowed: number"),
+        ({"inner": [1, 2]}, "inner: a mapping is required, not [1, 2]"),
+        ({"word": "c"}, "word: one of a, b is required, not 'c'"),
+        ({"pair": [1]}, "pair: a list of 2 is required, not [1]"),
     ],
 )
 def test_plain_values_of_another_shape_are_refused_by_name(plain, said):
