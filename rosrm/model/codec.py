@@ -27,8 +27,9 @@ _Convert = Callable[[Any], Any]
 _SCALARS: Final = (str, int, float, bool, type(None))
 #: Types whose values are JSON already.
 _PLAIN: Final = frozenset(_SCALARS)
-#: Annotations of fields that are JSON already.
+#: Annotations of fields that are JSON already; `json` refuses a value of another type.
 _PLAIN_HINTS: Final = ("str", "int", "float", "bool", str, int, float, bool)
+_JSON_OBJECT: Final = ("Mapping[str, Any]", Mapping[str, Any])
 
 
 def _compiled_once(function: Callable[[Any], T]) -> Callable[[Any], T]:
@@ -81,13 +82,16 @@ def _unchanged(value: Any) -> Any:
 def _object_writer(kind: Any) -> _Convert:
     names = [field.name for field in fields(kind)]
     others = [field.name for field in fields(kind) if field.type not in _PLAIN_HINTS]
+    objects = {field.name for field in fields(kind) if field.type in _JSON_OBJECT}
     first = {"kind": kind.KIND} if hasattr(kind, "KIND") else {}
 
     def write(value: Any) -> dict[str, Any]:
         plain = {name: getattr(value, name) for name in names}
         for name in others:
             item = plain[name]
-            if item is not None:
+            if name in objects:
+                plain[name] = dict(item)
+            elif item is not None:
                 plain[name] = _writer(type(item))(item)
         return {**first, **plain} if first else plain
 
