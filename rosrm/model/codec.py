@@ -104,15 +104,16 @@ def _object_writer(kind: Any) -> _Convert:
 class _Unfit(ValueError):
     """A value does not fit its type."""
 
-    def __init__(self, text: str, path: str = "") -> None:
-        super().__init__(f"{path}: {text}" if path else text)
+    def __init__(self, text: str, joint: str = ": ", path: str = "") -> None:
+        super().__init__(f"{path}{joint}{text}" if path else text)
         self.text = text
+        self.joint = joint
         self.path = path
 
     def below(self, outer: str) -> _Unfit:
         """Return the same error with the path of the value around it."""
-        joint = "." if self.path and not self.path.startswith("[") else ""
-        return _Unfit(self.text, f"{outer}{joint}{self.path}")
+        dot = "." if self.path and not self.path.startswith("[") else ""
+        return _Unfit(self.text, self.joint, f"{outer}{dot}{self.path}")
 
 
 def from_plain(wanted: type[T], plain: Any) -> T:
@@ -279,7 +280,8 @@ def _choice_reader(choices: Mapping[Any, Any]) -> _Convert:
 
     def read(plain: Any) -> Any:
         if not isinstance(plain, (str, int)) or plain not in choices:
-            raise _unfit(f"one of {', '.join(map(str, choices))}", plain)
+            allowed = ", ".join(map(str, choices))
+            raise _Unfit(f"{plain!r}; allowed: {allowed}", " ")
         return choices[plain]
 
     return read

@@ -54,7 +54,7 @@ def test_a_plan_survives_the_journal() -> None:
     [
         (("strange",), 1, "unknown strange; allowed: steps, "),
         (("overlap",), "long", "overlap: float is required, not 'long'"),
-        (("steps", 0, "kind"), "teleport", "steps[0].kind: one of start, await_ready, "),
+        (("steps", 0, "kind"), "teleport", "steps[0].kind 'teleport'; allowed: start, "),
         (("steps", 0, "shadow"), "yes", "steps[0].shadow: bool is required, not 'yes'"),
         (("steps", 0, "colour"), 1, "steps[0]: unknown colour; allowed: instance, "),
         (
@@ -67,7 +67,7 @@ def test_a_plan_survives_the_journal() -> None:
             "1",
             "steps[0].instance.number: int is required",
         ),
-        (("steps", 2, "phase"), "JUMP", "steps[2].phase: one of SHADOW, SWITCH, "),
+        (("steps", 2, "phase"), "JUMP", "steps[2].phase 'JUMP'; allowed: SHADOW, "),
         (("steps", 3, "restart", "colour"), 1, "steps[3].restart: unknown colour"),
         (("steps", 4, "arguments"), [], "steps[4].arguments: a mapping is required, not []"),
     ],
