@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass
 from math import inf
 from typing import Any, Final
 
@@ -23,12 +23,13 @@ from rosrm.core.master.state.learned_needs import LearnedNeeds
 from rosrm.core.master.state.migration import Run, run_to_dict
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
-from rosrm.core.master.state.process import Instance, Process, ProcessPhase, Wanted
+from rosrm.core.master.state.process import JOURNALED, Instance, Process, ProcessPhase, Wanted
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.replicas import Keeping
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.model.codec import fields_to_plain, to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
@@ -194,15 +195,11 @@ class MasterState:
         return Intent(
             "process", process.name,
             {
-                "spec": process.plain, "order": process.order, "phase": phase.value, "since": began,
-                "wanted": process.wanted.value, "owner": process.owner,
+                "spec": process.plain, "phase": phase.value, "since": began,
                 "host": owner.host.name if owner else process.ended_on, "instances": held,
-                "reason": process.reason, "excluded": dict(process.excluded),
-                "migrations": process.migrations, "exit_code": process.exit_code,
-                "restarts": process.restarts, "node_names": aliases,
-                "standby": self._standby_of(process), "born": process.born,
-                "left_behind": left and [left.number, left.host, left.node_name],
-                "image": None if process.image is None else asdict(process.image),
+                "node_names": aliases, "standby": self._standby_of(process),
+                "left_behind": left and astuple(left), "image": to_plain(process.image),
+                **fields_to_plain(process, JOURNALED),
             },
         )  # fmt: skip
 

@@ -591,7 +591,7 @@ def test_a_move_in_the_journal_that_nobody_understands_is_over() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert not cluster.intents["migration"]
     assert (
-        "cannot be continued: no step of a plan: 'teleport'"
+        "cannot be continued: steps[0].kind 'teleport'; allowed: start, "
         in cluster.told("migration_forgotten")[0]
     )
 

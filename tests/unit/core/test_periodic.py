@@ -218,7 +218,7 @@ class Unsound(Criu):
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"timeout": "10s"}, "'10s' is no number"),
+        ({"timeout": "10s"}, "timeout: float is required, not '10s'"),
         ({"arguments": {"of": {1}}}, "set is not JSON serializable"),
     ],
 )

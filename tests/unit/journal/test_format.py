@@ -15,7 +15,7 @@ from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.images import Unwanted
 from rosrm.extensions.contracts import Intent
 from rosrm.journal.sqlite import SqliteJournal
-from rosrm.model.plan_json import step_to_dict
+from rosrm.model.codec import to_plain
 from rosrm.model.values import ProcessSpec
 from tests.unit.core.cluster import Eq1
 
@@ -166,7 +166,7 @@ def test_every_migration_is_taken_up_where_it_was(state: MasterState, name: str)
         "move_full": "await_ready", "move_starting": "await_ready",
         "move_stop_first": "await_ready", "move_stuck": "stop",
     }  # fmt: skip
-    assert step_to_dict(in_hand)["kind"] == steps[name]
+    assert to_plain(in_hand)["kind"] == steps[name]
 
 
 def test_hosts_numbers_and_everything_else_are_as_they_were(state: MasterState) -> None:

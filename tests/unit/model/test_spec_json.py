@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.model.spec_json import spec_from_dict, spec_to_dict
+from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.values import (
     Kind,
     MigrationPolicy,
@@ -54,15 +54,15 @@ specs = st.builds(
 
 @given(specs)
 def test_a_spec_comes_back_from_json_as_it_was(spec):
-    assert spec_from_dict(json.loads(json.dumps(spec_to_dict(spec)))) == spec
+    assert from_plain(ProcessSpec, json.loads(json.dumps(to_plain(spec)))) == spec
 
 
 def test_an_older_record_gets_the_defaults_of_what_it_lacks():
-    assert spec_from_dict({"name": "a"}) == ProcessSpec("a")
+    assert from_plain(ProcessSpec, {"name": "a"}) == ProcessSpec("a")
 
 
 def test_a_field_of_a_newer_version_is_refused_not_dropped():
-    with pytest.raises(ValueError, match="unknown field of ProcessSpec: colour"):
-        spec_from_dict({"name": "a", "colour": 1})
-    with pytest.raises(ValueError, match="unknown field of RestartPolicy: colour"):
-        spec_from_dict({"name": "a", "restart": {"colour": 1}})
+    with pytest.raises(ValueError, match=r"^unknown colour; allowed: name, "):
+        from_plain(ProcessSpec, {"name": "a", "colour": 1})
+    with pytest.raises(ValueError, match=r"^restart: unknown colour; allowed: when, "):
+        from_plain(ProcessSpec, {"name": "a", "restart": {"colour": 1}})

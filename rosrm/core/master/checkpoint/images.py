@@ -20,6 +20,7 @@ from rosrm.core.master.state.images import Unwanted
 from rosrm.core.master.state.pending_orders import ImageRemoval
 from rosrm.core.master.state.process import Image, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
+from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
 
@@ -31,6 +32,8 @@ _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 60.0
 #: Key of the unwanted images in the journal's table "cluster".
 _KEY: Final = "unwanted_images"
+#: Fields of an unwanted image that the journal has.
+_JOURNALED: Final = ("process", "host", "drop", "numbers")
 
 
 # --- of a process -----------------------------------------------------------------------------
@@ -131,10 +134,9 @@ def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, 
 
 def _save(state: MasterState) -> None:
     unwanted = {
-        str(number): {"process": one.process, "host": one.host, "drop": one.drop,
-                      "numbers": list(one.numbers)}
+        str(number): fields_to_plain(one, _JOURNALED)
         for number, one in state.images.unwanted.items()
-    }  # fmt: skip
+    }
     state.emit(Intent("cluster", _KEY, unwanted or None))
 
 
@@ -145,6 +147,5 @@ def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> Non
         cluster: the journal's table of that name.
     """
     for number, one in cluster.get(_KEY, {}).items():
-        state.images.unwanted[int(number)] = Unwanted(
-            one["process"], one["host"], one["drop"], tuple(map(int, one["numbers"]))
-        )
+        known = fields_from_plain(Unwanted, one, _JOURNALED)
+        state.images.unwanted[int(number)] = Unwanted(**known)

@@ -28,10 +28,10 @@ from rosrm.core.master.state.process import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import MemoryPacing, MemoryView, PeriodicImaging
 from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
 from rosrm.model.plan import Execute
-from rosrm.model.plan_json import checked_step
 from rosrm.wording import size
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def _order(
 
     def ask() -> Execute:
         step = required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute)
-        return required(checked_step(step), Execute)
+        return checked(step, "step")
 
     try:
         step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask)

@@ -14,9 +14,9 @@ from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError, describe_fault
 from rosrm.extensions.plugin_calls import required
+from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
-from rosrm.model.plan_json import checked_plan
 from rosrm.wording import listed, standing
 
 #: Method of a strategy that plans for each aim.
@@ -185,7 +185,7 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
         fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
         if fault:
             raise PluginError(f"an unsound plan: {fault}")
-        return checked_plan(plan)  # it goes into the journal
+        return checked(plan, "plan")  # it goes into the journal
 
     try:
         return state.plugins.ask("migration", name, _HOOKS[aim], ask)

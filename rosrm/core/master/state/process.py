@@ -12,8 +12,8 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Lazy
+from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.spec_json import spec_to_dict
 from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
 
 
@@ -159,7 +159,14 @@ class PlainSpec(Lazy):
 
     def render(self) -> Mapping[str, Any]:
         """Return all fields of the spec."""
-        return spec_to_dict(self._spec)
+        plain: Mapping[str, Any] = to_plain(self._spec)
+        return plain
+
+
+#: Fields of a process that the journal has unchanged.
+JOURNALED: Final = (
+    "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
+)  # fmt: skip
 
 
 @dataclass(slots=True)
