@@ -458,7 +458,7 @@ class Play(RuleBasedStateMachine):
                 self.late.append(readings)
             else:
                 self.tell(readings)
-                self.tell(machine.usages())
+                self.tell(machine.usages(self.cluster.now))
         self.flow()
 
     @precondition(lambda self: self.late)
@@ -619,8 +619,8 @@ class Play(RuleBasedStateMachine):
             machine.tell(reducer.TimePassed(), self.cluster.now)
             if self.known(machine) and not quiet:
                 self.tell(self.cluster.readings([machine]))
-                self.tell(machine.usages())
-                if machine.accepts():
+                self.tell(machine.usages(self.cluster.now))
+                if machine.reading(self.cluster.now).accepts:
                     self.ask_for_work(machine)
         self.tell(happened.TimePassed())
         self.flow()
