@@ -21,7 +21,7 @@ import rosrm_criu.plugin
 import rosrm_migration.plugin
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
-from rosrm.core.master.commands import Command, PublishStateConfig, Reply, SendOrder
+from rosrm.core.master.commands import Command, Reply, SendOrder
 from rosrm.core.master.master_state import MasterState, Process
 from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
@@ -210,6 +210,7 @@ class Cluster(World[Machine]):
         self.declared = declared or declared_by(self.strategies)
         super().__init__(self._new_state(epoch=1))
         self.air = Air(self.machines.values)
+        self.publish = self.air.publish
         self.records: list[Record] = []
         self.intents: dict[str, dict[str, Any]] = defaultdict(dict)
         self.carried: list[Command] = []
@@ -235,10 +236,6 @@ class Cluster(World[Machine]):
 
     # --- commands ------------------------------------------------------------------------
 
-    @property
-    def last_contact(self) -> float:
-        return self.now
-
     def record(self, event: happened.Event, commands: Sequence[Command]) -> None:
         """Make the commands durable."""
         self.journal(commands)
@@ -259,12 +256,6 @@ class Cluster(World[Machine]):
 
     def send(self, sent: SendOrder) -> None:
         self.by_id(sent.host_id).ordered.append(sent)
-
-    def publish(self, config: PublishStateConfig) -> None:
-        self.air.publish(config)
-
-    def after(self, seconds: float, action: Callable[[], object]) -> None:
-        action()
 
     # --- machines ------------------------------------------------------------------------
 
@@ -290,7 +281,7 @@ class Cluster(World[Machine]):
     def enter(self, machine: Machine, journal_seen: int, kept: tuple[KeptState, ...]) -> Reply:
         """Register a slave, which sends no reading yet."""
         machine.begin_to_register()
-        reply = self.join(machine, machine.slave.statuses(), journal_seen, kept)
+        reply = self.join(machine, self.now, machine.slave.statuses(), journal_seen, kept)
         if reply.accepted:
             machine.fresh = False
             machine.polled.clear()
@@ -364,12 +355,13 @@ class Cluster(World[Machine]):
     def settle(self) -> None:
         """Deliver all messages until no part sends another one."""
         for _ in range(200):
-            said = [self._deliver(machine) for machine in self.machines.values()]
-            if not any([*said, self._nodes_talk()]):
+            said = [self.deliver(machine) for machine in self.machines.values()]
+            if not any([*said, self.nodes_talk()]):
                 return
         raise AssertionError("the cluster talks without an end")
 
-    def _deliver(self, machine: Machine) -> bool:
+    def deliver(self, machine: Machine) -> bool:
+        """Deliver all messages between the master and a host; return True if there were any."""
         if not machine.connected:
             return False
         busy = bool(machine.polled or machine.ordered or machine.said)
@@ -380,15 +372,14 @@ class Cluster(World[Machine]):
             self.tell(machine.said.popleft())
         return busy
 
-    def _nodes_talk(self) -> bool:
-        """Deliver all handoff messages that are on their way."""
-        arrivals = self.air.waiting()
+    def nodes_talk(self, *, heard: bool = True) -> bool:
+        """Deliver one message to a node, and one report to the master."""
+        arrivals, reports = self.air.waiting(), self.air.next_reports()
         for arrive in arrivals[:1]:
             arrive()
-        heard = self.air.next_reports()
-        for at in heard[:1]:
+        for at in reports[: int(heard)]:
             self.tell(self.air.to_master.pop(at)[1])
-        return bool(arrivals or heard)
+        return bool(arrivals or reports)
 
     def wait(self, seconds: float, *, tick: float = 0.1) -> None:
         """Let time pass: readings and usages arrive, and the reducer checks its deadlines."""

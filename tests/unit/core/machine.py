@@ -53,7 +53,6 @@ class Machine(Host[Program]):
         quirks: of the nodes of a process here, by process name; see `Node`.
         shown: base units that each process uses, by name; shows in readings and usages.
         ordered: orders on their way to the slave.
-        said: status batches on their way to the master.
         kept: newest snapshot or replica of each process on this host, by process name.
         ships: hosts that receive replicas of a process on this host, by process name.
         connected: True while the wires work.
@@ -70,7 +69,6 @@ class Machine(Host[Program]):
     busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
     shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     ordered: deque[SendOrder] = field(default_factory=deque)
-    said: deque[happened.StatusesReceived] = field(default_factory=deque)
     kept: dict[str, KeptState] = field(default_factory=dict)
     ships: dict[str, tuple[str, ...]] = field(default_factory=dict)
     connected: bool = True
@@ -100,24 +98,8 @@ class Machine(Host[Program]):
         reading = super().reading(now)
         return reading._replace(accepts=self.takes and reading.accepts)
 
-    def amounts(self, now: float) -> dict[str, float]:
-        amounts: dict[str, float] = defaultdict(float)
-        for instance in self.programs:
-            for resource, amount in self.shown[instance.process].items():
-                amounts[resource] += amount
-        return amounts
-
-    def cpu_of(self, program: Program) -> float:
-        return self.shown[program.assignment.instance.process].get("cpu", 0.0)
-
-    def memory_of(self, program: Program, now: float) -> float:
-        return self.shown[program.assignment.instance.process].get("memory", 0.0)
-
-    def say(self, batch: happened.StatusesReceived) -> None:
-        self.said.append(batch)
-
-    def later(self, seconds: float, now: float, action: Callable[[float], None]) -> None:
-        action(now)
+    def used_by(self, program: Program, now: float) -> dict[str, float]:
+        return self.shown[program.assignment.instance.process]
 
     # --- programs --------------------------------------------------------------------------
 
@@ -134,8 +116,8 @@ class Machine(Host[Program]):
         program.node = Node(instance, False, self.quirks[instance.process])
 
     def spent(self, program: Program, now: float) -> tuple[float, float, float]:
-        run_time = program.run_time
-        return run_time, self.memory_of(program, now), run_time * self.cpu_of(program)
+        used, run_time = self.used_by(program, now), program.run_time
+        return run_time, used.get("memory", 0.0), run_time * used.get("cpu", 0.0)
 
     def _launch(self, assignment: Assignment, now: float) -> None:
         reason = self.refuses.get(assignment.instance.process)

@@ -18,7 +18,6 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    PublishStateConfig,
     Reply,
     SendOrder,
 )
@@ -85,7 +84,7 @@ class Simulation(World[Machine]):
         self.meter = Meter(workload.until)
         self.agenda = Agenda()
         self._plans = {plan.name: plan for plan in workload.processes}
-        self._nodes = Nodes(self.agenda, workload.model, self.machines, self.tell)
+        self.publish = Nodes(self.agenda, workload.model, self.machines, self.tell).hear
         self._active = 0.0
         self._usage_told = -1
         # After this long without any event, the passing of time alone has no further effect.
@@ -149,7 +148,7 @@ class Simulation(World[Machine]):
             plan, len(self.machines) + 1, self.agenda, self.workload.model, self._plans, self.tell
         )
         self.machines[plan.name] = machine
-        self.join(machine)
+        self.join(machine, inf)  # no simulated host is cut off
         self._read([machine])
 
     def _leave(self, plan: HostPlan) -> None:
@@ -202,11 +201,6 @@ class Simulation(World[Machine]):
         """Return the virtual time, seconds."""
         return self.agenda.now
 
-    @property
-    def last_contact(self) -> float:
-        """Return inf: no simulated host is cut off."""
-        return inf
-
     def after(self, seconds: float, action: Callable[[], object]) -> None:
         """Plan an action."""
         self.agenda.after(seconds, action)
@@ -216,10 +210,6 @@ class Simulation(World[Machine]):
         self.meter.take(self.state, event, commands, self.now)
         if any(not isinstance(command, Record | Intent | Reply) for command in commands):
             self._active = self.now
-
-    def publish(self, config: PublishStateConfig) -> None:
-        """Publish the phase of a handoff to the nodes."""
-        self._nodes.hear(config)
 
     def assign(self, host: Machine, command: Assign) -> None:
         """Hand an assignment to a host, which receives it later."""

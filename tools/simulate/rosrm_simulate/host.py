@@ -1,12 +1,13 @@
 """Base of simulated hosts: a slave's core, and programs in place of real processes.
 
-The hosts of the simulator and those of the unit tests share it. The subclasses add the usage of the
-programs, the delay of messages and actions, and faults.
+The hosts of the simulator and those of the unit tests share it. Here nothing takes time; the
+subclasses add the usage of the programs, delays and faults.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -84,6 +85,7 @@ class Host(ABC, Generic[ProgramT]):
         programs: instances that really run; they outlive the slave.
         ends: statuses of ended instances that the supervisor remembers.
         polled: assignments at the master that wait for the slave's next request.
+        said: status batches on their way to the master.
         stale: resources whose readings are too old.
         limit: (RESOURCE_SLOTS,) as in its readings.
     """
@@ -104,6 +106,7 @@ class Host(ABC, Generic[ProgramT]):
     programs: dict[InstanceId, ProgramT] = field(default_factory=dict)
     ends: dict[InstanceId, InstanceStatus] = field(default_factory=dict)
     polled: list[Assignment] = field(default_factory=list)
+    said: deque[StatusesReceived] = field(default_factory=deque)
     stale: set[str] = field(default_factory=set)
     sequence: int = 0
     batches: int = 0
@@ -124,16 +127,8 @@ class Host(ABC, Generic[ProgramT]):
         """Return the program of a new instance."""
 
     @abstractmethod
-    def cpu_of(self, program: ProgramT) -> float:
-        """Return the cores that an instance gets."""
-
-    @abstractmethod
-    def memory_of(self, program: ProgramT, now: float) -> float:
-        """Return the bytes that an instance holds."""
-
-    @abstractmethod
-    def amounts(self, now: float) -> Mapping[str, float]:
-        """Return the amount of each resource that all programs use, in base units."""
+    def used_by(self, program: ProgramT, now: float) -> Mapping[str, float]:
+        """Return the base units of each resource that an instance uses."""
 
     @abstractmethod
     def spent(self, program: ProgramT, now: float) -> tuple[float, float, float]:
@@ -147,13 +142,13 @@ class Host(ABC, Generic[ProgramT]):
     def replicate(self, order: ReplicateSnapshot | DropReplica) -> None:
         """Carry out an order about snapshots; here nodes publish none."""
 
-    @abstractmethod
     def say(self, batch: StatusesReceived) -> None:
         """Send statuses to the master."""
+        self.said.append(batch)
 
-    @abstractmethod
-    def later(self, seconds: float, now: float, action: Callable[[float], None]) -> None:
+    def later(self, _seconds: float, now: float, action: Callable[[float], None]) -> None:
         """Call an action after some seconds, with the time at which it happens."""
+        action(now)
 
     def run_begins(self, instance: InstanceId, now: float) -> None:
         """Note that a program runs from now on."""
@@ -175,9 +170,10 @@ class Host(ABC, Generic[ProgramT]):
 
     def usage(self, now: float) -> dict[str, float]:
         """Return the fraction of each resource that is used."""
-        amounts = self.amounts(now)
+        used = [self.used_by(program, now) for program in self.programs.values()]
         return {
-            one.name: self.busy.get(one.name, 0.0) + amounts.get(one.name, 0.0) / one.capacity
+            one.name: self.busy.get(one.name, 0.0)
+            + sum(amounts.get(one.name, 0.0) for amounts in used) / one.capacity
             for one in self.resources
         }
 
@@ -194,9 +190,10 @@ class Host(ABC, Generic[ProgramT]):
 
     def used(self, now: float) -> tuple[tuple[int, float, float], ...]:
         """Return number, cores and bytes of each instance."""
+        used = [(one.number, self.used_by(it, now)) for one, it in self.programs.items()]
         return tuple(
-            (instance.number, self.cpu_of(one), self.memory_of(one, now))
-            for instance, one in self.programs.items()
+            (number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0))
+            for number, amounts in used
         )
 
     def usages(self, now: float) -> UsagesReceived:

@@ -16,7 +16,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import SendOrder
 from rosrm.core.slave.events import SeenInGraph
 from rosrm.core.slave.state import awaits_graph
-from rosrm.model.values import Assignment, InstanceId, InstanceState, RestartPolicy
+from rosrm.model.values import EMPTY, Assignment, InstanceId, InstanceState, RestartPolicy
 from rosrm_simulate.agenda import Agenda, Entry
 from rosrm_simulate.host import Host, Program, Reading
 from rosrm_simulate.workload import HostPlan, Model, ProcessPlan
@@ -225,18 +225,13 @@ class Machine(Host[Work]):
         """Return the bytes that an instance holds."""
         return 0.0 if program.begun is None else program.plan.memory.at(now - program.begun)
 
-    def cpu_of(self, program: Work) -> float:
-        """Return the cores that an instance gets."""
-        return 0.0 if program.begun is None else program.plan.cpu * self._rate
-
-    def amounts(self, now: float) -> Mapping[str, float]:
-        """Return the amount of each resource that all programs use, in base units."""
-        running = self._running()
-        return {
-            "memory": sum(self.memory_of(one, now) for one in running),
-            "cpu": sum(self.cpu_of(one) for one in running),
-            "disk": sum(one.plan.disk for one in running),
-        }
+    def used_by(self, program: Work, now: float) -> Mapping[str, float]:
+        """Return the base units of each resource that an instance uses."""
+        if program.begun is None:
+            return EMPTY
+        plan = program.plan
+        memory = self.memory_of(program, now)
+        return {"memory": memory, "cpu": plan.cpu * self._rate, "disk": plan.disk}
 
     def grows(self, now: float) -> bool:
         """Return True if the memory of a process is still changing."""

@@ -1,6 +1,6 @@
 """Base of simulated clusters: the master's core, and the way of its commands to the hosts.
 
-The simulator and the unit tests share it. The subclasses decide when messages arrive.
+The simulator and the unit tests share it. The subclasses decide when messages arrive, and record.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ class World(ABC, Generic[HostT]):
     Attributes:
         machines: by name.
         replies: replies of the master, by request number.
+        publish: publishes the phase of a handoff to the nodes.
     """
+
+    publish: Callable[[PublishStateConfig], None]
 
     def __init__(self, state: MasterState) -> None:
         self.state = state
@@ -57,11 +60,6 @@ class World(ABC, Generic[HostT]):
         """Return the Unix time."""
         return self.now
 
-    @property
-    @abstractmethod
-    def last_contact(self) -> float:
-        """Return the time up to which registered slaves know that the master receives messages."""
-
     @abstractmethod
     def record(self, event: Event, commands: Sequence[Command]) -> None:
         """Process the records and intents of a step, before its other commands."""
@@ -70,17 +68,13 @@ class World(ABC, Generic[HostT]):
     def send(self, sent: SendOrder) -> None:
         """Send an order to a slave."""
 
-    @abstractmethod
-    def publish(self, config: PublishStateConfig) -> None:
-        """Publish the phase of a handoff to the nodes."""
-
     def assign(self, host: HostT, command: Assign) -> None:
         """Hand an assignment to a host with the answer to its open request."""
         host.polled.append(command.assignment)
 
-    @abstractmethod
-    def after(self, seconds: float, action: Callable[[], object]) -> None:
-        """Carry out an action after some seconds."""
+    def after(self, _seconds: float, action: Callable[[], object]) -> None:
+        """Carry out an action after some seconds: here at once."""
+        action()
 
     # --- the master ------------------------------------------------------------------------
 
@@ -140,13 +134,19 @@ class World(ABC, Generic[HostT]):
         """Return a registered host."""
         return self.machines[self.state.hosts.hosts[host_id - 1].name]
 
-    def join(self, host: HostT, *known: Any) -> Reply:
-        """Register a slave with its description and what else it knows."""
+    def join(self, host: HostT, contact: float, *known: Any) -> Reply:
+        """Register a slave with its description and what else it knows.
+
+        Args:
+            host: of the slave.
+            contact: time up to which it then knows that the master receives its messages.
+            known: further fields of the registration.
+        """
         reply = self.replies[self.request(HostRegistered(0, host.description(), *known))]
         if reply.accepted:
             host.host_id = reply.host_id
             host.tell(Registered(self.state.epoch), self.now)
-            host.tell(MasterHears(self.last_contact), self.now)
+            host.tell(MasterHears(contact), self.now)
         return reply
 
     def readings(self, hosts: Sequence[HostT], **columns: Any) -> ReadingsReceived:
