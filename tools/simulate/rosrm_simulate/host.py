@@ -150,7 +150,7 @@ class Host(ABC, Generic[ProgramT]):
         """Call an action after some seconds, with the time at which it happens."""
         action(now)
 
-    def run_begins(self, instance: InstanceId, now: float) -> None:
+    def run_begins(self, program: ProgramT, now: float) -> None:
         """Note that a program runs from now on."""
 
     def run_begins_again(self, program: ProgramT, now: float) -> None:
@@ -280,7 +280,7 @@ class Host(ABC, Generic[ProgramT]):
         if program is None or program.run != run or program.state is not InstanceState.STARTING:
             return
         program.state = InstanceState.RUNNING
-        self.run_begins(instance, now)
+        self.run_begins(program, now)
         status = InstanceStatus(instance, InstanceState.RUNNING, pid=program.pid, restarts=run)
         self._supervisor_says(status, now)
 

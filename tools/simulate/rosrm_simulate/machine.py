@@ -128,13 +128,13 @@ class Machine(Host[Work]):
             pid=instance.number,
         )  # fmt: skip
 
-    def run_begins(self, instance: InstanceId, now: float) -> None:
+    def run_begins(self, program: Work, now: float) -> None:
         """Begin with the work of an instance; a ROS node is seen in the graph later."""
-        program = self.programs[instance]
         program.begun = now
         self.changed(now)
         if awaits_graph(program.assignment.spec):
-            self.later(self._model.ready, now, partial(self._seen, instance, program.run))
+            seen = partial(self._seen, program.assignment.instance, program.run)
+            self.later(self._model.ready, now, seen)
 
     def run_begins_again(self, program: Work, now: float) -> None:
         """Drop the work of the earlier run."""
