@@ -63,10 +63,10 @@ def begin(cluster: Cluster, until: HandoffPhase) -> None:
         if until.name in said(cluster):
             return
         for machine in cluster.machines.values():
-            cluster._deliver(machine)
+            cluster.deliver(machine)
             if until.name in said(cluster):
                 return
-        cluster._nodes_talk()
+        cluster.nodes_talk()
     raise AssertionError(f"{until.name} was never said")
 
 
@@ -149,7 +149,7 @@ def test_the_commit_is_durable_before_the_source_is_stopped() -> None:
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
     while not cluster["p"].migrations:
-        cluster._nodes_talk()
+        cluster.nodes_talk()
     assert cluster.intents["migration"]["p"]["committed"]
     assert not cluster.orders(StopInstance)
 
@@ -161,7 +161,7 @@ def test_a_source_that_does_not_say_that_it_is_released_does_not_hold_up_the_mov
     cluster.air.to_master = [
         one for one in cluster.air.to_master if one[1].phase is not ReportPhase.RELEASED
     ]
-    while cluster._nodes_talk():
+    while cluster.nodes_talk():
         cluster.air.to_master = [
             one for one in cluster.air.to_master if one[1].phase is not ReportPhase.RELEASED
         ]
@@ -253,7 +253,7 @@ def test_a_destination_that_ends_after_it_was_active_and_before_the_commit() -> 
         for arrive in cluster.air.waiting():
             arrive()
     cluster.machines["b"].finish("p", cluster.now, code=3)
-    cluster._deliver(cluster.machines["b"])
+    cluster.deliver(cluster.machines["b"])
     assert cluster.active() == []
     cluster.settle()
     has_stayed(cluster)
@@ -429,7 +429,7 @@ def test_a_destination_that_ends_after_the_commit_is_queued_by_its_policy() -> N
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
     while not cluster["p"].migrations:
-        cluster._nodes_talk()
+        cluster.nodes_talk()
     cluster.machines["b"].finish("p", cluster.now, code=3)
     cluster.settle()
     assert cluster.phase("p") == "running"

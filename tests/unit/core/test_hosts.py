@@ -132,7 +132,7 @@ def test_a_usage_that_makes_no_sense_is_refused() -> None:
     cluster.submit(process("p", memory=100))
     for wrong in (float("nan"), -1.0, float("inf")):
         cluster.machines["a"].shown["p"] = {"memory": wrong}
-        cluster.tell(cluster.machines["a"].usages())
+        cluster.tell(cluster.machines["a"].usages(cluster.now))
     assert cluster.state.instances[1].seen == {}
     assert cluster.told("reading_refused") == ["a usage of p#1 was refused (NaN or negative)"]
 
