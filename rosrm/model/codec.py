@@ -50,10 +50,11 @@ def to_plain(value: Any) -> Any:
 
 def fields_to_plain(value: Any, names: Iterable[str]) -> dict[str, Any]:
     """Return some fields of a value as JSON, by name."""
-    return {
-        name: item if type(item := getattr(value, name)) in _PLAIN else to_plain(item)
-        for name in names
-    }
+    plain = {name: getattr(value, name) for name in names}
+    for name, item in plain.items():
+        if type(item) not in _PLAIN:
+            plain[name] = _writer(type(item))(item)
+    return plain
 
 
 @_compiled_once
@@ -61,7 +62,7 @@ def _writer(kind: Any) -> _Convert:
     if is_dataclass(kind):
         return _object_writer(kind)
     if issubclass(kind, Enum):
-        return attrgetter("name" if issubclass(kind, ByName) else "value")
+        return attrgetter("_name_" if issubclass(kind, ByName) else "_value_")
     if issubclass(kind, _SCALARS):
         return _unchanged
     if issubclass(kind, Path):

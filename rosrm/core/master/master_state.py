@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass
 from math import inf
+from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -29,7 +30,7 @@ from rosrm.core.master.state.replicas import Keeping
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
-from rosrm.model.codec import fields_to_plain, to_plain
+from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
@@ -45,6 +46,8 @@ _ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTIN
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 #: Most removed processes of which replicas are still dropped.
 _REMOVED_KEPT: Final = 10_000
+#: Faster than `fields_to_plain`, because a process is saved in the turn of its decision.
+_journaled_of: Final = attrgetter(*JOURNALED)
 #: No instance gets a number as large as this.
 _LARGEST: Final = 2**53
 
@@ -198,8 +201,10 @@ class MasterState:
                 "spec": process.plain, "phase": phase.value, "since": began,
                 "host": owner.host.name if owner else process.ended_on, "instances": held,
                 "node_names": aliases, "standby": self._standby_of(process),
-                "left_behind": left and astuple(left), "image": to_plain(process.image),
-                **fields_to_plain(process, JOURNALED),
+                "left_behind": left and astuple(left),
+                "image": process.image and to_plain(process.image),
+                **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
+                "excluded": dict(process.excluded),
             },
         )  # fmt: skip
 
