@@ -298,6 +298,10 @@ class Cluster(World[Machine]):
         if heard:
             self.tell(self.readings(heard, **wrong))
 
+    def readings(self, hosts: Sequence[Machine], **wrong: Any) -> happened.ReadingsReceived:
+        batches = np.array([one.batches for one in hosts], np.uint64)
+        return super().readings(hosts, **{"status_sequence": batches, **wrong})
+
     # --- requests ------------------------------------------------------------------------
 
     def ask(self, kind: Any, *fields: Any, settle: bool = True) -> Reply:

@@ -208,7 +208,7 @@ class Simulation(World[Machine]):
     def record(self, event: happened.Event, commands: Sequence[Command]) -> None:
         """Measure a step of the master's core."""
         self.meter.take(self.state, event, commands, self.now)
-        if any(not isinstance(command, Record | Intent | Reply) for command in commands):
+        if any(not isinstance(command, (Record, Intent, Reply)) for command in commands):
             self._active = self.now
 
     def assign(self, host: Machine, command: Assign) -> None:

@@ -190,11 +190,11 @@ class Host(ABC, Generic[ProgramT]):
 
     def used(self, now: float) -> tuple[tuple[int, float, float], ...]:
         """Return number, cores and bytes of each instance."""
-        used = [(one.number, self.used_by(it, now)) for one, it in self.programs.items()]
-        return tuple(
-            (number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0))
-            for number, amounts in used
-        )
+        told = []
+        for instance, program in self.programs.items():
+            amounts = self.used_by(program, now)
+            told.append((instance.number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0)))
+        return tuple(told)
 
     def usages(self, now: float) -> UsagesReceived:
         """Return the event with the usage of each instance."""

@@ -150,15 +150,20 @@ class World(ABC, Generic[HostT]):
         return reply
 
     def readings(self, hosts: Sequence[HostT], **columns: Any) -> ReadingsReceived:
-        """Return the next readings of hosts as one event; `columns` replace what they report."""
-        readings = [host.reading(self.now) for host in hosts]
+        """Return the next readings of hosts as one event.
+
+        Args:
+            hosts: that send them.
+            columns: `status_sequence`, and what replaces the reported values.
+        """
+        now = self.now
+        readings = [host.reading(now) for host in hosts]
         for host in hosts:
             host.sequence += 1
         values: dict[str, Any] = {
             "host_id": np.array([one.host_id for one in hosts], np.int64),
             "incarnation": np.array([one.incarnation for one in hosts], np.uint64),
             "sequence": np.array([one.sequence for one in hosts], np.uint64),
-            "status_sequence": np.array([one.batches for one in hosts], np.uint64),
             "accepting": np.array([one.accepts for one in readings], np.bool_),
             "stale": np.array([one.stale for one in readings], np.uint32),
             "usage": np.array([one.usage for one in readings]),
