@@ -25,15 +25,23 @@ import select
 import socket
 import sys
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import NoReturn, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from benchmarks.machine import say
 from benchmarks.shared_participant import Berth, SharedParticipant, Tally
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, reducer
+from rosrm.core.slave.events import (
+    AssignmentsReceived,
+    Event,
+    MasterLost,
+    SupervisorReported,
+    TimePassed,
+)
+from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused, RosrmError
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import (
@@ -42,11 +50,11 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
-    KeptState,
     ResourceDescription,
-    RestartPolicy,
 )
-from rosrm.ros.slave.endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
+from rosrm.ros.participant import Participant
+from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
+from rosrm.ros.slave.services import Duties, SlaveServices
 from rosrm.testing.loopback import settings_on_this_machine
 
 #: Most seconds between two looks at standard input.
@@ -103,14 +111,17 @@ class SimulatedSlave:
     def __init__(self, berth: Berth, name: str, period: float, tally: Tally) -> None:
         self.name = name
         self._tally = tally
-        self._state = core.SlaveState()
-        self._events: list[core.Event] = []
+        self._state = SlaveState()
+        self._events: list[Event] = []
         resources = tuple(ResourceDescription(*one) for one in _RESOURCES)
         description = HostDescription(
             name, int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
             pid=os.getpid(), resources=resources, period=period,
         )  # fmt: skip
-        self.endpoint = SlaveEndpoint(berth, self, description, max_age=5.0)  # type: ignore[arg-type]
+        participant = cast("Participant", berth)
+        self.endpoint = SlaveEndpoint(participant, description, self._state, take=self.take)
+        duties = Duties(self.take, *[self._refuse] * 5)
+        SlaveServices(participant, duties, name, 5.0, lambda: self.endpoint.epoch)
 
     @property
     def registered(self) -> bool:
@@ -122,21 +133,21 @@ class SimulatedSlave:
     ) -> None:
         """Do a slave's work of one period of `resource_info`."""
         self.endpoint.go_on(now)
-        accepting = core.under_limits(usage, limit, _PRESENT, 0)
+        accepting = under_limits(usage, limit, _PRESENT, 0)
         self.endpoint.publish_reading(
             usage, limit, _PRESENT, 0, accepting=accepting, processes=self._state.live()
         )
-        self._events.append(core.TimePassed())
+        self._events.append(TimePassed())
         self.work(now)
 
     def work(self, now: float) -> None:
         """Process the queued events; report each launched process as running, then as ended."""
         while self._events:
             events, self._events = self._events, []
-            for command in core.step_all(self._state, events, now):
-                if isinstance(command, core.Report):
+            for command in reducer.step_all(self._state, events, now):
+                if isinstance(command, commands.Report):
                     self.endpoint.publish_statuses(command.statuses, complete=command.complete)
-                elif isinstance(command, core.Launch):
+                elif isinstance(command, commands.Launch):
                     self._run([one.instance for one in command.assignments])
         self.endpoint.ask(now)
 
@@ -145,45 +156,17 @@ class SimulatedSlave:
             self._tally.taken[instance.process] = time.time()
             for state in (InstanceState.RUNNING, InstanceState.EXITED):
                 status = InstanceStatus(instance, state, pid=os.getpid())
-                self._events.append(core.SupervisorReported((status,)))
+                self._events.append(SupervisorReported((status,)))
 
-    # --- callbacks of the endpoint --------------------------------------------------------
-
-    def take(self, event: core.Event) -> None:
+    def take(self, event: Event) -> None:
         """Queue an event; process assignments at once, as a slave's loop does."""
         self._events.append(event)
-        self._tally.lost += isinstance(event, core.MasterLost)
-        if isinstance(event, core.AssignmentsReceived):
+        self._tally.lost += isinstance(event, MasterLost)
+        if isinstance(event, AssignmentsReceived):
             self.work(time.monotonic())
 
-    def statuses(self) -> Sequence[InstanceStatus]:
-        """Return the statuses of all instances that this slave holds."""
-        return self._state.statuses()
-
-    def kept_states(self) -> Sequence[KeptState]:
-        """Return none: its processes have no state."""
-        return ()
-
-    # ruff: noqa: ARG002 - the endpoint passes these arguments in any case
-
-    def read_log(self, query: LogQuery) -> LogSlice:
-        """Refuse: there is no process, so no log."""
-        raise Refused(f"{self.name} is simulated: it has no logs", "unknown")
-
-    def set_restart(
-        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
-    ) -> None:
-        """Refuse: there is no process, so no policy."""
-        settled(f"{self.name} is simulated: {instance} does not run")
-
-    def execute(
-        self, executor: str, arguments: dict[str, Any], done: Callable[[str, str, str], None]
-    ) -> None:
-        """Refuse: there are no executors."""
-        raise Refused(f"{self.name} is simulated: it has no executor {executor!r}", "unknown")
-
-    def say(self, message: str) -> None:
-        """Drop a log line: thousands of slaves would flood the output."""
+    def _refuse(self, *_request: object) -> NoReturn:
+        raise Refused(f"{self.name} is simulated: it has no processes", "unknown")
 
 
 class Fleet:

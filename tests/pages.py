@@ -83,7 +83,7 @@ NOT_RUN: Final[Mapping[str, str]] = {
     "docs/evaluation.md": "40 minutes; tests/integration/test_paper.py runs its parts",
 }
 
-_BLOCK: Final = re.compile(
+BLOCK: Final = re.compile(
     r"(?:^<!-- (?P<mark>[^\n]*) -->\n)?^```(?P<language>\w+)(?P<info>[^\n]*)\n(?P<text>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
@@ -111,16 +111,19 @@ class Block:
             yield re.sub(r"\s+# .*", "", line).strip(), answer.strip()
 
 
+def title_of(found: re.Match[str]) -> str:
+    """Return the title of a block, or an empty string."""
+    title = re.search(r'title="([^"]+)"', found["info"])
+    return title[1] if title else ""
+
+
 def blocks(page: str) -> Iterator[Block]:
     """The files and commands of a page, in its order."""
-    for found in _BLOCK.finditer((ROOT / page).read_text(encoding="utf-8")):
-        title = re.search(r'title="([^"]+)"', found["info"])
+    for found in BLOCK.finditer((ROOT / page).read_text(encoding="utf-8")):
         mark, _, about = (found["mark"] or "").partition(": ")
         known = mark if mark in _MARKS else ""
-        yield Block(
-            found["language"], title[1] if title else "", known, about if known else "",
-            found["text"],
-        )  # fmt: skip
+        about = about if known else ""
+        yield Block(found["language"], title_of(found), known, about, found["text"])
 
 
 def pages_with_commands() -> set[str]:

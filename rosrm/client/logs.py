@@ -17,8 +17,8 @@ from rosrm.errors import NoMaster, Refused
 from rosrm.wording import duration, listed, no_such, standing, standing_for
 
 if TYPE_CHECKING:
-    from rosrm.model.rows import HostRow, ProcessRow, Snapshot
-    from rosrm.ros.client import LogPart, MasterClient
+    from rosrm.model.rows import HostRow, LogPart, ProcessRow, Snapshot
+    from rosrm.ros.client import MasterClient
 
 _PART: Final = 256 * 1024
 #: Seconds between two polls of logs without new output.

@@ -14,6 +14,7 @@ from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
 from rosrm.extensions.registry import Registry
+from rosrm.model.rows import PluginKind
 
 #: Sections that the rules on times read.
 _OF_TIME: Final = ("liveness", "control")
@@ -128,7 +129,7 @@ def _given(root: Node, section: str) -> str | None:
 
 
 def _options(
-    root: Node, section: str, policy: str | None, plugins: PluginCheck
+    root: Node, section: PluginKind, policy: str | None, plugins: PluginCheck
 ) -> Mapping[str, Any]:
     if policy is None:
         return {}

@@ -13,6 +13,7 @@ from rosrm.extensions.plugin_calls import TITLES
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import IsResource
 from rosrm.model.codec import to_plain
+from rosrm.model.rows import PluginKind
 from rosrm.model.values import ProcessSpec
 
 #: Entry of `probes` that selects all probes that are read by default.
@@ -35,7 +36,7 @@ class PluginCheck:
         self._registry = registry
         self._problems = problems
 
-    def has(self, kind: str, name: str) -> bool:
+    def has(self, kind: PluginKind, name: str) -> bool:
         """Return True if a plugin is installed; always True without a registry."""
         return self._registry is None or name in self._registry.names(kind)
 
@@ -52,12 +53,12 @@ class PluginCheck:
         return no_standby(strategy, known)
 
     def choice(
-        self, kind: str, name: str, named: Node, options: Node | None, *, own: bool = False
+        self, kind: PluginKind, name: str, named: Node, options: Node | None, *, own: bool = False
     ) -> Mapping[str, Any]:
         """Return the options of one chosen plugin.
 
         Args:
-            kind: as in `Registry.offer`.
+            kind: of the plugin.
             name: of the offer.
             named: value that names the plugin in the file.
             options: as given in the file; None: none.
@@ -120,7 +121,7 @@ class PluginCheck:
                 continue
             self._problems.add(node.key_place or node.place, f"{where}: {note}")
 
-    def by_name(self, kind: str, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
+    def by_name(self, kind: PluginKind, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
         """Return the options of each plugin in a list of names or a mapping from name to options.
 
         For probes, the name `default` selects the default ones.

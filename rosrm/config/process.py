@@ -6,8 +6,8 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Final, Literal
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
@@ -32,6 +32,7 @@ _STOP: Final = StopPolicy()
 
 Text = Annotated[str, PlainWord()]
 Labels = Annotated[Mapping[str, Text], NullIsEmpty()]
+_Value = TypeVar("_Value")
 ListOfWords = Annotated[tuple[Text, ...], Words()]
 
 
@@ -157,31 +158,20 @@ class ProcessInFile:
         because it may not be repeatable.
         """
         when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
-        policy: RestartPolicy = _same(RestartPolicy, self.restart)
-        return replace(policy, when=when)
+        return _same(RestartPolicy, self.restart, when=when)
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses."""
-        return ProcessSpec(
-            name=self.name,
-            namespace=self.namespace,
-            package=self.package,
-            executable=self.executable,
-            module=self.module,
-            command=self.command,
-            arguments=self.arguments,
+        return _same(
+            ProcessSpec,
+            self,
             parameters=dict(flattened(self.parameters)),
-            remappings=self.remappings,
-            environment=self.environment,
-            working_directory=self.working_directory,
             ros=self.is_ros,
             kind=Kind(self.kind),
             restart=self.restart_policy,
-            needs=self.needs,
             required_labels=self.labels.required,
             preferred_labels=self.labels.preferred,
             avoided_labels=self.labels.avoided,
-            priority=self.priority,
             migration=_same(MigrationPolicy, self.migration),
             readiness=_same(Readiness, self.readiness),
             stop=_same(StopPolicy, self.stop),
@@ -192,9 +182,10 @@ class ProcessInFile:
         )
 
 
-def _same(wanted: type[Any], of: Any) -> Any:
-    """Return a value of the core with the fields of its form in the file."""
-    return wanted(**{f.name: getattr(of, f.name) for f in fields(wanted)})
+def _same(wanted: type[_Value], of: Any, **others: Any) -> _Value:
+    """Return a value of the core with the fields of its form in the file, except `others`."""
+    names = [f.name for f in fields(wanted) if f.name not in others]  # type: ignore[arg-type]
+    return wanted(**{name: getattr(of, name) for name in names}, **others)
 
 
 def flattened(parameters: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:

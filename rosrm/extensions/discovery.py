@@ -14,7 +14,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
 from pkgutil import resolve_name
 from types import SimpleNamespace
-from typing import Any, Final, TypeAlias, TypeVar, get_args, get_type_hints
+from typing import Any, Final, Literal, TypeAlias, TypeVar, get_args, get_type_hints
 
 import pluggy
 
@@ -31,6 +31,7 @@ from rosrm.extensions.contracts import (
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.installed import GROUP, PluginAddress
 from rosrm.extensions.time_limit import limited
+from rosrm.model.rows import PluginKind
 from rosrm.wording import get_close_matches
 
 T = TypeVar("T")
@@ -39,7 +40,7 @@ ChosenOffer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | Checkpoin
 Offer: TypeAlias = "ChosenOffer | LauncherOffer"
 
 #: Hook to the kind and the type of its offers.
-HOOKS: Final[Mapping[str, tuple[str, type[Any]]]] = {
+HOOKS: Final[Mapping[str, tuple[PluginKind, type[Any]]]] = {
     "register_probes": ("probe", ProbeOffer),
     "register_scoring_policies": ("scoring", ScoringOffer),
     "register_migration_strategies": ("migration", MigrationOffer),
@@ -71,9 +72,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Offered:
-    """One offer: its kind is a key of `TITLES`, as "probe"."""
+    """One offer."""
 
-    kind: str
+    kind: PluginKind
     offer: Offer
     source: Source
 
@@ -84,7 +85,7 @@ class Broken:
 
     source: Source
     reason: str
-    kind: str = ""
+    kind: PluginKind | Literal[""] = ""
     name: str = ""
 
 

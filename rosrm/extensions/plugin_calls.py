@@ -19,16 +19,17 @@ from math import inf
 from typing import Any, Final, TypeGuard, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.model.rows import PluginKind
 from rosrm.wording import counted
 
 T = TypeVar("T")
 #: Kind and name of an offer.
-Plugin = tuple[str, str]
+Plugin = tuple[PluginKind, str]
 #: Carries a call out; may raise `TimeoutError` when the call takes too long.
 Limit = Callable[[Plugin, Callable[[], Any]], Any]
 
 #: Names of the kinds of offers in messages.
-TITLES: Final[Mapping[str, str]] = {
+TITLES: Final[Mapping[PluginKind, str]] = {
     "probe": "probe",
     "scoring": "scoring policy",
     "migration": "migration strategy",
@@ -91,11 +92,11 @@ class PluginCalls:
     _failed: dict[Plugin, Failing] = field(default_factory=dict)
     _worked: set[Plugin] = field(default_factory=set)
 
-    def ask(self, kind: str, name: str, hook: str, call: Callable[[], T]) -> T:
+    def ask(self, kind: PluginKind, name: str, hook: str, call: Callable[[], T]) -> T:
         """Return the answer of a plugin.
 
         Args:
-            kind: of the offer, as in `TITLES`.
+            kind: of the offer.
             name: of the offer.
             hook: that is called, for messages.
             call: calls the hook and checks the answer; raises `PluginError` for a bad answer.

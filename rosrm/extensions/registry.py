@@ -44,11 +44,11 @@ from rosrm.extensions.discovery import (
 )
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.extensions.options import merged_options
-from rosrm.extensions.plugin_calls import TITLES, implements, required
+from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import from_plain
 from rosrm.model.description_checks import resource_fault
-from rosrm.model.rows import PluginRow
+from rosrm.model.rows import PluginKind, PluginRow, PluginState
 from rosrm.model.values import (
     EMPTY,
     RESOURCE_SLOTS,
@@ -60,7 +60,7 @@ from rosrm.model.values import (
 from rosrm.wording import counted, get_close_matches
 
 #: Members that the object of each kind must have.
-_METHODS: Final[Mapping[str, tuple[str, ...]]] = {
+_METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
     "probe": ("resources", "read", "close"),
     "scoring": ("score",),
     "migration": ("propose",),
@@ -69,7 +69,7 @@ _METHODS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 
 #: Distribution with rosrm's own plugins of a kind, for an installation without any.
-_SHIPPED_IN: Final[Mapping[str, str]] = {
+_SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "probe": "rosrm-resources",
     "scoring": "rosrm-scoring",
     "migration": "rosrm-migration",
@@ -173,9 +173,9 @@ class Registry:
     """The plugins of this installation; made by `discover`."""
 
     def __init__(self, loaded: Loaded) -> None:
-        self._offers: dict[tuple[str, str], Offered] = {}
+        self._offers: dict[Plugin, Offered] = {}
         self._broken: list[Broken] = list(loaded.broken)
-        self._outcome: dict[tuple[str, str], tuple[str, str]] = {}
+        self._outcome: dict[Plugin, tuple[PluginState, str]] = {}
         self._keep_single(loaded.offers)
         self._refuse_shared_executors()
 
@@ -204,11 +204,11 @@ class Registry:
         """Return the faults of plugins and offers."""
         return tuple(self._broken)
 
-    def names(self, kind: str) -> tuple[str, ...]:
+    def names(self, kind: PluginKind) -> tuple[str, ...]:
         """Return the offered names of one kind."""
         return tuple(sorted(name for of_kind, name in self._offers if of_kind == kind))
 
-    def offer(self, kind: str, name: str) -> ChosenOffer:
+    def offer(self, kind: PluginKind, name: str) -> ChosenOffer:
         """Return the offer of a name; raise `ConfigError` with the names that exist."""
         return cast(ChosenOffer, self._offered(kind, name).offer)
 
@@ -237,7 +237,7 @@ class Registry:
             )
         return chosen
 
-    def rows(self, *kinds: str, host: str = "") -> list[PluginRow]:
+    def rows(self, *kinds: PluginKind, host: str = "") -> list[PluginRow]:
         """Return one row for each offer and each fault of these kinds (of all where none is given).
 
         State and reason depend on the calls below: "available" until the object was made, then
@@ -454,7 +454,7 @@ class Registry:
             raise self._fault("probe", name, fault)
         return MadeProbe(name, probe, resources, offer.period, offer.deadline)
 
-    def _required(self, kind: str, name: str, options: Mapping[str, Any]) -> Any:
+    def _required(self, kind: PluginKind, name: str, options: Mapping[str, Any]) -> Any:
         """Make an object that the master needs: its absence here is an error."""
         try:
             return self._make(kind, name, options)
@@ -462,7 +462,7 @@ class Registry:
             self._outcome[kind, name] = ("absent", str(skip))
             raise ConfigError(f"{TITLES[kind]} {name!r} is absent here: {skip}") from skip
 
-    def _make(self, kind: str, name: str, options: Mapping[str, Any], *more: Any) -> Any:
+    def _make(self, kind: PluginKind, name: str, options: Mapping[str, Any], *more: Any) -> Any:
         offer = self.offer(kind, name)
         try:
             settings = from_plain(offer.options, options)
@@ -473,7 +473,7 @@ class Registry:
             raise self._fault(kind, name, reason) from fault
         return self._create(kind, name, offer, settings, *more)
 
-    def _create(self, kind: str, name: str, offer: Offer, *given: Any) -> Any:
+    def _create(self, kind: PluginKind, name: str, offer: Offer, *given: Any) -> Any:
         create = cast(Callable[..., Any], offer.create)
 
         def late() -> str:
@@ -495,7 +495,7 @@ class Registry:
         self._outcome[kind, name] = ("selected", offer.summary)
         return thing
 
-    def _fault(self, kind: str, name: str, reason: str) -> PluginError:
+    def _fault(self, kind: PluginKind, name: str, reason: str) -> PluginError:
         self._outcome[kind, name] = ("broken", reason)
         return PluginError(
             f"{TITLES[kind]} {name!r} of {self._offers[kind, name].source}: {reason}"
@@ -541,7 +541,7 @@ class Registry:
             source = self._offers.pop(("migration", name)).source
             self._broken.append(Broken(source, reason, "migration", name))
 
-    def _offered(self, kind: str, name: str) -> Offered:
+    def _offered(self, kind: PluginKind, name: str) -> Offered:
         if (kind, name) in self._offers:
             return self._offers[kind, name]
         title, names = TITLES[kind], self.names(kind)
@@ -553,7 +553,7 @@ class Registry:
             f"unknown {title} {name!r}{meant} {installed}{self._broken_note(kind, name)}"
         )
 
-    def _broken_note(self, kind: str, name: str = "") -> str:
+    def _broken_note(self, kind: PluginKind, name: str = "") -> str:
         """Return the faults of the broken plugin that may be meant, and the number of the others.
 
         A plugin is matched by the name of its offer or, where that is unknown, by its own.
@@ -583,7 +583,7 @@ def _words(text: str) -> list[str]:
     return [word for word in re.split(r"[^a-z]+", text.lower()) if word not in ("", "rosrm")]
 
 
-def _missing_method(kind: str, thing: object) -> str:
+def _missing_method(kind: PluginKind, thing: object) -> str:
     """Return the fault of an object that an offer made; "": it has all its methods."""
     if thing is None:
         wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])

@@ -19,10 +19,10 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    Order,
     PublishStateConfig,
     Redeliver,
     Reply,
+    SendOrder,
     Withdraw,
 )
 from rosrm.core.master.master_state import MasterState
@@ -50,7 +50,8 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.client import find_master
-from rosrm.ros.master.endpoint import Identity, MasterEndpoint
+from rosrm.ros.master.endpoint import MasterEndpoint
+from rosrm.ros.master.services import Identity
 from rosrm.ros.participant import Participant
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
@@ -74,11 +75,6 @@ _BLOCKED: Final = 0.5
 #: Seconds between two attempts to write the journal during a stall.
 _TRY_AGAIN: Final = 0.5
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
-
-
-def monotonic_ns() -> int:
-    """Return the clock of the master's beats: monotonic nanoseconds."""
-    return time.monotonic_ns()
 
 
 class MasterRuntime:
@@ -221,7 +217,7 @@ class MasterRuntime:
             core_now=lambda: self._core_now(self._now()),
             trouble=lambda: self._held.refusal if self._held is not None else "",
         )  # fmt: skip
-        return MasterEndpoint(self._participant, identity, reading, monotonic_ns, control)
+        return MasterEndpoint(self._participant, identity, reading, control)
 
     def _now(self) -> float:
         return time.monotonic()
@@ -268,7 +264,7 @@ class MasterRuntime:
 
     def _tick(self, now: float) -> None:
         self._endpoint.poll_readings()
-        self._endpoint.expire(now)
+        self._endpoint.links.expire(now)
         self._endpoint.events.append(happened.TimePassed())
         rival = self._endpoint.rival
         if rival is not None:
@@ -294,7 +290,9 @@ class MasterRuntime:
     def _take_in(self, now: float) -> None:
         """Pass all received events to the core in order, and execute its commands as a group."""
         if self._held is not None and not self._write_held(self._held, now):
-            self._held.take(self._state, self._endpoint.take_events(), self._endpoint.reply)
+            self._held.take(
+                self._state, self._endpoint.take_events(), self._endpoint.services.reply
+            )
             return
         self._state.wall = time.time()
         core_now, spent = self._core_now(now), self._deadlines.spent
@@ -367,28 +365,28 @@ class MasterRuntime:
         replies = [command for command in commands if isinstance(command, Reply)]
         for reply in replies:
             if reply.host_id:
-                self._endpoint.reply(reply)
+                self._endpoint.services.reply(reply)
         self._act(commands, now)
-        self._endpoint.flush(self._journal.last_sequence)
+        self._endpoint.links.flush(self._journal.last_sequence)
         for reply in replies:
             if not reply.host_id:
-                self._endpoint.reply(reply)
+                self._endpoint.services.reply(reply)
         for one in stored:
             _log.info("%s", one.record.message)
 
     def _act(self, commands: Sequence[Command], now: float) -> None:
-        endpoint = self._endpoint
+        links = self._endpoint.links
         for command in commands:
             if isinstance(command, Assign):
-                endpoint.assign(command)
-            elif isinstance(command, Order):
-                endpoint.order(command, now)
+                links.assign(command)
+            elif isinstance(command, SendOrder):
+                links.order(command, now)
             elif isinstance(command, PublishStateConfig):
-                endpoint.handoffs.publish(command)
+                self._endpoint.handoffs.publish(command)
             elif isinstance(command, Withdraw):
-                endpoint.withdraw(command, now)
+                links.withdraw(command, now)
             elif isinstance(command, Redeliver):
-                endpoint.redeliver(command, now)
+                links.redeliver(command, now)
 
     def _write(
         self, records: Sequence[Record], intents: Sequence[Intent]

@@ -1,116 +1,346 @@
-"""Conversion of frozen dataclasses to plain JSON values and back, without pydantic.
+"""Conversion of dataclasses to plain JSON values and back, driven by their type hints.
 
-The values have been validated before. This module checks only their shape, because the two ends may
-have different versions of rosrm or of a plugin.
+Readers are compiled once per type. A dataclass is read from an object, or from a list of its fields
+in order (`dataclasses.astuple` as JSON). Each class of a union has its name in JSON as the class
+attribute `KIND`, which the object has as `kind`. This module does not import pydantic, because the
+core and the lean runtimes use it. pydantic checks the files of users.
 """
 
 from __future__ import annotations
 
+import json
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
+from functools import cache
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import get_type_hints as hints_of
+
+from rosrm.errors import PluginError
 
 T = TypeVar("T")
+_Convert = Callable[[Any], Any]
+
+_SCALARS: Final = (str, int, float, bool, type(None))
+#: Types whose values are JSON already.
+_PLAIN: Final = frozenset(_SCALARS)
+#: Annotations of fields that are JSON already; `json` refuses a value of another type.
+_PLAIN_HINTS: Final = ("str", "int", "float", "bool", str, int, float, bool)
+_JSON_OBJECT: Final = ("Mapping[str, Any]", Mapping[str, Any])
+
+
+def _compiled_once(function: Callable[[Any], T]) -> Callable[[Any], T]:
+    return cache(function)  # typed, because mypy does not accept a type as an argument of a cache
+
+
+class ByName:
+    """An enum with this base class is in JSON with its names, not with its values."""
+
+
+# --- writing ----------------------------------------------------------------------------------
 
 
 def to_plain(value: Any) -> Any:
     """Return a dataclass, mapping, sequence or scalar as JSON; raise `TypeError` for others."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Enum):
-        return value.value
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [to_plain(item) for item in value]
-    raise TypeError(f"a value of type {type(value).__name__} cannot be carried as JSON")
+    return _writer(type(value))(value)
 
 
-def from_plain(wanted: type[T], plain: Mapping[str, Any]) -> T:
-    """Return a dataclass from plain values; raise `ValueError` that names the field."""
-    hints = get_type_hints(wanted)
-    known = {f.name: f for f in fields(wanted) if f.init}  # type: ignore[arg-type]
-    strange = sorted(set(plain) - set(known))
-    if strange:
-        raise ValueError(f"unknown {', '.join(strange)}; allowed: {', '.join(known) or 'nothing'}")
-    missing = [
-        name
-        for name, f in known.items()
-        if name not in plain and f.default is MISSING and f.default_factory is MISSING
-    ]
-    if missing:
-        raise ValueError(f"{', '.join(missing)} is missing")
-    return wanted(**{name: _value(hints[name], plain[name], name) for name in plain})
-
-
-def _value(hint: Any, plain: Any, where: str) -> Any:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return _one_of(arguments, plain, where)
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        return _mapping(arguments, plain, where)
-    if origin in (list, set, frozenset, tuple):
-        return _sequence(origin, arguments, plain, where)
-    if not isinstance(hint, type):
-        return plain  # Any, Literal and the like: unchanged
-    return _scalar(hint, plain, where)
-
-
-def _one_of(choices: tuple[Any, ...], plain: Any, where: str) -> Any:
-    if plain is None:
-        return None
-    first = next((choice for choice in choices if choice is not type(None)), Any)
-    for choice in choices:
-        try:
-            return _value(choice, plain, where)
-        except ValueError:
-            continue
-    return _value(first, plain, where)
-
-
-def _mapping(arguments: tuple[Any, ...], plain: Any, where: str) -> Any:
-    if not isinstance(plain, Mapping):
-        raise _unfit(where, "a mapping", plain)
-    hint = arguments[1] if len(arguments) == 2 else Any
-    return {key: _value(hint, item, f"{where}.{key}") for key, item in plain.items()}
-
-
-def _sequence(origin: Any, arguments: tuple[Any, ...], plain: Any, where: str) -> Any:
-    if isinstance(plain, str) or not isinstance(plain, (list, tuple)):
-        raise _unfit(where, "a list", plain)
-    if origin is tuple and Ellipsis not in arguments and len(arguments) == len(plain):
-        hints = arguments
-    else:
-        hints = (arguments[0] if arguments else Any,) * len(plain)
-    return origin(_value(hint, item, where) for hint, item in zip(hints, plain, strict=True))
-
-
-def _scalar(hint: type[Any], plain: Any, where: str) -> Any:
-    if is_dataclass(hint):
-        if not isinstance(plain, Mapping):
-            raise _unfit(where, "a mapping", plain)
-        return from_plain(hint, plain)
-    if issubclass(hint, Path) or issubclass(hint, Enum):
-        try:
-            return hint(plain)
-        except TypeError:
-            raise _unfit(where, "text", plain) from None
-    if hint is float and isinstance(plain, int) and not isinstance(plain, bool):
-        return float(plain)
-    if hint is type(None) and plain is not None:
-        raise _unfit(where, "null", plain)
-    known = hint in (bool, int, float, str)
-    if known and (not isinstance(plain, hint) or (hint is int and isinstance(plain, bool))):
-        raise _unfit(where, hint.__name__, plain)
+def fields_to_plain(value: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Return some fields of a value as JSON, by name."""
+    plain = {name: getattr(value, name) for name in names}
+    for name, item in plain.items():
+        if type(item) not in _PLAIN:
+            plain[name] = _writer(type(item))(item)
     return plain
 
 
-def _unfit(where: str, wanted: str, plain: Any) -> ValueError:
-    return ValueError(f"{where}: {wanted} is required, not {plain!r}")
+@_compiled_once
+def _writer(kind: Any) -> _Convert:
+    if is_dataclass(kind):
+        return _object_writer(kind)
+    if issubclass(kind, Enum):
+        return attrgetter("_name_" if issubclass(kind, ByName) else "_value_")
+    if issubclass(kind, _SCALARS):
+        return _unchanged
+    if issubclass(kind, Path):
+        return str
+    if issubclass(kind, Mapping):
+        return lambda value: {str(key): to_plain(item) for key, item in value.items()}
+    if issubclass(kind, (list, tuple)):
+        return lambda value: [to_plain(item) for item in value]
+    if issubclass(kind, (set, frozenset)):
+        return lambda value: [to_plain(item) for item in sorted(value)]
+    raise TypeError(f"a value of type {kind.__name__} cannot be carried as JSON")
+
+
+def _unchanged(value: Any) -> Any:
+    return value
+
+
+def _object_writer(kind: Any) -> _Convert:
+    names = [field.name for field in fields(kind)]
+    others = [field.name for field in fields(kind) if field.type not in _PLAIN_HINTS]
+    objects = {field.name for field in fields(kind) if field.type in _JSON_OBJECT}
+    first = {"kind": kind.KIND} if hasattr(kind, "KIND") else {}
+
+    def write(value: Any) -> dict[str, Any]:
+        plain = {name: getattr(value, name) for name in names}
+        for name in others:
+            item = plain[name]
+            if name in objects:
+                plain[name] = dict(item)
+            elif item is not None:
+                plain[name] = _writer(type(item))(item)
+        return {**first, **plain} if first else plain
+
+    return write
+
+
+# --- reading ----------------------------------------------------------------------------------
+
+
+class _Unfit(ValueError):
+    """A value does not fit its type."""
+
+    def __init__(self, text: str, joint: str = ": ", path: str = "") -> None:
+        super().__init__(f"{path}{joint}{text}" if path else text)
+        self.text = text
+        self.joint = joint
+        self.path = path
+
+    def below(self, outer: str) -> _Unfit:
+        """Return the same error with the path of the value around it."""
+        dot = "." if self.path and not self.path.startswith("[") else ""
+        return _Unfit(self.text, self.joint, f"{outer}{dot}{self.path}")
+
+
+def from_plain(wanted: type[T], plain: Any) -> T:
+    """Return a dataclass from plain values; raise `ValueError` with the path of the field.
+
+    A missing field has its default.
+    """
+    made: T = _reader(wanted)(plain)
+    return made
+
+
+def fields_from_plain(
+    wanted: type[Any], plain: Mapping[str, Any], names: Iterable[str]
+) -> dict[str, Any]:
+    """Return those fields of a dataclass that an object has, as keyword arguments.
+
+    Raises:
+        ValueError: with the path of an invalid field, or the name of a missing one without default.
+    """
+    given = {name: plain[name] for name in names if name in plain}
+    shape = _shape(wanted)
+    return _read_fields(shape, given, shape.required.intersection(names))
+
+
+def checked(value: T, what: str) -> T:
+    """Return a plugin's value as the journal gives it back.
+
+    Args:
+        value: a dataclass.
+        what: its name in the message.
+
+    Raises:
+        PluginError: a field has the wrong type, or is no JSON.
+    """
+    try:
+        return from_plain(type(value), json.loads(json.dumps(to_plain(value))))
+    except (ValueError, TypeError) as fault:
+        raise PluginError(f"an unsound {what}: {fault}") from fault
+
+
+@_compiled_once
+def _reader(hint: Any) -> _Convert:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return _union_reader(arguments)
+    if origin is Literal:
+        return _choice_reader({allowed: allowed for allowed in arguments})
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return _mapping_reader(arguments[-1])
+    if origin in (list, set, frozenset, tuple):
+        return _sequence_reader(origin, arguments)
+    return _class_reader(hint) if isinstance(hint, type) else _unchanged
+
+
+def _class_reader(kind: Any) -> _Convert:
+    if is_dataclass(kind):
+        return _object_reader(kind)
+    if issubclass(kind, Enum):
+        return _choice_reader({_writer(kind)(member): member for member in kind})
+    if issubclass(kind, Path):
+        return _read_path
+    return _scalar_reader(kind) if kind in _PLAIN else _unchanged
+
+
+class _Shape(NamedTuple):
+    """The fields of a dataclass.
+
+    Attributes:
+        readers: reader of each field by its name, in order, with a type that needs no reader.
+        required: names of the fields without a default.
+    """
+
+    readers: Mapping[str, tuple[Any, _Convert]]
+    required: frozenset[str]
+
+
+@_compiled_once
+def _shape(kind: Any) -> _Shape:
+    hints = hints_of(kind)
+    known = [field for field in fields(kind) if field.init]
+    required = [f.name for f in known if f.default is MISSING and f.default_factory is MISSING]
+    readers = {field.name: (hints[field.name], _reader(hints[field.name])) for field in known}
+    return _Shape(readers, frozenset(required))
+
+
+def _object_reader(kind: Any) -> _Convert:
+    is_of_union = hasattr(kind, "KIND")
+
+    def read(plain: Any) -> Any:
+        shape = _shape(kind)  # not before the first use, because a field may have the type itself
+        if isinstance(plain, list) and len(plain) <= len(shape.readers):
+            plain = dict(zip(shape.readers, plain, strict=False))
+        if not isinstance(plain, Mapping):
+            raise _unfit("a mapping", plain)
+        if is_of_union:
+            plain = {name: item for name, item in plain.items() if name != "kind"}
+        return kind(**_read_fields(shape, plain, shape.required))
+
+    return read
+
+
+def _read_fields(
+    shape: _Shape, plain: Mapping[str, Any], required: frozenset[str]
+) -> dict[str, Any]:
+    readers = shape.readers
+    if not plain.keys() <= readers.keys():
+        unknown = ", ".join(sorted(plain.keys() - readers.keys()))
+        raise _Unfit(f"unknown {unknown}; allowed: {', '.join(readers) or 'nothing'}")
+    if not required <= plain.keys():
+        missing = required - plain.keys()
+        raise _Unfit(f"{', '.join(name for name in readers if name in missing)} is missing")
+    values = {}
+    for name, item in plain.items():
+        plain_type, reader = readers[name]
+        try:
+            values[name] = item if type(item) is plain_type else reader(item)
+        except _Unfit as fault:
+            raise fault.below(name) from None
+    return values
+
+
+def _union_reader(choices: tuple[Any, ...]) -> _Convert:
+    readers = {choice: _reader(choice) for choice in choices if choice is not type(None)}
+    if len(readers) == 1:
+        (read,) = readers.values()
+    elif all(hasattr(choice, "KIND") for choice in readers):
+        read = _by_kind({choice.KIND: reader for choice, reader in readers.items()})
+    else:
+        read = _first_fit(list(readers.values()))
+    if len(readers) == len(choices):
+        return read
+    return lambda plain: None if plain is None else read(plain)
+
+
+def _first_fit(readers: list[_Convert]) -> _Convert:
+    def read(plain: Any) -> Any:
+        for reader in readers:
+            try:
+                return reader(plain)
+            except ValueError:
+                continue
+        return readers[0](plain)
+
+    return read
+
+
+def _by_kind(readers: Mapping[str, _Convert]) -> _Convert:
+    read_kind = _choice_reader(readers)
+
+    def read(plain: Any) -> Any:
+        if not isinstance(plain, Mapping):
+            raise _unfit("a mapping", plain)
+        try:
+            reader = read_kind(plain.get("kind"))
+        except _Unfit as fault:
+            raise fault.below("kind") from None
+        return reader(plain)
+
+    return read
+
+
+def _choice_reader(choices: Mapping[Any, Any]) -> _Convert:
+    """Return a reader of the keys of a mapping: each stands for its value."""
+
+    def read(plain: Any) -> Any:
+        if not isinstance(plain, (str, int)) or plain not in choices:
+            allowed = ", ".join(map(str, choices))
+            raise _Unfit(f"{plain!r}; allowed: {allowed}", " ")
+        return choices[plain]
+
+    return read
+
+
+def _mapping_reader(hint: Any) -> _Convert:
+    reader = _reader(hint)
+
+    def read(plain: Any) -> Any:
+        if not isinstance(plain, Mapping):
+            raise _unfit("a mapping", plain)
+        values = {}
+        for name, item in plain.items():
+            try:
+                values[name] = reader(item)
+            except _Unfit as fault:
+                raise fault.below(name) from None
+        return values
+
+    return read
+
+
+def _sequence_reader(origin: Any, arguments: tuple[Any, ...]) -> _Convert:
+    readers = [_reader(hint) for hint in arguments if hint is not Ellipsis]
+    is_fixed = origin is tuple and Ellipsis not in arguments
+
+    def read(plain: Any) -> Any:
+        if not isinstance(plain, (list, tuple)):
+            raise _unfit("a list", plain)
+        if is_fixed and len(readers) != len(plain):
+            raise _unfit(f"a list of {len(readers)}", plain)
+        values = []
+        for at, item in enumerate(plain):
+            try:
+                values.append(readers[at if is_fixed else 0](item))
+            except _Unfit as fault:
+                raise fault.below(f"[{at}]") from None
+        return origin(values)
+
+    return read
+
+
+def _scalar_reader(kind: Any) -> _Convert:
+    def read(plain: Any) -> Any:
+        if type(plain) is kind:
+            return plain
+        if kind is float and type(plain) is int:
+            return float(plain)
+        raise _unfit(kind.__name__, plain)
+
+    return read
+
+
+def _read_path(plain: Any) -> Path:
+    if not isinstance(plain, str):
+        raise _unfit("text", plain)
+    return Path(plain)
+
+
+def _unfit(wanted: str, plain: Any) -> _Unfit:
+    return _Unfit(f"{wanted} is required, not {plain!r}")

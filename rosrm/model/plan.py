@@ -11,8 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from math import inf
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
+from rosrm.model.codec import ByName
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec, RestartPolicy
 
 
@@ -56,7 +57,7 @@ class Aim(str, Enum):
     RESTORE = "restore"
 
 
-class HandoffPhase(IntEnum):
+class HandoffPhase(ByName, IntEnum):
     """Phase that the master publishes for a handoff, as in `StateConfig`."""
 
     SHADOW = 1
@@ -95,6 +96,8 @@ class Start:
     the process's spec.
     """
 
+    KIND: ClassVar = "start"
+
     instance: InstanceId
     host: str
     timeout: float
@@ -108,6 +111,8 @@ class Start:
 @dataclass(frozen=True, slots=True)
 class AwaitReady:
     """Wait until an instance is ready; done `settle` seconds after its slave reports so."""
+
+    KIND: ClassVar = "await_ready"
 
     instance: InstanceId
     host: str
@@ -123,6 +128,8 @@ class AwaitReleased:
     This step never fails: the successor is active, and outputs cannot be recalled.
     """
 
+    KIND: ClassVar = "await_released"
+
     instance: InstanceId
     host: str
     timeout: float
@@ -132,6 +139,8 @@ class AwaitReleased:
 @dataclass(frozen=True, slots=True)
 class Stop:
     """Stop an instance; done when its slave reports that it has ended."""
+
+    KIND: ClassVar = "stop"
 
     instance: InstanceId
     host: str
@@ -147,6 +156,8 @@ class Configure:
     not `awaited`, at once.
     """
 
+    KIND: ClassVar = "configure"
+
     phase: HandoffPhase
     timeout: float
     awaited: bool = True
@@ -156,6 +167,8 @@ class Configure:
 @dataclass(frozen=True, slots=True)
 class SetRestart:
     """Set another restart policy of an instance; done when its slave has accepted it."""
+
+    KIND: ClassVar = "set_restart"
 
     instance: InstanceId
     host: str
@@ -172,6 +185,8 @@ class Commit:
     executor that removes an unwanted image; "": this is no checkpoint.
     """
 
+    KIND: ClassVar = "commit"
+
     timeout: float = 0.0
     undo: Step | None = None
     image: str = ""
@@ -184,6 +199,8 @@ class Execute:
     The executor gets the arguments and, as `results`, the answers of the executors of earlier steps
     of the same migration, by their names.
     """
+
+    KIND: ClassVar = "execute"
 
     executor: str
     host: str

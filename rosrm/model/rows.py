@@ -1,12 +1,16 @@
-"""Rows of listings: plain values for clients, tables and tests."""
+"""Rows of listings, and parts of logs: plain values for clients, tables and tests."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from rosrm.model.values import EMPTY, HostDescription
+
+#: Kinds of offers; "plugin": a fault of a plugin before its offers are known.
+PluginKind = Literal["probe", "scoring", "migration", "checkpoint", "launcher", "plugin"]
+PluginState = Literal["selected", "available", "absent", "broken", "failing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,16 +116,14 @@ class PluginRow:
     """One offer of a plugin, or a fault.
 
     Attributes:
-        kind: "probe", "scoring", "migration" or "checkpoint".
         distribution: name and version of the package that brings it.
-        state: "selected", "available", "absent", "broken" or "failing".
         host: "" for the master.
     """
 
-    kind: str
+    kind: PluginKind
     name: str
     distribution: str
-    state: str
+    state: PluginState
     reason: str
     host: str = ""
 
@@ -145,3 +147,28 @@ class Snapshot:
     plugins: Sequence[PluginRow] = ()
     events: Sequence[EventRow] = ()
     trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LogPart:
+    """A part of an instance's log.
+
+    Attributes:
+        number: of the instance.
+        numbers: of all instances of the process whose logs the host holds, ascending.
+        content: the bytes.
+        offset: of the content, from the first byte that the instance wrote. Bytes between the
+            requested offset and this one were dropped.
+        next_offset: offset of the next part.
+        ended: the instance has ended, and the log is complete.
+        marks: checks of the log: (unix time, offset, pid). Everything before the offset had been
+            written by that time; a pid not 0 is that of a process whose output begins there.
+    """
+
+    number: int
+    numbers: Sequence[int]
+    content: bytes
+    offset: int
+    next_offset: int
+    ended: bool
+    marks: Sequence[tuple[float, int, int]]

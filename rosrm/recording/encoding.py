@@ -20,12 +20,22 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    Order,
     PublishStateConfig,
     Redeliver,
+    SendOrder,
     Withdraw,
 )
 from rosrm.model.codec import from_plain, to_plain
+from rosrm.model.orders import (
+    FenceInstance,
+    Order,
+    ReportInstances,
+    RestartInstance,
+    RunExecutor,
+    SetRestartPolicy,
+    StartInstance,
+    StopInstance,
+)
 from rosrm.model.values import RESOURCE_SLOTS
 from rosrm.recording.frames import FrameKind
 
@@ -39,8 +49,20 @@ _COLUMNS: Final = (
     ("accepting", "?"), ("stale", "<u4"),
 )  # fmt: skip
 
-#: Orders about replicas do not decide where anything runs.
-_KEEPING: Final = frozenset({"keep", "drop_kept"})
+#: Orders in a decision; those about replicas do not decide where anything runs.
+_ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
+    {
+        StartInstance: "start",
+        StopInstance: "stop",
+        FenceInstance: "fence",
+        RestartInstance: "restart",
+        SetRestartPolicy: "set_restart",
+        RunExecutor: "execute",
+        ReportInstances: "report",
+    }
+)
+#: Bits of an order's number to its series, in the records of rosrm 0.1.0.
+_SERIES_OF_0_1_0: Final = MappingProxyType({41: "replication", 42: "capability", 43: "periodic"})
 _KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {kind.__name__: kind for kind in get_args(happened.Event)}
 )
@@ -86,10 +108,19 @@ def decode(kind: FrameKind, content: bytes) -> Happened:
         if kind is FrameKind.USAGES:
             return Happened(now, wall, _decoded_usages(rest))
         plain = json.loads(rest)
-        event: happened.Event = from_plain(_KINDS[plain.pop("kind")], plain)
+        kind_of_event = _KINDS[plain.pop("kind")]
+        if kind_of_event is happened.OrderAnswered:
+            plain["order"] = _order_id(plain["order"])
+        event: happened.Event = from_plain(kind_of_event, plain)
     except (struct.error, KeyError, TypeError, AttributeError) as fault:
         raise ValueError(f"{type(fault).__name__}: {fault}") from None
     return Happened(now, wall, event)
+
+
+def _order_id(plain: Any) -> Any:
+    """Return the id of an order; rosrm 0.1.0 wrote those of a series as one large number."""
+    series = _SERIES_OF_0_1_0.get(plain.bit_length()) if isinstance(plain, int) else None
+    return plain if series is None else [series, plain - (1 << plain.bit_length() - 1)]
 
 
 def _encoded_readings(event: happened.ReadingsReceived) -> bytes:
@@ -154,9 +185,10 @@ def _decision(command: Command) -> str:
         return f"assign {command.assignment.instance} to host {command.host_id} again"
     if isinstance(command, Withdraw):
         return f"withdraw {command.instance} from host {command.host_id}"
-    if isinstance(command, Order) and command.action not in _KEEPING:
-        what = command.instance or (command.assignment.instance if command.assignment else "")
-        return f"{command.action} {what} on host {command.host_id}".replace("  ", " ")
+    if isinstance(command, SendOrder) and type(command.order) in _ORDERS:
+        instance = getattr(command.order, "instance", None)
+        what = _ORDERS[type(command.order)] + (f" {instance}" if instance else "")
+        return f"{what} on host {command.host_id}"
     if isinstance(command, PublishStateConfig):
         way = f"from {command.source} to {command.destination}"
         return f"{command.phase.name} {command.process} {way}"

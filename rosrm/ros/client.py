@@ -8,12 +8,11 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from rosrm.errors import NoMaster, Refused, RosrmError
+from rosrm.errors import NoMaster, Refused
 from rosrm.model.ros_settings import RosSettings
-from rosrm.model.rows import Snapshot
+from rosrm.model.rows import LogPart, Snapshot
 from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, check_answer
@@ -36,31 +35,6 @@ _GREET_AGAIN: Final = 0.5
 _UNKNOWN_EPOCH: Final = 0
 #: Name of the master in messages.
 _MASTER: Final = "the master"
-
-
-@dataclass(frozen=True, slots=True)
-class LogPart:
-    """A part of an instance's log.
-
-    Attributes:
-        number: of the instance.
-        numbers: of all instances of the process whose logs the host holds, ascending.
-        content: the bytes.
-        offset: of the content, from the first byte that the instance wrote. Bytes between the
-            requested offset and this one were dropped.
-        next_offset: offset of the next part.
-        ended: the instance has ended, and the log is complete.
-        marks: checks of the log: (unix time, offset, pid). Everything before the offset had been
-            written by that time; a pid not 0 is that of a process whose output begins there.
-    """
-
-    number: int
-    numbers: Sequence[int]
-    content: bytes
-    offset: int
-    next_offset: int
-    ended: bool
-    marks: Sequence[tuple[float, int, int]]
 
 
 def wait_for_service(participant: Participant, client: Any, deadline: float) -> bool:
@@ -233,22 +207,6 @@ class MasterClient:
         """Queue processes, all or none; return the master's message."""
         request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
         return str(self._ask(srv.Submit, names.SUBMIT, request).answer.message)
-
-    def submit_soon(self, specs: Sequence[ProcessSpec], done: Callable[[str], None]) -> None:
-        """Queue processes without waiting for the answer; `spin` until `done` is called.
-
-        Args:
-            done: called with "" or with the reason of a refusal.
-        """
-        request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
-        request.envelope = self._envelope()
-        client = self._client(srv.Submit, names.SUBMIT, _MASTER)
-
-        def finish(response: Any) -> None:
-            refused = response is None or not response.answer.accepted
-            done((response.answer.message if response else "no answer in time") if refused else "")
-
-        self._control.call(client, request, time.monotonic() + self._timeout, finish)
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""
@@ -438,13 +396,5 @@ class MasterClient:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-
-__all__ = ["LogPart", "MasterClient", "RosrmError", "find_master", "wait_for_service"]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import is_dataclass
+from functools import cache, partial
+from operator import attrgetter
+from typing import Any, Final, TypeVar, get_type_hints
 
 from rosrm.errors import Refused
 from rosrm.model import values
@@ -12,6 +15,7 @@ from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceR
 from rosrm_msgs import msg
 
 _INFINITE: Final = float("inf")
+_STATES: Final = frozenset(state.value for state in values.InstanceState)
 
 # --- pairs, instances, JSON -------------------------------------------------------------------
 
@@ -28,12 +32,12 @@ def mapping(values: Iterable[msg.KeyValue]) -> dict[str, str]:
 
 def instance_to_msg(instance: values.InstanceId) -> msg.InstanceId:
     """Return an instance as a message."""
-    return msg.InstanceId(process=instance.process, number=instance.number)
+    return _to_msg(msg.InstanceId, instance)
 
 
 def instance_from_msg(message: msg.InstanceId) -> values.InstanceId:
     """Return the inverse of `instance_to_msg`."""
-    return values.InstanceId(message.process, message.number)
+    return _from_msg(values.InstanceId, message)
 
 
 def json_object(text: str, what: str) -> dict[str, Any]:
@@ -46,48 +50,83 @@ def json_object(text: str, what: str) -> dict[str, Any]:
     return value
 
 
+# --- values and messages with the same fields -------------------------------------------------
+
+_Value = TypeVar("_Value")
+_Convert = Callable[[Any], Any]
+
+#: Fields that have another name in messages.
+_RENAMED: Final = {"namespace": "ros_namespace", "facts": "data"}
+#: Type of a field to its conversion to a message and back.
+_FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
+    float: (float, float),
+    str | None: (lambda text: text or "", lambda text: text or None),
+    tuple[str, ...]: (list, tuple),
+    Mapping[str, str]: (pairs, mapping),
+    values.Kind: (attrgetter("value"), values.Kind),
+    values.InstanceState: (attrgetter("value"), values.InstanceState),
+}
+
+
+def _fields(kind: Any) -> tuple[tuple[str, str, _Convert, _Convert], ...]:
+    """Return name, name in the message and conversions of each field; `kind` is a dataclass."""
+    return tuple(
+        (name, _RENAMED.get(name, name), *_forms(hint))
+        for name, hint in get_type_hints(kind).items()
+    )
+
+
+#: Typed, because mypy does not accept a type as an argument of a cache.
+_known_fields: Final[Callable[[Any], tuple[tuple[str, str, _Convert, _Convert], ...]]] = cache(
+    _fields
+)
+
+
+def _forms(hint: Any) -> tuple[_Convert, _Convert]:
+    if isinstance(hint, type) and is_dataclass(hint):
+        return partial(_to_msg, getattr(msg, hint.__name__)), partial(_from_msg, hint)
+    return _FORMS.get(hint, (_unchanged, _unchanged))
+
+
+def _unchanged(value: Any) -> Any:
+    return value
+
+
+def _to_msg(message: Any, value: Any, **others: Any) -> Any:
+    """Return a dataclass as a message of a type with the same fields; `others` are converted."""
+    same = {
+        there: convert(getattr(value, name))
+        for name, there, convert, _ in _known_fields(type(value))
+        if there not in others
+    }
+    return message(**same, **others)
+
+
+def _from_msg(wanted: type[_Value], message: Any, **others: Any) -> _Value:
+    """Return the inverse of `_to_msg`."""
+    same = {
+        name: convert(getattr(message, there))
+        for name, there, _, convert in _known_fields(wanted)
+        if name not in others
+    }
+    return wanted(**same, **others)
+
+
 # --- specs and assignments --------------------------------------------------------------------
 
 
 def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
     """Return a process spec as a message."""
-    restart, readiness, stop = spec.restart, spec.readiness, spec.stop
-    return msg.ProcessSpec(
-        name=spec.name, ros_namespace=spec.namespace, package=spec.package or "",
-        executable=spec.executable or "", module=spec.module or "", command=list(spec.command),
-        arguments=list(spec.arguments),
-        parameters=[
-            msg.KeyValue(key=key, value=json.dumps(value)) for key, value in spec.parameters.items()
-        ],
-        remappings=pairs(spec.remappings), environment=pairs(spec.environment),
-        working_directory=spec.working_directory or "", ros=spec.ros, kind=spec.kind.value,
-        restart=restart_to_msg(restart),
+    parameters = spec.parameters.items()
+    return _to_msg(
+        msg.ProcessSpec, spec,
+        parameters=[msg.KeyValue(key=key, value=json.dumps(value)) for key, value in parameters],
         needs=[
             msg.ResourceAmount(resource=name, amount=float(amount))
             for name, amount in spec.needs.items()
         ],
-        required_labels=pairs(spec.required_labels), preferred_labels=pairs(spec.preferred_labels),
-        avoided_labels=pairs(spec.avoided_labels), priority=spec.priority,
-        migration=msg.MigrationPolicy(
-            strategy=spec.migration.strategy or "", overlap=spec.migration.overlap,
-            options=json.dumps(dict(spec.migration.options)),
-        ),
-        readiness=msg.Readiness(kind=readiness.kind, timeout=float(readiness.timeout)),
-        stop=msg.StopPolicy(
-            interrupt_grace=float(stop.interrupt_grace), terminate_grace=float(stop.terminate_grace)
-        ),
-        host_loss=msg.HostLossPolicy(
-            then=spec.host_loss.then, delay=float(spec.host_loss.delay)
-        ),
-        isolation=msg.IsolationPolicy(
-            then=spec.isolation.then, after=float(spec.isolation.after)
-        ),
-        standby=msg.StandbyPolicy(
-            wanted=spec.standby.wanted, apart_by=list(spec.standby.apart_by)
-        ),
-        health=msg.Health(
-            topic=spec.health.topic, rate=float(spec.health.rate),
-            lifecycle=spec.health.lifecycle, timeout=float(spec.health.timeout),
+        migration=_to_msg(
+            msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
         ),
     )  # fmt: skip
 
@@ -97,35 +136,16 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     fault = _spec_fault(message)
     if fault:
         raise Refused(f"process {message.name!r}: {fault}")
-    migration = message.migration
-    return values.ProcessSpec(
-        name=message.name, namespace=message.ros_namespace, package=message.package or None,
-        executable=message.executable or None, module=message.module or None,
-        command=tuple(message.command), arguments=tuple(message.arguments),
+    return _from_msg(
+        values.ProcessSpec, message,
         parameters={
             pair.key: _json_value(pair.value, f"parameter {pair.key}")
             for pair in message.parameters
         },
-        remappings=mapping(message.remappings), environment=mapping(message.environment),
-        working_directory=message.working_directory or None, ros=message.ros,
-        kind=values.Kind(message.kind),
-        restart=_restart_from_msg(message.restart),
         needs={need.resource: need.amount for need in message.needs},
-        required_labels=mapping(message.required_labels),
-        preferred_labels=mapping(message.preferred_labels),
-        avoided_labels=mapping(message.avoided_labels), priority=message.priority,
-        migration=values.MigrationPolicy(
-            migration.strategy or None, migration.overlap,
-            json_object(migration.options, "migration options"),
-        ),
-        readiness=values.Readiness(message.readiness.kind, message.readiness.timeout),
-        stop=values.StopPolicy(message.stop.interrupt_grace, message.stop.terminate_grace),
-        host_loss=values.HostLossPolicy(message.host_loss.then, message.host_loss.delay),
-        isolation=values.IsolationPolicy(message.isolation.then, message.isolation.after),
-        standby=values.StandbyPolicy(message.standby.wanted, tuple(message.standby.apart_by)),
-        health=values.Health(
-            message.health.topic, message.health.rate, message.health.lifecycle,
-            message.health.timeout,
+        migration=_from_msg(
+            values.MigrationPolicy, message.migration,
+            options=json_object(message.migration.options, "migration options"),
         ),
     )  # fmt: skip
 
@@ -183,10 +203,7 @@ def _times_fault(message: msg.ProcessSpec) -> str:
 
 def restart_to_msg(restart: values.RestartPolicy) -> msg.RestartPolicy:
     """Return a restart policy as a message."""
-    return msg.RestartPolicy(
-        when=restart.when, delay=float(restart.delay), max_delay=float(restart.max_delay),
-        factor=float(restart.factor), attempts=restart.attempts, window=float(restart.window),
-    )  # fmt: skip
+    return _to_msg(msg.RestartPolicy, restart)
 
 
 def restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
@@ -194,14 +211,7 @@ def restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
     fault = _restart_fault(message)
     if fault:
         raise Refused(f"a restart policy: {fault}")
-    return _restart_from_msg(message)
-
-
-def _restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
-    return values.RestartPolicy(
-        message.when, message.delay, message.max_delay, message.factor, message.attempts,
-        message.window,
-    )  # fmt: skip
+    return _from_msg(values.RestartPolicy, message)
 
 
 def _restart_fault(message: msg.RestartPolicy) -> str:
@@ -256,19 +266,11 @@ def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
 
 def host_to_msg(host: values.HostDescription) -> msg.HostDescription:
     """Return a host's description as a message."""
-    return msg.HostDescription(
-        name=host.name, hostname=host.hostname, incarnation=host.incarnation, pid=host.pid,
-        software_version=host.software_version, labels=pairs(host.labels),
-        resources=[
-            msg.ResourceDescription(
-                slot=slot, name=resource.name, unit=resource.unit, capacity=resource.capacity,
-                scope=resource.scope,
-            )
-            for slot, resource in enumerate(host.resources)
-        ],
-        max_processes=host.max_processes, period=host.period, executors=list(host.executors),
-        absent=pairs(host.absent),
-    )  # fmt: skip
+    resources = [
+        _to_msg(msg.ResourceDescription, resource, slot=slot)
+        for slot, resource in enumerate(host.resources)
+    ]
+    return _to_msg(msg.HostDescription, host, resources=resources)
 
 
 def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
@@ -285,41 +287,29 @@ def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
             )
     if not 0.0 < message.period < _INFINITE:
         raise Refused(f"host {message.name!r}: it reports every {message.period} s")
-    return values.HostDescription(
-        name=message.name, incarnation=message.incarnation, hostname=message.hostname,
-        pid=message.pid, software_version=message.software_version, labels=mapping(message.labels),
-        resources=tuple(
-            values.ResourceDescription(r.name, r.unit, r.capacity, r.scope) for r in resources
-        ),
-        max_processes=message.max_processes, period=message.period,
-        executors=tuple(message.executors), absent=mapping(message.absent),
-    )  # fmt: skip
+    return _description(message, resources)
+
+
+def _description(
+    message: msg.HostDescription, resources: Iterable[msg.ResourceDescription]
+) -> values.HostDescription:
+    described = tuple(_from_msg(values.ResourceDescription, resource) for resource in resources)
+    return _from_msg(values.HostDescription, message, resources=described)
 
 
 def status_to_msg(status: values.InstanceStatus) -> msg.ProcessStatus:
     """Return an instance's status as a message."""
-    return msg.ProcessStatus(
-        instance=instance_to_msg(status.instance), state=status.state.value, pid=status.pid,
-        exit_code=status.exit_code, exit_signal=status.exit_signal, restarts=status.restarts,
-        peak_memory=float(status.peak_memory), cpu_time=float(status.cpu_time),
-        run_time=float(status.run_time), message=status.message,
-    )  # fmt: skip
+    return _to_msg(msg.ProcessStatus, status)
 
 
 def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
     """Return the inverse of `status_to_msg`; raises `Refused` for an invalid status."""
-    try:
-        state = values.InstanceState(message.state)
-    except ValueError as error:
-        raise Refused(f"unknown state {message.state!r} of {message.instance.process}") from error
+    if message.state not in _STATES:
+        raise Refused(f"unknown state {message.state!r} of {message.instance.process}")
     for name in ("peak_memory", "cpu_time", "run_time"):
         if not 0.0 <= getattr(message, name) < _INFINITE:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
-    return values.InstanceStatus(
-        instance_from_msg(message.instance), state, message.pid, message.exit_code,
-        message.exit_signal, message.restarts, message.peak_memory, message.cpu_time,
-        message.run_time, message.message,
-    )  # fmt: skip
+    return _from_msg(values.InstanceStatus, message)
 
 
 def kept_to_msg(kept: values.KeptState) -> msg.KeptState:
@@ -367,56 +357,37 @@ def host_row_from_msg(message: msg.HostState) -> HostRow:
             message.stale, strict=True,
         )
     )  # fmt: skip
-    description = message.description
-    return HostRow(
-        values.HostDescription(
-            description.name, description.incarnation, description.hostname, description.pid,
-            description.software_version, mapping(description.labels),
-            tuple(values.ResourceDescription(r.name, r.unit, r.capacity, r.scope)
-                  for r in description.resources),
-            description.max_processes, description.period, tuple(description.executors),
-            mapping(description.absent),
-        ),
-        message.host_id, message.state, message.cordoned, message.draining, message.accepting,
-        message.reading_age, resources, message.processes, message.drained,
-    )  # fmt: skip
+    description = _description(message.description, message.description.resources)
+    return _from_msg(HostRow, message, description=description, resources=resources)
 
 
 def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
     """Return a row of `rosrm ps` as a message."""
-    fields = {name: getattr(row, name) for name in ProcessRow.__slots__}
     known = row.exit_code is not None
-    return msg.ProcessState(**fields | {"exit_code": row.exit_code or 0, "exit_code_known": known})
+    return _to_msg(msg.ProcessState, row, exit_code=row.exit_code or 0, exit_code_known=known)
 
 
 def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
     """Return the inverse of `process_row_to_msg`."""
-    fields = {name: getattr(message, name) for name in ProcessRow.__slots__}
-    fields["cpu"] = _fraction(message.cpu)
-    return ProcessRow(**fields if message.exit_code_known else fields | {"exit_code": None})
+    exit_code = message.exit_code if message.exit_code_known else None
+    return _from_msg(ProcessRow, message, cpu=_fraction(message.cpu), exit_code=exit_code)
 
 
 def plugin_row_to_msg(row: PluginRow) -> msg.PluginState:
     """Return a row of `rosrm plugins` as a message."""
-    return msg.PluginState(**{name: getattr(row, name) for name in PluginRow.__slots__})
+    return _to_msg(msg.PluginState, row)
 
 
 def plugin_row_from_msg(message: msg.PluginState) -> PluginRow:
     """Return the inverse of `plugin_row_to_msg`."""
-    return PluginRow(**{name: getattr(message, name) for name in PluginRow.__slots__})
+    return _from_msg(PluginRow, message)
 
 
 def event_to_msg(row: EventRow) -> msg.Event:
     """Return a line of the event record as a message."""
-    return msg.Event(
-        sequence=row.sequence, wall_time=row.wall_time, elapsed=row.elapsed, kind=row.kind,
-        process=row.process, host=row.host, message=row.message, data=json.dumps(dict(row.facts)),
-    )  # fmt: skip
+    return _to_msg(msg.Event, row, data=json.dumps(dict(row.facts)))
 
 
 def event_from_msg(message: msg.Event) -> EventRow:
     """Return the inverse of `event_to_msg`."""
-    return EventRow(
-        message.sequence, message.wall_time, message.elapsed, message.kind, message.process,
-        message.host, message.message, json_object(message.data, "an event"),
-    )  # fmt: skip
+    return _from_msg(EventRow, message, facts=json_object(message.data, "an event"))

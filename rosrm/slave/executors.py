@@ -9,19 +9,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from rosrm.core.master.events import BAD_RESULT
 from rosrm.errors import Refused, RosrmError, describe_fault, describe_plugin_fault
 from rosrm.extensions.discovery import definition
 from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given
 from rosrm.extensions.registry import Executor, OfferedExecutor
+from rosrm.ros.slave.services import ExecutorOutcome
 
-#: Takes the outcome: "" or the code of a failure, the reason of a failure, the result as JSON.
-Done = Callable[[str, str, str], None]
-#: Code of a failure that the executor reports by a `ValueError` or an error of rosrm. Such a
-#: failure is a valid answer, not an error of the plugin.
-UNABLE: Final = "unable"
+#: Takes the outcome of an executor.
+Done = Callable[[ExecutorOutcome], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,18 +109,18 @@ class Executors:
         timer.daemon = True
         told = {**arguments, "here": here.as_json()}
 
-        def settle(code: str, message: str, result: str) -> None:
-            if code and code != UNABLE:
-                where = f" ({place})" if code == BAD_RESULT else ""
-                self._fail(strategy, f"executor {message}{where}")
-            else:
+        def settle(outcome: ExecutorOutcome) -> None:
+            if outcome.code in ("", "unable"):
                 self._work(strategy)
-            done(code, message, result)
+            else:
+                where = f" ({place})" if outcome.code == "bad_result" else ""
+                self._fail(strategy, f"executor {outcome.message}{where}")
+            done(outcome)
 
         def work() -> None:
             outcome = _outcome(name, function, told)
             timer.cancel()
-            self._post(partial(settle, *outcome))
+            self._post(partial(settle, outcome))
 
         threading.Thread(target=work, name=f"executor {name}", daemon=True).start()
         if timeout > 0.0:
@@ -142,22 +139,24 @@ class Executors:
             self._changed(f"migration strategy {strategy} works again")
 
 
-def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Run an executor; return the arguments of `Done`."""
+def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> ExecutorOutcome:
+    """Run an executor; return its outcome."""
     try:
         result: object = function(arguments)
         if not isinstance(result, Mapping):
-            return BAD_RESULT, f"{name} answered {given(result)}; a JSON object is required", ""
+            wrong = f"{name} answered {given(result)}; a JSON object is required"
+            return ExecutorOutcome("bad_result", wrong)
         strange = _no_json(result, "")
         if strange:
-            return BAD_RESULT, f"{name} answered something that is no JSON: {strange}", ""
-        return "", "", json.dumps(result, default=dict)
+            wrong = f"{name} answered something that is no JSON: {strange}"
+            return ExecutorOutcome("bad_result", wrong)
+        return ExecutorOutcome("", result=json.dumps(result, default=dict))
     except RosrmError as error:
-        return UNABLE, str(error), ""
+        return ExecutorOutcome("unable", str(error))
     except ValueError as error:
-        return UNABLE, f"{name}: {describe_fault(error)}", ""
+        return ExecutorOutcome("unable", f"{name}: {describe_fault(error)}")
     except BaseException as error:  # noqa: BLE001 - a third party's code, which may call sys.exit
-        return "failed", f"{name} raised {describe_plugin_fault(error)}", ""
+        return ExecutorOutcome("failed", f"{name} raised {describe_plugin_fault(error)}")
 
 
 def _no_json(value: object, path: str) -> str:

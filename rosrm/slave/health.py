@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from rosrm.core.slave.reducer import Held, Look, LookedAt, Watch
+from rosrm.core.slave.events import LookedAt
+from rosrm.core.slave.state import Held
+from rosrm.core.slave.watches import Look, Watch
 from rosrm.model.values import InstanceId
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave.graph import GraphWatch

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosrm.errors import Refused
+from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
-from rosrm.ros.slave.endpoint import LogQuery, LogSlice
-from rosrm.supervisor import log_index
-from rosrm.supervisor.client import log_path, logged_instances, newest_log
+from rosrm.ros.slave.services import LogQuery
+from rosrm.supervisor import log_index, paths
+from rosrm.supervisor.client import log_path
 
 #: Most bytes in one answer.
 _MOST: Final = 1 << 20
@@ -32,7 +33,7 @@ class _Segment(NamedTuple):
     end: int
 
 
-def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice:
+def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
     """Read a part of an instance's output.
 
     Args:
@@ -45,7 +46,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice
     """
     instance = InstanceId(query.process, query.number)
     path = log_path(state_directory, instance)
-    numbers = tuple(logged_instances(state_directory, query.process))
+    numbers = tuple(_logged(state_directory, query.process))
     for _ in range(_TRIES):
         before = log_index.base(str(path))
         try:
@@ -61,15 +62,23 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice
 
 def newest_instance(state_directory: Path, process: str) -> InstanceId:
     """Return the newest instance of a process that has a log here; raises `Refused`."""
-    newest = newest_log(state_directory, process)
-    if newest is None:
+    numbers = _logged(state_directory, process)
+    if not numbers:
         raise Refused(f"this host has no log of {process}", "unknown")
-    return newest
+    return InstanceId(process, numbers[-1])
 
 
-def nothing_yet(query: LogQuery) -> LogSlice:
+def nothing_yet(query: LogQuery) -> LogPart:
     """Return an empty answer for an instance that is starting, whose file does not exist yet."""
-    return LogSlice(query.number, (), b"", query.offset, query.offset, False, ())
+    return LogPart(query.number, (), b"", query.offset, query.offset, False, ())
+
+
+def _logged(state_directory: Path, process: str) -> list[int]:
+    """Return the numbers of the instances of a process that have a log, ascending."""
+    wanted = paths.safe_name(process)
+    folder = Path(paths.log_folder(str(state_directory)))
+    found = [paths.log_number(path.name) for path in folder.glob("*.log")]
+    return sorted(log[1] for log in found if log is not None and log[0] == wanted)
 
 
 def _segments(path: Path) -> list[_Segment]:
@@ -91,7 +100,7 @@ def _segments(path: Path) -> list[_Segment]:
 def _read(
     path: Path, segments: Sequence[_Segment], query: LogQuery, numbers: Sequence[int], *,
     ended: bool,
-) -> LogSlice:  # fmt: skip
+) -> LogPart:  # fmt: skip
     last = segments[-1].end
     offset = min(_start(segments, query), last)
     found = next((one for one in segments if one.end > offset), segments[-1])
@@ -102,7 +111,7 @@ def _read(
         content = log.read(min(query.max_bytes or _MOST, _MOST))
     marks, end = _marks(found, offset, offset + len(content), now=found.path == path)
     content = content[: end - offset]
-    return LogSlice(query.number, numbers, content, offset, end, ended and end >= last, marks)
+    return LogPart(query.number, numbers, content, offset, end, ended and end >= last, marks)
 
 
 def _start(segments: Sequence[_Segment], query: LogQuery) -> int:

@@ -17,25 +17,31 @@ from typing import Any, Final
 import numpy as np
 
 from rosrm.config.settings import HostConfig
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, reducer
+from rosrm.core.slave.events import Event, Registered, TimePassed
+from rosrm.core.slave.health import LOOK_PERIOD
+from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
+from rosrm.model.orders import RunExecutor, SetRestartPolicy
+from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
     InstanceId,
     InstanceState,
     InstanceStatus,
-    KeptState,
     RestartPolicy,
 )
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
-from rosrm.ros.slave.endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
+from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalSeen
 from rosrm.ros.slave.replication import KeptEndpoint
+from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.executors import Done, Executors, Here
@@ -88,10 +94,10 @@ class SlaveRuntime:
         self._stopping = ""
         self._accepting = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
-        self._state = core.SlaveState(
+        self._state = SlaveState(
             max_processes=config.max_processes, max_starting=config.max_starting, max_age=max_age
         )
-        self._events: deque[core.Event] = deque()
+        self._events: deque[Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
         self._executors = Executors(
@@ -108,7 +114,7 @@ class SlaveRuntime:
             offered = registry.launchers(
                 LauncherContext(config.state, sys.executable, self._incarnation)
             )
-            launchers = Launchers.of(offered, registry.capabilities_of(), self.say)
+            launchers = Launchers.of(offered, registry.capabilities_of())
             sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions)
             context = ProbeContext(config.scope, config.budget, config.state, sessions)
@@ -119,9 +125,9 @@ class SlaveRuntime:
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_stop_signals(self._stop)
             self._supervisor = SupervisorLink(
-                config.state / "supervisor", config.logs, post=self._post, take=self.take,
-                follow=self._follow_session, say=self.say,
-                ended=self._supervisor_ended,
+                config.state / "supervisor", config.logs, post=self._post, take=self._take,
+                follow=self._follow_session,
+                ended=lambda fault: self._ending.note_supervisor_left(fault),  # noqa: PLW0108 - made later
             )  # fmt: skip
             opened.callback(self._supervisor.close)
             self._participant = Participant(
@@ -132,31 +138,36 @@ class SlaveRuntime:
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._limit = self._limits()
             self._endpoint = SlaveEndpoint(
-                self._participant,
-                self,
-                self._description(probes.absent),
-                max_age,
-                JournalSeen(config.state / "journal_seen"),
-            )
+                self._participant, self._description(probes.absent), self._state, take=self._take,
+                kept_states=lambda: self._keeping.states(),  # noqa: PLW0108 - made later
+                seen=JournalSeen(config.state / "journal_seen"),
+            )  # fmt: skip
             self._note_probes(first)
             self._endpoint.failing.update(self._executors.failing_plugins())
             for name, reason in offered.broken.items():
                 self._endpoint.failing["launcher", name] = reason
             for strategy, reason in self._executors.failing.items():
-                self.say(f"migration strategy {strategy} is broken: {reason}")
+                _log.info("migration strategy %s is broken: %s", strategy, reason)
             kept = config.state / "kept"
             self._keeping = Keeping(
                 kept, config.host, config.keep,
                 KeptEndpoint(self._participant, config.host),
-                post=self._post, say=self.say, publish=self._endpoint.publish_kept,
+                post=self._post, publish=self._endpoint.publish_kept,
             )  # fmt: skip
+            duties = Duties(
+                self._take, self._set_restart, self._keeping.keep, self._drop_kept, self._execute,
+                self._read_log,
+            )  # fmt: skip
+            SlaveServices(
+                self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch
+            )
             self._starter = Starter(
                 config, kept, self._state, self._supervisor, self._endpoint, self._keeping, graph,
-                sessions, launchers, take=self.take, say=self.say,
+                sessions, launchers, take=self._take,
             )  # fmt: skip
             self._ending = Ending(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
-                serve=self._serve, say=self.say,
+                serve=self._serve,
             )  # fmt: skip
             self._closing = opened.pop_all()
         self._adopt()
@@ -181,7 +192,7 @@ class SlaveRuntime:
         held = self._supervisor.take_over()
         self._work(time.monotonic())
         if held:
-            self.say(self._found(held))
+            _log.info("%s", self._found(held))
 
     def _found(self, held: int) -> str:
         """Return a sentence about the processes that a former run of the slave had started."""
@@ -223,11 +234,12 @@ class SlaveRuntime:
             reached = self._is_registered
             code = self._ending.carry_out(self._stopping)
             if not reached:
-                self.say(
-                    f"the master was not reached within {_MASTER_PATIENCE:g} s and does not know "
-                    f"of these ends: it lists the processes as before. The next start of this "
-                    f"slave reports them, or another `rosrm slave {STOP_ALL}`"
-                )
+                _log.info(
+                    "the master was not reached within %g s and does not know of these ends: it "
+                    "lists the processes as before. The next start of this slave reports them, or "
+                    "another `rosrm slave %s`",
+                    _MASTER_PATIENCE, STOP_ALL,
+                )  # fmt: skip
             return code
 
     @property
@@ -245,18 +257,18 @@ class SlaveRuntime:
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
                 self._usage.look(now)
-                self.take(core.TimePassed())  # `_cycle` may be rare, and fences need this
+                self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
                 self._starter.look_at_graph(awaited)
             if now >= next_health:
-                next_health = now + core.LOOK_PERIOD
+                next_health = now + LOOK_PERIOD
                 self._events.extend(self._health.look(self._state.watched(), now))
             searches = self._endpoint.link is Link.SEARCHING and not self._ending.has_begun
             if searches and now - told >= _PATIENCE_TOLD:
                 told = now
-                self.say(f"looking for a master on {self._config.ros.describe()}")
+                _log.info("looking for a master on %s", self._config.ros.describe())
             self._work(now)
             wake = min(next_sample, next_usage, next_graph if awaited else next_sample)
             wake = min(wake, next_health) if self._health.watches else wake
@@ -268,11 +280,8 @@ class SlaveRuntime:
 
     def _stop(self, number: int, _frame: Any) -> None:
         if self._stopping:  # the handler may interrupt a log call: the loop logs instead
-            self._from_threads.append(self._say_progress)
+            self._from_threads.append(lambda: self._ending.say_progress())  # noqa: PLW0108 - as above
         self._stopping = self._stopping or signal.Signals(number).name
-
-    def _say_progress(self) -> None:
-        self._ending.say_progress()
 
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
@@ -283,20 +292,20 @@ class SlaveRuntime:
             self._note_probes(sample.reports)
             self._endpoint.publish_statuses((), complete=False)
         present = self._sampler.present
-        under = core.under_limits(sample.usage, self._limit, present, sample.stale)
+        under = under_limits(sample.usage, self._limit, present, sample.stale)
         self._accepting = under and not (self._stopping or self._ending.has_begun)
         self._endpoint.publish_reading(
             sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),
         )  # fmt: skip
         self._say_usage()
-        self.take(core.TimePassed())
+        self._take(TimePassed())
 
     def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
         """Log which readings became stale or fresh again, and report that to the master."""
         failing = self._endpoint.failing
         for report in reports:
-            self.say(str(report))
+            _log.info("%s", report)
             for resource in report.resources or (report.probe,):
                 if report.stale:
                     failing["probe", resource] = f"probe {report.probe}: {report.reason}"
@@ -305,7 +314,7 @@ class SlaveRuntime:
 
     def _note_executors(self, message: str) -> None:
         """Log which migration strategy fails or works again, and report that to the master."""
-        self.say(message)
+        _log.info("%s", message)
         failing = self._endpoint.failing
         for plugin in [one for one in failing if one[0] == "migration"]:
             del failing[plugin]
@@ -323,10 +332,10 @@ class SlaveRuntime:
 
     # --- core and supervisor -------------------------------------------------------------
 
-    def take(self, event: core.Event) -> None:
+    def _take(self, event: Event) -> None:
         """Queue an event for the core."""
         self._events.append(event)
-        if isinstance(event, core.Registered):
+        if isinstance(event, Registered):
             self._keeping.say_again()
             if self._endpoint.failing:
                 self._endpoint.publish_statuses((), complete=False)
@@ -334,7 +343,9 @@ class SlaveRuntime:
     def _post(self, call: Callable[[], None]) -> None:
         """Schedule a call in the loop; may be called from any thread."""
         self._from_threads.append(call)
-        self._wake()
+        # The participant may be closed already when the last messages of the supervisor arrive.
+        with contextlib.suppress(Exception):
+            self._participant.wake()
 
     def _work(self, now: float) -> None:
         """Pass all queued events to the core, and execute its commands."""
@@ -344,69 +355,49 @@ class SlaveRuntime:
             events = list(self._events)
             self._events.clear()
             reported: list[InstanceStatus] = []
-            for command in core.step_all(self._state, events, now):
-                if isinstance(command, core.Report) and not command.complete:
+            for command in reducer.step_all(self._state, events, now):
+                if isinstance(command, commands.Report) and not command.complete:
                     reported += command.statuses
                 else:
                     self._carry_out(command)
             if reported:
                 self._endpoint.publish_statuses(reported, complete=False)
 
-    def _carry_out(self, command: core.Command) -> None:
-        if isinstance(command, core.Launch):
+    def _carry_out(self, command: commands.Command) -> None:
+        if isinstance(command, commands.Launch):
             if not self._ending.keeps:  # the master expects no new start
                 self._starter.launch(command.assignments)
-        elif isinstance(command, core.Report):
+        elif isinstance(command, commands.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
-        elif isinstance(command, core.Settle):
+        elif isinstance(command, commands.Settle):
             for settled in self._unsettled.pop((command.instance, command.restart), []):
                 settled(command.refusal)
         else:
             self._have_supervisor(command)
 
-    def _have_supervisor(self, command: core.Command) -> None:
+    def _have_supervisor(self, command: commands.Command) -> None:
         """Send a command to the supervisor, unless the instance still waits for its start."""
         if self._starter.call_off(command):
             return
-        if isinstance(command, core.Fail):
-            self.say(f"{command.instance} is {command.reason}")
-        if isinstance(command, core.Restart):  # on request of a user
+        if isinstance(command, commands.Fail):
+            _log.info("%s is %s", command.instance, command.reason)
+        if isinstance(command, commands.Restart):  # on request of a user
             self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
-
-    def _wake(self) -> None:
-        # The participant may be closed already when the last messages of the supervisor arrive.
-        with contextlib.suppress(Exception):
-            self._participant.wake()
-
-    def _supervisor_ended(self, fault: str) -> None:
-        self._ending.note_supervisor_left(fault)
 
     def _follow_session(self, status: InstanceStatus) -> None:
         self._usage.follow(status)
         if status.state.ended:
             self._starter.ended(status.instance)
 
-    # --- calls of the endpoint -----------------------------------------------------------
+    # --- requests of the master, and of readers of logs ----------------------------------
 
-    def statuses(self) -> Sequence[InstanceStatus]:
-        """Return the statuses of all instances on this host."""
-        return self._state.statuses()
-
-    def kept_states(self) -> Sequence[KeptState]:
-        """Return all snapshots on this host."""
-        return self._keeping.states()
-
-    def set_restart(self, instance: InstanceId, restart: RestartPolicy, settled: Settled) -> None:
+    def _set_restart(self, order: SetRestartPolicy, settled: Settled) -> None:
         """Set the restart policy of an instance; call `settled` when the supervisor recorded it."""
-        self._unsettled.setdefault((instance, restart), []).append(settled)
-        self.take(core.RestartPolicySet(instance, restart))
+        self._unsettled.setdefault((order.instance, order.restart), []).append(settled)
+        self._take(event_of(order))
 
-    def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
-        """Replicate the snapshots of an instance to these hosts from now on."""
-        self._keeping.keep(instance, hosts, every)
-
-    def drop_kept(self, instance: InstanceId) -> None:
+    def _drop_kept(self, instance: InstanceId) -> None:
         """Delete the snapshots of a process, of instances up to this one."""
         lives = any(
             one.process == instance.process and one.number <= instance.number
@@ -415,11 +406,7 @@ class SlaveRuntime:
         )
         self._keeping.drop(instance, lives=lives)
 
-    def say(self, message: str) -> None:
-        """Log a message for the user."""
-        _log.info("%s", message)
-
-    def read_log(self, query: LogQuery) -> LogSlice:
+    def _read_log(self, query: LogQuery) -> LogPart:
         """Return a part of a log; raises `Refused`."""
         if not query.number:
             query = replace(query, number=self._newest_instance(query.process).number)
@@ -438,12 +425,13 @@ class SlaveRuntime:
             return InstanceId(process, max(held))
         return newest_instance(self._supervisor.state, process)
 
-    def execute(self, executor: str, arguments: dict[str, Any], timeout: float, done: Done) -> None:
+    def _execute(self, order: RunExecutor, done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""
         held = self._state.held.items()
         pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
         here = Here(self._config.host, self._config.state, pids)
-        self._executors.execute(executor, arguments, timeout, here=here, done=done)
+        arguments = dict(order.arguments)
+        self._executors.execute(order.executor, arguments, order.timeout, here=here, done=done)
 
 
 def _random_number() -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from rosrm.config.settings import HostConfig
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import InstanceState, InstanceStatus, StopPolicy
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.slave.launch.starter import Starter
@@ -38,7 +38,6 @@ class Ending:
         supervisor: stops them.
         endpoint: informs the master.
         serve: runs the loop of the slave while its argument returns True.
-        say: logs a message for the user.
         has_begun: the slave accepts no more work.
         keeps: the slave starts no more processes, because it has reported the running ones to the
             master.
@@ -46,12 +45,11 @@ class Ending:
     """
 
     config: HostConfig
-    state: core.SlaveState
+    state: SlaveState
     starter: Starter
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint
     serve: Callable[[Callable[[], bool]], None]
-    say: Callable[[str], None]
     has_begun: bool = False
     keeps: bool = False
     supervisor_left: bool = False
@@ -85,11 +83,11 @@ class Ending:
             self.keeps = True
             self._inform_master(begun)
             keep = counted(len(running), "process keeps", "processes keep")
-            self.say(
-                f"slave of {self.config.host} ended ({cause or 'refused'}); {keep} running "
-                f"(supervisor pid {self.supervisor.pid}). Start the slave again to manage "
-                f"them, or stop them by `rosrm slave {STOP_ALL}` with the same --config"
-            )
+            _log.info(
+                "slave of %s ended (%s); %s running (supervisor pid %d). Start the slave again to "
+                "manage them, or stop them by `rosrm slave %s` with the same --config",
+                self.config.host, cause or "refused", keep, self.supervisor.pid, STOP_ALL,
+            )  # fmt: skip
             return 1 if failure else 0
         live = self.state.live()
         if live and failure and not self.endpoint.superseded and cause != STOP_ALL:
@@ -99,7 +97,7 @@ class Ending:
         if live:
             count = counted(live, "process", "processes")
             self._kill_at = self._next_kill()
-            self.say(f"stopping {count} ({cause or 'refused'}){self._kill_after()}")
+            _log.info("stopping %s (%s)%s", count, cause or "refused", self._kill_after())
         self.starter.close()
         self._inform_master()
         return self._stop_processes(1 if failure else 0, live, cause)
@@ -109,7 +107,7 @@ class Ending:
         left = _live(self._begun())
         if self._kill_at and left:
             names = listed(str(one.instance) for one in left)
-            self.say(f"still stopping {names}{self._kill_after()}")
+            _log.info("still stopping %s%s", names, self._kill_after())
 
     def _fail_without_supervisor(self) -> int:
         left = _live(self._begun())
@@ -136,7 +134,7 @@ class Ending:
         self.endpoint.wait_until_heard()
         part = "supervisor" if cause == STOP_ALL else "slave"
         count = counted(live, "process was stopped", "processes were stopped")
-        self.say(f"{part} of {self.config.host} ended; {count}")
+        _log.info("%s of %s ended; %s", part, self.config.host, count)
         return code
 
     def _inform_master(self, kept: Sequence[InstanceStatus] = ()) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,22 +11,22 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.config.settings import LogSettings
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, events
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.launch.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
 from rosrm.supervisor.client import (
-    Amended,
-    LaunchOrder,
-    LogLimits,
     SupervisorClient,
     SupervisorEnded,
     SupervisorGone,
     SupervisorSilent,
-    Told,
 )
+from rosrm.supervisor.client_values import Amended, LaunchOrder, Told
+from rosrm.supervisor.logs import LogLimits
 from rosrm.wording import counted
+
+_log = logging.getLogger("rosrm.slave")
 
 #: Seconds for a new supervisor to be ready, or for a busy one to answer.
 _PATIENCE: Final = 30.0
@@ -48,7 +49,6 @@ class SupervisorLink:
         post: schedules a call in the loop; may be called from any thread.
         take: takes events for the core.
         follow: takes each new status of an instance.
-        say: logs a message for the user.
         ended: called once, when there is no supervisor any more, with the fault; "": the supervisor
             ended as requested.
 
@@ -58,13 +58,12 @@ class SupervisorLink:
 
     def __init__(
         self, state: Path, logs: LogSettings, *, post: Callable[[Callable[[], None]], None],
-        take: Callable[[core.Event], None], follow: Callable[[InstanceStatus], None],
-        say: Callable[[str], None], ended: Callable[[str], None],
+        take: Callable[[events.Event], None], follow: Callable[[InstanceStatus], None],
+        ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.state = state
         self._limits = LogLimits(logs.max_bytes, logs.keep)
-        self._post, self._take, self._follow = post, take, follow
-        self._say, self._ended = say, ended
+        self._post, self._take, self._follow, self._ended = post, take, follow, ended
         self._is_shutting_down = False
         self._is_closed = False
         self._told_waits = False
@@ -91,7 +90,7 @@ class SupervisorLink:
             self._client.start(orders)
         self._say_if_it_waits()
 
-    def carry_out(self, command: core.Command) -> None:
+    def carry_out(self, command: commands.Command) -> None:
         """Send a command of the core."""
         with contextlib.suppress(SupervisorGone):
             self._tell(command)
@@ -100,31 +99,32 @@ class SupervisorLink:
     def _say_if_it_waits(self) -> None:
         waits = self._client.waits
         if waits > _TOLD_AFTER and not self._told_waits:
-            self._say(
-                f"the supervisor (pid {self._client.pid}) has accepted no order for {waits:.0f} s: "
-                f"is it stopped? Orders wait until it continues"
-            )
+            _log.info(
+                "the supervisor (pid %d) has accepted no order for %.0f s: is it stopped? Orders "
+                "wait until it continues",
+                self._client.pid, waits,
+            )  # fmt: skip
         self._told_waits = waits > _TOLD_AFTER
 
-    def _tell(self, command: core.Command) -> None:
+    def _tell(self, command: commands.Command) -> None:
         client = self._client
-        if isinstance(command, core.Stop | core.Fence):
+        if isinstance(command, commands.Stop | commands.Fence):
             self._unanswered.pop(command.instance, None)
-        if isinstance(command, core.Stop):
+        if isinstance(command, commands.Stop):
             client.stop(command.instance)
-        elif isinstance(command, core.Fence):
+        elif isinstance(command, commands.Fence):
             client.fence(command.instance)
-        elif isinstance(command, core.Restart):
+        elif isinstance(command, commands.Restart):
             client.restart(command.instance)
-        elif isinstance(command, core.Renew):
+        elif isinstance(command, commands.Renew):
             client.heard(command.at, command.alive)
-        elif isinstance(command, core.Fail):
+        elif isinstance(command, commands.Fail):
             client.fail(command.instance, command.pid, command.reason, kill=command.kill)
-        elif isinstance(command, core.Amend):
+        elif isinstance(command, commands.Amend):
             client.amend(command.instance, command.restart, {SHADOW: None})
-        elif isinstance(command, core.Remember):
+        elif isinstance(command, commands.Remember):
             client.remember(command.instance, to_memo(command.memo))
-        elif isinstance(command, core.Forget):
+        elif isinstance(command, commands.Forget):
             client.forget(command.instances)
         else:
             raise TypeError(command)
@@ -164,7 +164,7 @@ class SupervisorLink:
         except (SupervisorGone, SupervisorEnded) as gone:  # ended: by a SIGTERM to it alone
             if self._is_shutting_down or self._is_closed:
                 raise
-            self._post(partial(self._say, f"{gone}; connecting to the next one"))
+            _log.info("%s; connecting to the next one", gone)
 
     def _next(self) -> SupervisorClient:
         """Return a connection to the next supervisor, or to the same one if it was silent."""
@@ -176,7 +176,7 @@ class SupervisorLink:
                 if self._is_closed:
                     raise
                 if not told:
-                    self._post(partial(self._say, f"{silence}; waiting until it does"))
+                    _log.info("%s; waiting until it does", silence)
                 told = True
 
     def _take_told(self, told: Sequence[Told]) -> None:
@@ -184,10 +184,10 @@ class SupervisorLink:
         for status in statuses:
             self._unanswered.pop(status.instance, None)
             self._follow(status)
-        self._take(core.SupervisorReported(statuses))
+        self._take(events.SupervisorReported(statuses))
         for one in told:
             if isinstance(one, Amended):
-                self._take(core.RestartPolicyRecorded(one.instance, one.restart))
+                self._take(events.RestartPolicyRecorded(one.instance, one.restart))
 
     def take_over(self) -> int:
         """Re-adopt the supervisor's instances; instances unknown to the supervisor do not run.
@@ -197,13 +197,13 @@ class SupervisorLink:
         """
         client = self._client
         for note in client.notes:
-            self._say(note)
+            _log.info("%s", note)
         for status in client.instances:
             self._follow(status)
         found = {one: from_memo(memo) for one, memo in client.memos.items()}
         memos = {one: memo for one, memo in found.items() if memo is not None}
         statuses = [*client.instances, *self._launch_again(client)]
-        self._take(core.SupervisorReplaced(tuple(statuses), memos, client.fenced))
+        self._take(events.SupervisorReplaced(tuple(statuses), memos, client.fenced))
         return len(client.instances)
 
     def _launch_again(self, client: SupervisorClient) -> list[InstanceStatus]:
@@ -226,7 +226,7 @@ class SupervisorLink:
         live = sum(not status.state.ended for status in client.instances) + len(self._unanswered)
         which = "the same" if client.pid == former.pid else "a new"
         manages = counted(live, "process", "processes")
-        self._say(f"{which} supervisor (pid {client.pid}) manages {manages}")
+        _log.info("%s supervisor (pid %d) manages %s", which, client.pid, manages)
         if self._is_shutting_down:  # the former one may have missed it
             self.shut_down()
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rosrm.core.supervisor.reducer import (
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,
@@ -40,20 +40,6 @@ from rosrm.supervisor.send_buffer import MOST_UNSENT, Outgoing, Overfull
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = [
-    "Amended",
-    "LaunchOrder",
-    "LogLimits",
-    "SupervisorClient",
-    "SupervisorEnded",
-    "SupervisorGone",
-    "SupervisorSilent",
-    "Told",
-    "log_path",
-    "logged_instances",
-    "newest_log",
-]
-
 DEFAULT_LOG_LIMITS: Final = LogLimits()
 _CHUNK: Final = 1 << 16
 
@@ -76,20 +62,6 @@ class SupervisorEnded(SupervisorError):
 def log_path(state_directory: Path, instance: InstanceId) -> Path:
     """Return the log file of an instance; older parts have `.1`, `.2`, ... appended."""
     return Path(paths.log_file(str(state_directory), instance.process, instance.number))
-
-
-def logged_instances(state_directory: Path, process: str) -> list[int]:
-    """Return the numbers of the instances of a process that have a log, ascending."""
-    wanted = paths.safe_name(process)
-    folder = Path(paths.log_folder(str(state_directory)))
-    found = [paths.log_number(path.name) for path in folder.glob("*.log")]
-    return sorted(log[1] for log in found if log is not None and log[0] == wanted)
-
-
-def newest_log(state_directory: Path, process: str) -> InstanceId | None:
-    """Return the newest instance of a process that has a log; None: there is none (any more)."""
-    numbers = logged_instances(state_directory, process)
-    return InstanceId(process, numbers[-1]) if numbers else None
 
 
 class SupervisorClient:

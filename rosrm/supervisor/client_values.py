@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rosrm.core.supervisor.reducer import FenceRule, RestartRule, StopRule
+from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 from rosrm.model.values import (
     Fence,
     InstanceId,

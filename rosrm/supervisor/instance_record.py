@@ -19,7 +19,9 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
-from rosrm.core.supervisor.reducer import Instance, Key, Supervision
+from rosrm.core.supervisor.instance import Instance
+from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 
-from rosrm.core.supervisor.reducer import Heard
+from rosrm.core.supervisor.events import Heard
 from rosrm.supervisor import own_log, paths, procfs
 
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Collection, Container, Iterable
 from typing import Final, NamedTuple
 
-from rosrm.core.supervisor.reducer import Key
+from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import log_index, own_log, paths
 from rosrm.supervisor.log_index import Mark
 

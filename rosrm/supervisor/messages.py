@@ -55,21 +55,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from rosrm.core.supervisor.reducer import (
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,
-    FenceRule,
     Forgotten,
     Heard,
-    Instance,
-    Key,
     RestartOrdered,
-    RestartRule,
     ShutdownOrdered,
     StopOrdered,
-    StopRule,
 )
+from rosrm.core.supervisor.instance import Instance
+from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.supervisor.json_lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
 
@@ -165,17 +162,8 @@ class Status(NamedTuple):
     def of(cls, instance: Instance) -> Status:
         """Return the status that is sent for an instance."""
         return cls(
-            instance.key,
-            instance.phase,
-            instance.pid,
-            instance.exit_code,
-            instance.exit_signal,
-            instance.restarts,
-            instance.peak_memory,
-            instance.cpu_time,
-            instance.run_time,
-            instance.message,
-        )
+            instance.key, instance.phase, *(getattr(instance, name) for name in cls._fields[2:])
+        )  # fmt: skip
 
 
 # --- orders -----------------------------------------------------------------------------------
@@ -187,48 +175,37 @@ def encode_order(order: Order) -> bytes:
 
 
 _WORDS: Final[Mapping[type, str]] = {
+    Hello: "hello",
+    Environment: "environment",
+    Launch: "start",
     StopOrdered: "stop",
     FenceOrdered: "fence",
     Heard: "heard",
     RestartOrdered: "restart",
     FailOrdered: "fail",
+    Amend: "amend",
+    Remember: "remember",
+    Forget: "forget",
+    ShutdownOrdered: "shutdown",
 }
 
 
 def _order_fields(order: Order) -> dict[str, Any]:
-    if isinstance(order, Hello):
-        return {"do": "hello", "protocol": order.protocol, "pid": order.pid, "log": order.log}
+    fields = order._asdict()
     if isinstance(order, Environment):
-        return {"do": "environment", "id": order.id, "variables": dict(order.variables)}
-    if isinstance(order, Launch):
-        return {"do": "start", **launch_fields(order)}
-    if isinstance(order, (StopOrdered, FenceOrdered, Heard, RestartOrdered, FailOrdered)):
-        return {"do": _WORDS[type(order)], **order._asdict()}
-    if isinstance(order, Amend):
-        instance, restart = order.order
-        changes = dict(order.changes)
-        return {"do": "amend", "instance": instance, "restart": restart, "changes": changes}
-    if isinstance(order, Remember):
-        return {"do": "remember", "instance": order.instance, "memo": order.memo}
-    if isinstance(order, Forget):
-        return {"do": "forget", "instances": [forgotten.instance for forgotten in order.instances]}
-    return {"do": "shutdown"}
+        fields["variables"] = dict(order.variables)
+    elif isinstance(order, Launch):
+        fields = launch_fields(order)
+    elif isinstance(order, Amend):
+        fields = {**order.order._asdict(), "changes": dict(order.changes)}
+    elif isinstance(order, Forget):
+        fields = {"instances": [forgotten.instance for forgotten in order.instances]}
+    return {"do": _WORDS[type(order)], **fields}
 
 
 def launch_fields(launch: Launch) -> dict[str, Any]:
     """Return a launch in values that JSON can hold; the record stores the same form."""
-    return {
-        "instance": launch.instance,
-        "argv": launch.argv,
-        "environment": launch.environment,
-        "changes": dict(launch.changes),
-        "directory": launch.directory,
-        "restart": launch.restart,
-        "stop": launch.stop,
-        "fence": launch.fence,
-        "heard": launch.heard,
-        "memo": launch.memo,
-    }
+    return {**launch._asdict(), "changes": dict(launch.changes)}
 
 
 def decode_order(text: bytes) -> Order:

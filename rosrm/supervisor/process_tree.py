@@ -13,7 +13,9 @@ import selectors
 import signal
 from collections.abc import Callable, Iterable
 
-from rosrm.core.supervisor.reducer import UNKNOWN_EXIT, Cleared, Event, Exited, Key
+from rosrm.core.supervisor.events import Cleared, Event, Exited
+from rosrm.core.supervisor.instance import UNKNOWN_EXIT
+from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.procfs import Stat
 

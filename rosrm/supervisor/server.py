@@ -15,8 +15,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from rosrm.core.supervisor import reducer
-from rosrm.core.supervisor.reducer import Event, Key, Spawned, SpawnFailed
+from rosrm.core.supervisor import commands, events
+from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
+from rosrm.core.supervisor.instance import STOPPING
+from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import lease_file, messages, own_log, paths, procfs, spawn, takeover
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.instance_record import Record
@@ -46,7 +49,7 @@ class Server:
         self._state = state
         self._listener = listener
         self._selector = selectors.DefaultSelector()
-        self._core = reducer.Supervision()
+        self._core = Supervision()
         self._family = Family(state, self._selector, self._happened)
         self._record = Record(state)
         self._heard_at = lease_file.LastHeard(state)
@@ -88,7 +91,7 @@ class Server:
             # After a SIGSTOP of this process: messages that came in time count first.
             self._take_in(0.0)
         if self._is_due():
-            self._happened(reducer.TimePassed())
+            self._happened(events.TimePassed())
         now = time.monotonic()
         self._logs.look(now)
         self._spawn_some()
@@ -123,16 +126,16 @@ class Server:
         for command in self._core.handle(event, time.monotonic()):
             self._execute(command)
 
-    def _execute(self, command: reducer.Command) -> None:
-        if isinstance(command, reducer.Tell):
+    def _execute(self, command: commands.Command) -> None:
+        if isinstance(command, commands.Tell):
             self._note_status(command.instance)
-        elif isinstance(command, reducer.Spawn):
+        elif isinstance(command, commands.Spawn):
             self._spawns.append(command.instance)
-        elif isinstance(command, reducer.Signal):
+        elif isinstance(command, commands.Signal):
             self._family.signal(command.instance, command.number)
-        elif isinstance(command, reducer.Unspawn):
+        elif isinstance(command, commands.Unspawn):
             self._unspawn(command.instance)
-        elif isinstance(command, reducer.Drop):
+        elif isinstance(command, commands.Drop):
             self._record.dead(command.instance, self._core.dead[command.instance[0]])
         else:
             self._leaving = True
@@ -142,7 +145,7 @@ class Server:
         if instance.ended:
             self._launches.pop(key, None)
             self._logs.release(key)
-        if not instance.pid and instance.phase != reducer.STOPPING:
+        if not instance.pid and instance.phase != STOPPING:
             self._family.release(key)
         self._record.state(instance, self._family.birth(key))
         self._telling.append(messages.encode_status(messages.Status.of(instance)))
@@ -275,7 +278,7 @@ class Server:
         elif isinstance(order, messages.Forget):
             for forgotten in order.instances:
                 self._happened(forgotten)
-        elif isinstance(order, reducer.Heard):
+        elif isinstance(order, events.Heard):
             self._renew(order)
         else:
             self._happened(order)
@@ -321,14 +324,14 @@ class Server:
             self._launches[launch.instance] = launch
             self._record.launch(launch)
         self._happened(
-            reducer.StartOrdered(
+            events.StartOrdered(
                 launch.instance, launch.restart, launch.stop, launch.fence, launch.heard or None
             )
         )
 
-    def _renew(self, order: reducer.Heard) -> None:
+    def _renew(self, order: events.Heard) -> None:
         now = time.monotonic()
-        newest = reducer.Heard(min(order.at, now), min(order.alive, now))
+        newest = events.Heard(min(order.at, now), min(order.alive, now))
         self._heard_at.keep(newest)
         self._happened(newest)
 
@@ -371,7 +374,7 @@ class Server:
         connection.close()
         if connection is self._client:
             self._client = None
-            self._happened(reducer.ClientLost())
+            self._happened(events.ClientLost())
 
     # --- signals ------------------------------------------------------------------------------
 
@@ -391,7 +394,7 @@ class Server:
         if signal.SIGCHLD in numbers:
             self._family.reap()
         if signal.SIGTERM in numbers:
-            self._happened(reducer.ShutdownOrdered())
+            self._happened(events.ShutdownOrdered())
 
     def _watch(self, file: socket.socket | Connection, call: Callable[[], None]) -> None:
         self._selector.register(file, selectors.EVENT_READ, call)

@@ -14,18 +14,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from rosrm.core.supervisor import reducer
-from rosrm.core.supervisor.reducer import (
-    UNKNOWN_EXIT,
-    Cleared,
-    Event,
-    Exited,
-    Instance,
-    Resumed,
-    Spawned,
-    SpawnFailed,
-    Supervision,
-)
+from rosrm.core.supervisor.events import Cleared, Event, Exited, Resumed, Spawned, SpawnFailed
+from rosrm.core.supervisor.instance import RUNNING, STARTING, STOPPING, UNKNOWN_EXIT, Instance
+from rosrm.core.supervisor.reducer import Supervision
 from rosrm.supervisor import instance_record, lease_file, procfs
 from rosrm.supervisor.instance_record import Recorded
 from rosrm.supervisor.process_tree import Family, mark
@@ -75,9 +66,9 @@ def what_happened(
     marked = procfs.find_marked(state) if waiting else {}
     for instance in waiting:
         left = marked.get(mark(instance.key), [])
-        if instance.phase == reducer.STARTING:
+        if instance.phase == STARTING:
             yield _start_of(instance, left, recorded, family)
-        elif instance.phase in (reducer.RUNNING, reducer.STOPPING):
+        elif instance.phase in (RUNNING, STOPPING):
             yield from _end_of(instance, left, family)
 
 

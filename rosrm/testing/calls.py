@@ -16,6 +16,7 @@ from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import FailedProbe, Registry
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import to_plain
+from rosrm.model.rows import PluginKind
 
 T = TypeVar("T")
 
@@ -70,11 +71,11 @@ def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str,
     return dict(to_plain(value))
 
 
-def made(kind: str, offer: ChosenOffer, options: Mapping[str, Any], *context: Any) -> Any:
+def made(kind: PluginKind, offer: ChosenOffer, options: Mapping[str, Any], *context: Any) -> Any:
     """Return the object of an offer, created and checked as by master or slave.
 
     Args:
-        kind: as in `Registry.offer`.
+        kind: of the plugin.
         offer: of the plugin.
         options: in the form of a file.
         context: of a probe.

@@ -16,6 +16,7 @@ from rosrm.extensions.contracts import Imaging, MigrationOffer, MigrationStrateg
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.extensions.time_limit import CALL_LIMIT
+from rosrm.model.codec import checked
 from rosrm.model.plan import (
     Aim,
     Commit,
@@ -30,7 +31,6 @@ from rosrm.model.plan import (
     Stop,
 )
 from rosrm.model.plan import plan_fault as fault_of
-from rosrm.model.plan_json import checked_plan
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 from rosrm.testing.calls import ContractBroken, as_json, call, checked_options, made
 
@@ -120,7 +120,7 @@ class MigrationContract:
                 assert not fault, f"the plan of {hook} is unsound: {fault}"
                 again = _plan(hook, partial(make, here))
                 assert again == plan, f"{hook} gave another plan for the same move"
-                assert checked_plan(plan) == plan, f"the journal changes the plan of {hook}"
+                assert checked(plan, "plan") == plan, f"the journal changes the plan of {hook}"
 
     def test_periodic_checkpoints_are_sound(self) -> None:
         """Each periodic checkpoint is a step on the instance's host, distinct for each time.
@@ -200,7 +200,7 @@ class MigrationContract:
         """A restarted master reads the identical plan from its journal."""
         for move in self.moves():
             plan = self._plan(self.make(), move)
-            assert checked_plan(plan) == plan, "the journal gives back another plan"
+            assert checked(plan, "plan") == plan, "the journal gives back another plan"
 
     def test_a_shadow_is_released_after_the_commit(self) -> None:
         """A shadow gets the restart policy of its spec after the commit, and not before.
@@ -333,9 +333,9 @@ def before_commit(plan: Plan) -> Sequence[Step]:
 def _plan(hook: str, ask: Callable[[], Plan]) -> Plan:
     """Return a plan, with the time limit and checks of the master."""
 
-    def checked() -> Plan:
+    def sound() -> Plan:
         plan = required(ask(), Plan)
-        checked_plan(plan)
+        checked(plan, "plan")
         return plan
 
-    return call(hook, CALL_LIMIT, checked)
+    return call(hook, CALL_LIMIT, sound)

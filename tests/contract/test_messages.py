@@ -29,11 +29,12 @@ from rosrm.testing import (
     ScoringContract,
 )
 
+#: Offer, method of the plugin, and first test of each contract.
 KINDS = {
-    ProbeContract: (ProbeOffer, "read"),
-    ScoringContract: (ScoringOffer, "score"),
-    MigrationContract: (MigrationOffer, "propose"),
-    CheckpointContract: (CheckpointOffer, "choose"),
+    ProbeContract: (ProbeOffer, "read", "test_reads_each_resource_once"),
+    ScoringContract: (ScoringOffer, "score", "test_is_pure"),
+    MigrationContract: (MigrationOffer, "propose", "test_can_be_undone_before_the_commit"),
+    CheckpointContract: (CheckpointOffer, "choose", "test_chooses_hosts_that_are_there"),
 }
 
 
@@ -46,11 +47,7 @@ class _Options:
 def contract_of(kind, thing, **fields):
     """Return the contract of an offer that creates one plugin object."""
     contract = kind()
-    offer, _ = KINDS[kind]
-    if offer is ProbeOffer:
-        contract.offer = ProbeOffer("a", lambda options, context: thing, **fields)
-    else:
-        contract.offer = offer("a", lambda options: thing, **fields)
+    contract.offer = KINDS[kind][0]("a", lambda *_: thing, **fields)
     return contract
 
 
@@ -61,12 +58,8 @@ def thing_of(kind, answer):
     return thing
 
 
-FIRST = {
-    ProbeContract: "test_reads_each_resource_once",
-    ScoringContract: "test_is_pure",
-    MigrationContract: "test_can_be_undone_before_the_commit",
-    CheckpointContract: "test_chooses_hosts_that_are_there",
-}
+def run_first(contract):
+    getattr(contract, KINDS[type(contract)][2])()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -74,14 +67,14 @@ def test_an_answer_of_another_type_is_named(kind):
     """The message names the type of the answer, not an attribute that the answer lacks."""
     contract = contract_of(kind, thing_of(kind, lambda: 5))
     with pytest.raises(AssertionError, match=r"answered a int; [\w ]+ is required"):
-        getattr(contract, FIRST[kind])()
+        run_first(contract)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_object_without_its_method_is_named(kind):
     """The message names the missing method, as `rosrm config check` does."""
     with pytest.raises(AssertionError, match=r"made None; an object with .* is required"):
-        getattr(contract_of(kind, None), FIRST[kind])()
+        run_first(contract_of(kind, None))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -100,7 +93,7 @@ def test_a_call_that_takes_too_long_is_ended_and_named(kind, stubborn, monkeypat
     fields = {"deadline": 0.05} if kind is ProbeContract else {}
     contract = contract_of(kind, thing_of(kind, hang), **fields)
     with pytest.raises(AssertionError, match=rf"^{KINDS[kind][1]} took longer than 0\.05 s"):
-        getattr(contract, FIRST[kind])()
+        run_first(contract)
 
 
 def test_an_executor_that_hangs_is_ended_after_the_timeout_of_its_step(tmp_path):

@@ -43,7 +43,7 @@ class TestHandoffAsInThePaper(MigrationContract):
     offer = OFFERS["handoff"]
     options: ClassVar = {"protocol": "paper", "state": "/p/state", "type": "std_msgs/msg/Int64"}
     spec = ProcessSpec("p", command=("true",), ros=True)
-    not_called: ClassVar = {"handoff_watch": "needs a ROS graph: tests/ros/test_watching.py"}
+    not_called: ClassVar = {"handoff_watch": "needs a ROS graph: tests/ros/test_handoff_watch.py"}
 
     def moves(self):
         """Return moves of processes that may overlap: both instances are briefly active."""
@@ -75,20 +75,9 @@ def test_each_shipped_strategy_is_here():
 def _sound(move):
     """Return a sound plan: start on the destination, wait, stop the source, each with its undo."""
     source = Stop(move.source, move.source_host, 10.0)
-    return Plan(
-        (
-            Start(
-                move.destination,
-                move.destination_host,
-                10.0,
-                undo=Stop(move.destination, move.destination_host, 10.0),
-            ),
-            AwaitReady(move.destination, move.destination_host, 30.0),
-            Commit(),
-            source,
-        ),
-        overlap=20.0,
-    )
+    there = (move.destination, move.destination_host)
+    start = Start(*there, 10.0, undo=Stop(*there, 10.0))
+    return Plan((start, AwaitReady(*there, 30.0), Commit(), source), overlap=20.0)
 
 
 def _changed(**change):
@@ -102,14 +91,9 @@ def _changed(**change):
 
 
 def _handing_over(
-    *,
-    aborts=True,
-    resumes=True,
-    releases=True,
-    gives_back=True,
-    alias="p_1",
+    *, aborts=True, resumes=True, releases=True, gives_back=True, alias="p_1",
     phase=HandoffPhase.SWITCH,
-):
+):  # fmt: skip
     """Return a strategy that proposes a handoff with one fault."""
 
     def propose(move):
@@ -150,10 +134,7 @@ def _handing_over(
         (_handing_over(gives_back=False), "test_a_source_that_is_not_restarted"),
         (_changed(timeout=object()), "test_survives_the_journal"),
         (_sound, "test_an_overlap_is_declared"),  # the plan overlaps although the process may not
-        (
-            lambda move: Plan((Execute("unknown", "a", {}, 1.0), Commit())),
-            "test_executors_are_its_own",
-        ),
+        (lambda move: Plan((Execute("unknown", "a", {}, 1.0), Commit())), "test_executors_are_its"),
     ],
 )
 def test_contract_catches(propose, test):
@@ -191,9 +172,8 @@ class _Sleepy:
 
 
 def _stop_first(move):
-    stop = Stop(
-        move.source, move.source_host, 10.0, undo=Start(move.fallback, move.source_host, 10.0)
-    )
+    undo = Start(move.fallback, move.source_host, 10.0)
+    stop = Stop(move.source, move.source_host, 10.0, undo=undo)
     return Plan((stop, *_sound(move).steps[:3]))
 
 

@@ -55,7 +55,7 @@ def test_defaults_survive_the_way_to_the_slave(name):
         ("criu", {"leave_timeout": 0}, "greater than 0"),
         ("other-host", {"every": 0}, "greater than 0"),
         ("other-host", {"copies": 0}, "is not within 1"),
-        ("threshold", {"enter": 0.5, "leave": 0.6}, "must be below enter"),
+        ("threshold", {"enter": 0.5, "leave": 0.6}, r"leave \(0.6\) must be below enter \(0.5\)"),
     ],
 )
 def test_nonsense_is_refused(name, given, what):

@@ -89,16 +89,9 @@ class _Leaking(FakeProbe):
 _LEAKED = []
 
 
-class _Nameless(FakeProbe):
-    resources = (ResourceDescription("", "1", 1.0),)
-
-
-class _Unitless(FakeProbe):
-    resources = (ResourceDescription("a", None, 1.0),)
-
-
-class _Boundless(FakeProbe):
-    resources = (ResourceDescription("a", "1", 0.0),)
+def _described(*description):
+    """Return a class of probes with this description of a resource."""
+    return type("Described", (FakeProbe,), {"resources": (ResourceDescription(*description),)})
 
 
 class _Chatty(FakeProbe):
@@ -109,12 +102,11 @@ class _Chatty(FakeProbe):
 @pytest.mark.parametrize(
     ("make", "test"),
     [
-        (_Nameless, "test_resources_are_well_described"),
-        (_Boundless, "test_resources_are_well_described"),
-        (_Unitless, "test_resources_are_well_described"),
+        (_described("", "1", 1.0), "test_resources_are_well_described"),
+        (_described("a", "1", 0.0), "test_resources_are_well_described"),
+        (_described("a", None, 1.0), "test_resources_are_well_described"),
         (lambda: FakeProbe(undeclared=0.1), "test_resources_are_well_described"),
         (lambda: FakeProbe(a=float("nan")), "test_reads_each_resource_once"),
-        (lambda: FakeProbe(a=-0.1), "test_reads_each_resource_once"),
         (lambda: _Chatty(a=0.1), "test_reads_each_resource_once"),
         (_Leaking, "test_close_releases_files"),
     ],

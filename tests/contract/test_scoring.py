@@ -40,11 +40,6 @@ class _Relative:
         return Scores(memory - (memory.mean() if len(memory) else 0.0))
 
 
-class _NaN:
-    def score(self, hosts, process):
-        return Scores(hosts.usage[:, -1] * 1.0)
-
-
 class _Standing:
     buffer = np.zeros(0)
 
@@ -91,7 +86,6 @@ def test_an_undeclared_field_fails_the_contract_with_its_name():
     ("policy", "test"),
     [
         (_Relative, "test_rows_are_independent"),
-        (_NaN, "test_scores_every_host"),
         (_Words, "test_scores_every_host"),
         (_Standing, "test_is_pure"),
         (_Mutating, "test_is_pure"),

@@ -15,7 +15,7 @@ import pytest
 from rosrm.config.settings import LivenessSettings, MigrationSettings, ProcessDefaults
 from rosrm.errors import Refused
 from rosrm_criu.engine import restore_result
-from tests.faults.watching import instances
+from tests.faults.handoff_watcher import instances
 from tests.ros.clusters import MIB, PATIENCE, host, python, wait_until
 
 pytestmark = pytest.mark.timeout(180)

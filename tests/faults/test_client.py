@@ -10,10 +10,11 @@ import pytest
 from rosrm.errors import Refused
 from rosrm.ros.client import MasterClient, is_unsure
 from rosrm.ros.control import accepted, refused
-from tests.ros.clusters import PATIENCE, host, service
+from tests.ros.clusters import host, service
+from tests.waiting import PATIENCE
 
 
-def test_what_a_killed_master_may_have_taken_is_not_called_undone(make_cluster) -> None:
+def test_the_outcome_of_a_request_to_a_killed_master_is_unsure(make_cluster) -> None:
     """The next run of the master executes the request, or rejects it as too old: then "unsure"."""
     cluster = make_cluster(host("h0"))
     cluster.client.list()
@@ -37,25 +38,19 @@ def test_what_a_killed_master_may_have_taken_is_not_called_undone(make_cluster) 
         asking = threading.Thread(target=submit)
         asking.start()
         asking.join(1.0)
-        master.send_signal(signal.SIGKILL)
-        master.wait(PATIENCE)
-        cluster.reconnect()
-        cluster.start_master()
+        cluster.restart_master()
         asking.join(PATIENCE)
     finally:
         client.close()
     assert said in (["unsure"], ["done"])
 
 
-def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> None:
+def test_a_request_to_another_run_of_the_master_is_repeated(make_cluster) -> None:
     """The former run never got the request, so the client that greeted that run repeats it."""
     cluster = make_cluster(host("h0"))
     with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
         client.list()
-        cluster.master.process.send_signal(signal.SIGKILL)
-        cluster.master.process.wait(PATIENCE)
-        cluster.reconnect()
-        cluster.start_master()
+        cluster.restart_master()
         cluster.wait_for_hosts()
         client._heard += 1000.0  # the client greeted the former run just now
         client.submit([service("p")])
@@ -72,8 +67,6 @@ def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> No
         (refused("invalid", "no such field"), False),  # independent of the run
     ],
 )
-def test_a_refusal_by_another_run_of_the_master_leaves_it_open_what_was_done(
-    answer, unsure
-) -> None:
+def test_a_refusal_by_another_run_of_the_master_is_unsure(answer, unsure) -> None:
     """A repeated request may be refused because the former run has executed it."""
     assert is_unsure(answer, 1) is unsure

@@ -18,7 +18,7 @@ import pytest
 from rosrm.config.settings import LivenessSettings
 from rosrm.model.values import HostLossPolicy
 from rosrm_criu.engine import restore_result
-from tests.faults.watching import instances
+from tests.faults.handoff_watcher import instances
 from tests.ros.clusters import PATIENCE
 from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
-import time
+
+import pytest
 
 from rosrm.config.settings import ControlSettings, LivenessSettings
 from rosrm.model.values import HostLossPolicy, IsolationPolicy
 from tests.faults.test_host_loss import held
-from tests.ros.clusters import PATIENCE, alive, host, service, wait_gone, wait_until
+from tests.ros.clusters import alive, host, service
+from tests.waiting import wait_gone, wait_until
 
 SOON = {
     "liveness": LivenessSettings(suspect=1.0, lease=4.0),
@@ -17,32 +19,39 @@ SOON = {
 }
 
 
-def both(cluster, after: float = 2.0):
-    """Start a singleton that stops when its host is isolated, and a driver that does not."""
-    stop = IsolationPolicy("stop", after)
-    cluster.submit(service("singleton", isolation=stop), service("driver"))
-    return cluster.wait("singleton", "running"), cluster.wait("driver", "running")
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    return make_shared(host("h0"), **SOON)
 
 
-def test_the_supervisor_of_a_stopped_slave_fences(make_cluster) -> None:
+@pytest.fixture
+def both(cluster):
+    """Yield a function that starts a singleton, which stops when its host is isolated.
+
+    It starts a driver, too, which does not stop, and returns both rows.
+    """
+
+    def start(after: float = 2.0):
+        stop = IsolationPolicy("stop", after)
+        cluster.submit(service("singleton", isolation=stop), service("driver"))
+        return cluster.wait("singleton", "running"), cluster.wait("driver", "running")
+
+    yield start
+    cluster.cancel("singleton", "driver")
+
+
+def test_the_supervisor_of_a_stopped_slave_fences(cluster, both) -> None:
     """The singleton runs again when the slave resumes; the driver never stops."""
-    cluster = make_cluster(host("h0"), **SOON)
-    singleton, driver = both(cluster)
+    singleton, driver = both()
     with held(cluster, "h0"):
         wait_gone(singleton.pid)
         assert alive(driver.pid)
-    again = cluster.wait_until(
-        "the singleton runs again",
-        lambda v: any(
-            (row.name, row.state, row.pid != singleton.pid) == ("singleton", "running", True)
-            for row in v.processes
-        ),
-    )
-    assert {row.name: row.restarts for row in again.processes}["singleton"] == 0
+    again = cluster.wait("singleton", "running", where=lambda row: row.pid != singleton.pid)
+    assert again.restarts == 0
     assert cluster.wait("driver", "running").pid == driver.pid
 
 
-def test_it_has_ended_when_its_successor_starts(make_cluster) -> None:
+def test_a_singleton_has_ended_when_its_successor_starts(make_cluster) -> None:
     """The old singleton ends before its successor starts, in a time derived from the lease."""
     liveness = LivenessSettings(suspect=2.0, lease=6.0)
     cluster = make_cluster(host("h0"), host("h1"), **{**SOON, "liveness": liveness})
@@ -57,35 +66,29 @@ def test_it_has_ended_when_its_successor_starts(make_cluster) -> None:
     assert cluster.wait("singleton", "running").host != before.host
 
 
-def test_without_a_master_nobody_hears_the_host(make_cluster) -> None:
+def test_a_slave_without_a_master_fences(cluster, both) -> None:
     """An isolated slave stops its singletons; the next master has them started again."""
-    cluster = make_cluster(host("h0"), **SOON)
-    singleton, driver = both(cluster)
-    cluster.master.process.kill()
-    cluster.master.process.wait(PATIENCE)
+    singleton, driver = both()
+    cluster.end(cluster.master, signal.SIGKILL)
     wait_gone(singleton.pid)
     assert alive(driver.pid)
     cluster.start_master()
     cluster.reconnect()
-    assert cluster.wait("singleton", "running").pid != singleton.pid
+    cluster.wait("singleton", "running", where=lambda row: row.pid != singleton.pid)
     assert cluster.wait("driver", "running").pid == driver.pid
 
 
-def test_a_singleton_that_is_heard_goes_on_whoever_is_killed(make_cluster) -> None:
+def test_kills_of_supervisor_and_slave_fence_nothing(cluster, both) -> None:
     """The next supervisor and the next slave know the time of the host's last contact."""
-    cluster = make_cluster(host("h0"), **SOON)
     after = 8.0  # seconds; a killed slave is back before
-    singleton, driver = both(cluster, after)
-    lock = cluster.directory / "hosts" / "h0" / "supervisor" / "supervisor.lock"
-    first = int(lock.read_text())
+    singleton, driver = both(after)
+    first = cluster.supervisor("h0")
     os.kill(first, signal.SIGKILL)
-    wait_until(lambda: lock.read_text().strip() not in ("", str(first)), "another supervisor")
-    slave = cluster.slaves["h0"].process
-    slave.kill()
-    slave.wait(PATIENCE)
+    wait_until(lambda: cluster.supervisor("h0") != first, "another supervisor")
     cluster.start_slave_again("h0")
-    until = time.monotonic() + after + 1.0
-    wait_until(lambda: time.monotonic() > until, "longer than its fence")
+    cluster.stays(
+        after + 1.0, lambda: alive(singleton.pid) and alive(driver.pid), "longer than its fence"
+    )
     rows = [cluster.wait(name, "running").pid for name in ("singleton", "driver")]
     assert rows == [singleton.pid, driver.pid]
     with held(cluster, "h0"):

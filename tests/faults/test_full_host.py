@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import signal
-
 import pytest
 
 from rosrm.config.settings import LivenessSettings
 from rosrm.model.values import RestartPolicy
 from tests.faults.disks import small_disk
-from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service
+from tests.ros.clusters import alive, clusters, host, job, service
 
 LIVENESS = LivenessSettings(suspect=3.0, lease=60.0)
 
@@ -27,7 +25,7 @@ def cluster(disk, tmp_path):
         yield make(host("h0"), liveness=LIVENESS)
 
 
-def test_what_runs_goes_on_and_what_cannot_start_says_why(cluster, disk) -> None:
+def test_a_start_that_cannot_be_recorded_fails_with_the_reason(cluster, disk) -> None:
     """Listings and events of the process name the file that cannot be written.
 
     The restart policy retries the start, which succeeds when there is room.
@@ -56,9 +54,6 @@ def test_a_slave_starts_again_on_a_full_disk(cluster, disk) -> None:
     cluster.submit(service("runs"))
     pid = cluster.wait("runs", "running").pid
     disk.fill()
-    slave = cluster.slaves["h0"].process
-    slave.send_signal(signal.SIGKILL)
-    slave.wait(PATIENCE)
-    cluster.start_slave_again(cluster.hosts[0].host)
+    cluster.start_slave_again("h0")
     assert cluster.wait("runs", "running").pid == pid
     disk.make_room()

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.faults.scenes import Scene
-from tests.faults.watching import blocks
+from tests.faults.handoff_scene import Scene
+from tests.faults.handoff_watcher import blocks
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -36,14 +36,14 @@ def scene(make_shared):
 
 
 @pytest.fixture(scope="module")
-def deaf(make_shared):
+def stubborn(make_shared):
     """A scene like `scene`, whose process ends by SIGKILL only."""
-    one = Scene(make_shared, "count", module="tests.ros.programs.deaf")
+    one = Scene(make_shared, "count", module="tests.ros.programs.blocks_signals")
     yield one
     one.close()
 
 
-def strike(scene: Scene, victim: str, moment: str) -> str:
+def inject(scene: Scene, victim: str, moment: str) -> str:
     """Kill the victim at a moment; return "moved" or "stayed"."""
     scene.move((moment, scene.kill(victim)))
     end = scene.end(victim)
@@ -56,7 +56,7 @@ def strike(scene: Scene, victim: str, moment: str) -> str:
 )
 def test_the_master_is_killed(scene, moment):
     """No output is lost or repeated: the next master continues the current step, or undoes it."""
-    strike(scene, "master", moment)
+    inject(scene, "master", moment)
     assert scene.is_gapless(), scene.outputs
 
 
@@ -73,14 +73,14 @@ def test_the_master_is_killed(scene, moment):
 )  # fmt: skip
 def test_a_slave_is_killed(scene, whose, moment):
     """The processes on the slave's host keep running; no output is lost or repeated."""
-    strike(scene, f"{whose}'s slave", moment)
+    inject(scene, f"{whose}'s slave", moment)
     assert scene.is_gapless(), scene.outputs
 
 
 @pytest.mark.parametrize("moment", ["destination running", *MOMENTS[3:]])
 def test_the_destination_is_killed(scene, moment):
     """The source continues without a gap, or, once the destination is active, a successor."""
-    strike(scene, "destination", moment)
+    inject(scene, "destination", moment)
     if moment not in MAY_BE_ACTIVE:
         assert scene.is_gapless(), scene.outputs
         assert len(blocks(scene.outputs)) == 1
@@ -89,7 +89,7 @@ def test_the_destination_is_killed(scene, moment):
 @pytest.mark.parametrize("moment", MOMENTS[:11])
 def test_the_source_is_killed(scene, moment):
     """From SWITCH on the source's state is not lost; before, its restart policy starts it again."""
-    strike(scene, "source", moment)
+    inject(scene, "source", moment)
     speakers = blocks(scene.outputs)
     assert len(speakers) <= 2, speakers
     if moment in MAY_BE_ACTIVE:
@@ -98,16 +98,16 @@ def test_the_source_is_killed(scene, moment):
         assert second[0].sequence in (first[-1].sequence, first[-1].sequence + 1)
 
 
-def test_a_source_that_will_not_die_is_killed(deaf):
+def test_a_source_that_ignores_signals_is_killed(stubborn):
     """The source blocks SIGINT and SIGTERM; SIGKILL ends it after its grace periods."""
-    deaf.move(("source stopping", deaf.leave_alone))
-    assert deaf.end() == "moved"
-    assert deaf.is_gapless()
+    stubborn.move(("source stopping", stubborn.leave_alone))
+    assert stubborn.end() == "moved"
+    assert stubborn.is_gapless()
 
 
 @pytest.mark.parametrize("victim", ["master", "source's slave"])
-def test_a_source_that_will_not_die_outlives_who_orders_its_end(deaf, victim):
+def test_a_stop_is_continued_when_its_sender_is_killed(stubborn, victim):
     """The supervisor continues the stop, or gets the order again from the restarted part."""
-    deaf.move(("source stopping", deaf.kill(victim)))
-    assert deaf.end(victim) == "moved"
-    assert deaf.is_gapless()
+    stubborn.move(("source stopping", stubborn.kill(victim)))
+    assert stubborn.end(victim) == "moved"
+    assert stubborn.is_gapless()

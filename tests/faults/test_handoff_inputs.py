@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.faults.scenes import RATE, Scene, all_of
-from tests.faults.watching import blocks
+from tests.faults.handoff_scene import RATE, Scene, all_of
+from tests.faults.handoff_watcher import blocks
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -21,20 +21,16 @@ def scene(make_shared):
     one.close()
 
 
-@pytest.mark.parametrize("moment", ["says SWITCH", "SILENT", "ACTIVE", "source stopping"])
-def test_the_master_is_killed(scene, moment):
-    """The node answers each input once and in order."""
-    scene.move((moment, scene.kill("master")))
-    scene.end("master")
-    assert scene.is_gapless(), scene.outputs
-
-
 @pytest.mark.parametrize(
-    ("whose", "moment"), [("source", "SILENT"), ("destination", "SILENT"), ("source", "ACTIVE")]
-)
-def test_a_slave_is_killed(scene, whose, moment):
+    ("victim", "moment"),
+    [
+        ("master", "says SWITCH"), ("master", "SILENT"), ("master", "ACTIVE"),
+        ("master", "source stopping"), ("source's slave", "SILENT"),
+        ("destination's slave", "SILENT"), ("source's slave", "ACTIVE"),
+    ],
+)  # fmt: skip
+def test_master_or_slave_is_killed(scene, victim, moment):
     """The node answers each input once and in order."""
-    victim = f"{whose}'s slave"
     scene.move((moment, scene.kill(victim)))
     scene.end(victim)
     assert scene.is_gapless(), scene.outputs
@@ -50,8 +46,8 @@ def test_the_destination_is_killed_before_the_switch(scene, moment):
 
 def test_the_destination_is_killed_in_the_switch(scene):
     """The source, already silent, answers its buffered inputs: each once and in order."""
-    blow = all_of(scene.kill("destination"), scene.let_go("source"))
-    scene.move(*scene.source_held(), ("SWITCHING", blow))
+    fault = all_of(scene.kill("destination"), scene.let_go("source"))
+    scene.move(*scene.source_held(), ("SWITCHING", fault))
     assert scene.end() == "stayed"
     assert scene.is_gapless(), scene.outputs
 

@@ -19,8 +19,9 @@ from rosrm.model.values import (
     RestartPolicy,
     StandbyPolicy,
 )
-from tests.faults.watching import Watcher, instances
-from tests.ros.clusters import QUICK, Cluster, alive, host, service, wait_until
+from tests.faults.handoff_watcher import Watcher, instances
+from tests.ros.clusters import QUICK, Cluster, alive, host, service
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 SOON = {
@@ -50,9 +51,13 @@ def held(cluster: Cluster, name: str) -> Iterator[None]:
         slave.send_signal(signal.SIGCONT)
 
 
-def test_a_process_goes_elsewhere_when_its_slave_hangs(make_cluster) -> None:
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    return make_shared(host("h0"), host("h1"), **SOON)
+
+
+def test_a_process_goes_elsewhere_when_its_slave_hangs(cluster) -> None:
     """The supervisor ends the old instance before the successor starts: never two at once."""
-    cluster = make_cluster(host("h0"), host("h1"), **SOON)
     deaf = """
 import signal, time
 for number in (signal.SIGINT, signal.SIGTERM):
@@ -69,16 +74,17 @@ time.sleep(999)
         assert after.host != before.host
     cluster.wait_for_event("host_back", host=before.host)
     assert set(instances(cluster, "p")) == {after.number}
+    cluster.cancel("p")
+    cluster.wait_for_hosts()
 
 
-def test_a_process_that_waits_for_its_host_is_kept_by_it(make_cluster) -> None:
+def test_a_process_that_waits_for_its_host_is_kept_by_it(cluster) -> None:
     """A process that waits for its host has no successor: the host still runs the same instance."""
-    cluster = make_cluster(host("h0"), host("h1"), **SOON)
-    cluster.submit(service("p"))
-    before = cluster.wait("p", "running")
+    cluster.submit(service("waits"))
+    before = cluster.wait("waits", "running")
     with held(cluster, before.host):
-        assert cluster.wait("p", "unreachable").host == before.host
-    after = cluster.wait("p", "running")
+        assert cluster.wait("waits", "unreachable").host == before.host
+    after = cluster.wait("waits", "running")
     assert (after.pid, after.number, after.host) == (before.pid, before.number, before.host)
 
 
@@ -87,16 +93,14 @@ def test_a_lost_host_comes_back_with_nothing(make_cluster) -> None:
     cluster = make_cluster(host("h0"), **SOON)
     again = RestartPolicy("on-failure", delay=0.1)
     cluster.submit(service("waits", restart=again), service("goes", host_loss=ELSEWHERE))
-    first = cluster.wait("waits", "running"), cluster.wait("goes", "running")
+    first = cluster.wait("waits", "running")
+    cluster.wait("goes", "running")
     cluster.add(host("h1"))
     cluster.switch_off("h0")
     assert cluster.wait("waits", "unreachable").host == "h0"
-    wait_until(
-        lambda: cluster.client.list() and cluster.wait("goes", "running").host == "h1",
-        "it runs on h1",
-    )
+    cluster.wait("goes", "running", host="h1")
     cluster.start_slave(cluster.hosts[0])
-    wait_until(lambda: cluster.wait("waits", "running").pid != first[0].pid, "it runs again")
+    cluster.wait("waits", "running", where=lambda row: row.pid != first.pid)
     assert cluster.wait("goes", "running").host == "h1"
 
 

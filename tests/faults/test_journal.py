@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import sqlite3
-import time
 from pathlib import Path
 
 import pytest
@@ -17,15 +16,11 @@ from rosrm.extensions.contracts import Intent
 from rosrm.journal.recovery import recover
 from rosrm.journal.sqlite import SqliteJournal
 from tests.faults.disks import small_disk
-from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service, wait_gone, wait_until
+from tests.ros.clusters import alive, clusters, host, job, service
+from tests.waiting import PATIENCE, wait_gone, wait_until
 
 #: Seconds. Short, because tests wait for the lease; a busy machine needs some room for suspect.
 LIVENESS = LivenessSettings(suspect=2.0, lease=5.0)
-
-
-def kill(part) -> None:
-    part.process.send_signal(signal.SIGKILL)
-    part.process.wait(PATIENCE)
 
 
 def files_of(cluster) -> list[Path]:
@@ -42,7 +37,7 @@ def boot_of(cluster) -> str:
 # --- a journal gap -----------------------------------------------------------------------------
 
 
-def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
+def test_a_journal_gap_is_reported_and_starts_nothing_twice(make_cluster) -> None:
     """A journal gap is reported, and no process runs twice.
 
     The state is that after a power failure: the newest records are gone, and hosts know them. Both
@@ -55,7 +50,7 @@ def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
     for name in ("h0", "h1"):
         cluster.client.set_host_state(name, "cordon")
     cluster.submit(service("queued"))
-    kill(cluster.master)
+    cluster.end(cluster.master, signal.SIGKILL)
     kept = {path: path.read_bytes() for path in files_of(cluster)}
     cluster.reconnect()
     cluster.start_master()
@@ -69,16 +64,17 @@ def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
     stranger = cluster.wait("after", "running").pid
     for _ in range(20):
         cluster.client.list()  # each beat carries the newest sequence to every host
-        time.sleep(0.02)
+        cluster.client.spin(0.02)
 
-    kill(cluster.master)
+    cluster.end(cluster.master, signal.SIGKILL)
     for path in files_of(cluster):
         path.unlink()
     for path, content in kept.items():
         path.write_bytes(content)
     for name in ("h0", "h1"):
-        kill(cluster.slaves[name])
-        cluster.start_slave(next(one for one in cluster.hosts if one.host == name))
+        cluster.end(cluster.slaves[name], signal.SIGKILL)
+    for one in cluster.hosts:
+        cluster.start_slave(one)
     cluster.reconnect()
     cluster.start_master()
     told = cluster.wait_for_event("journal_behind")
@@ -97,15 +93,15 @@ def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_after_a_fall_of_its_machine_the_master_hears_all_hosts_first(make_cluster, killed) -> None:
+def test_after_a_reboot_the_master_waits_for_all_hosts(make_cluster, killed) -> None:
     """After a reboot of its machine the master waits for all hosts to report.
 
     Its journal may have lost records that a disconnected host acts on. The master also waits when
     the first master after the reboot was killed before all hosts reported.
     """
     cluster = make_cluster(host("h0"), host("h1"), liveness=LIVENESS)
-    kill(cluster.master)
-    kill(cluster.slaves.pop("h1"))
+    for part in (cluster.master, cluster.slaves.pop("h1")):
+        cluster.end(part, signal.SIGKILL)
     with sqlite3.connect(files_of(cluster)[0]) as database:
         database.execute(
             "UPDATE intent SET value = json_set(value, '$.boot', 'another') WHERE key = 'epoch'"
@@ -114,15 +110,13 @@ def test_after_a_fall_of_its_machine_the_master_hears_all_hosts_first(make_clust
     cluster.start_master()
     if killed:
         wait_until(lambda: "another" not in boot_of(cluster), "the next boot is in the journal")
-        kill(cluster.master)
-        cluster.reconnect()
-        cluster.start_master()
+        cluster.restart_master()
     assert cluster.run(job("p", "true"))[0].state == "finished"
     kinds = [(event.kind, event.process or event.host) for event in cluster.events()]
     assert kinds.index(("assigned", "p")) > kinds.index(("host_lost", "h1"))
 
 
-# --- a damaged file ----------------------------------------------------------------------------
+# --- a damaged or lost file --------------------------------------------------------------------
 
 
 def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
@@ -132,8 +126,7 @@ def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
     pid = cluster.wait("p", "running").pid
     cluster.submit(*(job(f"j{n:03}", "true") for n in range(200)))
     cluster.ended("j199")
-    cluster.master.end()
-    cluster.master.process.wait(PATIENCE)
+    cluster.end(cluster.master, signal.SIGINT)
     journal = cluster.directory / "master" / "journal.sqlite"
     raw = bytearray(journal.read_bytes())
     leaves = [at for at in range(4096, len(raw), 4096) if b'"j100"' in raw[at : at + 4096]]
@@ -146,6 +139,7 @@ def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
     said = cluster.log_of("master")
     assert f"rosrm master: the journal {journal} cannot be used" in said
     assert "`--recover`" in said
+    assert "move it away" in said
     assert "Traceback" not in said
     assert alive(pid)
 
@@ -155,6 +149,39 @@ def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
     assert cluster.events("journal_recovered")
     assert cluster.wait("p", "running").pid == pid
     assert cluster.run(job("new", "true"))[0].state == "finished"
+
+
+def test_a_master_without_its_journal_starts_empty(make_cluster) -> None:
+    """Processes of the lost journal are stopped as unknown; their names are free, new work runs.
+
+    The slave sees no silence of the master, and the same epoch as before, or an older one.
+    """
+    # A master without the records that hosts have seen assigns no work for one lease.
+    cluster = make_cluster(host("h0"), liveness=LivenessSettings(lease=3.0))
+
+    def may_submit() -> bool:
+        with contextlib.suppress(Refused):  # until the slave has reported its end
+            return bool(cluster.submit(service("p")))
+        return False
+
+    for epoch in (1, 2):
+        if epoch == 2:
+            cluster.restart_master()
+            cluster.wait_for_hosts()
+        else:
+            cluster.submit(service("p"))
+        before = cluster.wait("p", "running")
+        cluster.end(cluster.master, signal.SIGKILL)
+        for path in files_of(cluster):
+            path.unlink()
+        cluster.reconnect()
+        cluster.start_master()
+        # The host registers before its open request for work is repeated.
+        cluster.wait_for_hosts()
+        assert "epoch 1" in cluster.events("master_started")[-1].message
+        wait_gone(before.pid)
+        wait_until(may_submit, "the end of the unknown process", pause=cluster.client.spin)
+        assert cluster.wait("p", "running").pid != before.pid
 
 
 def test_a_damaged_journal_on_a_full_disk_is_left_as_it_is(tmp_path) -> None:
@@ -183,7 +210,7 @@ def test_a_damaged_journal_on_a_full_disk_is_left_as_it_is(tmp_path) -> None:
 # --- a journal stall --------------------------------------------------------------------------
 
 
-def test_a_journal_that_somebody_else_holds_holds_new_work_up(make_cluster) -> None:
+def test_a_journal_locked_by_another_program(make_cluster) -> None:
     """The master resumes after another program releases its lock on the journal."""
     cluster = make_cluster(host("h0"), liveness=LIVENESS)
     cluster.submit(service("stays"), service("ends"))
@@ -220,8 +247,7 @@ def cluster(disk, tmp_path):
 
 def blocked(cluster) -> str:
     """Wait until the master takes no new work; return the reason."""
-    wait_until(lambda: cluster.client.list().trouble, "the master noticing its full disk")
-    return cluster.client.list().trouble
+    return wait_until(lambda: cluster.client.list().trouble, "the master noticing its full disk")
 
 
 def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
@@ -250,12 +276,9 @@ def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
         with pytest.raises(Refused, match="disk is full") as refusal:
             request()
         assert refusal.value.code == "journal"
-    kill(cluster.slaves["h1"])
+    cluster.end(cluster.slaves["h1"], signal.SIGKILL)
     cluster.start_slave(cluster.hosts[1])
-    until = time.monotonic() + LIVENESS.lease + 1.0
-    while time.monotonic() < until:
-        assert cluster.client.list().trouble
-        cluster.client.spin(0.1)
+    cluster.stays(LIVENESS.lease + 1.0, lambda: cluster.client.list().trouble, "the stall")
     assert not ran.exists()
     assert all(alive(pid) for name, pid in pids.items() if name != "ends")
 
@@ -280,7 +303,7 @@ def test_a_master_is_killed_while_its_disk_is_full(cluster, disk) -> None:
     disk.fill()
     os.kill(pids["ends"], signal.SIGKILL)
     blocked(cluster)
-    kill(cluster.master)
+    cluster.end(cluster.master, signal.SIGKILL)
     cluster.reconnect()
     assert cluster.start_master().process.wait(PATIENCE) == 1
     said = cluster.log_of("master")
@@ -300,8 +323,7 @@ def test_a_master_is_stopped_while_its_disk_is_full(cluster, disk) -> None:
     disk.fill()
     os.kill(pid, signal.SIGKILL)
     blocked(cluster)
-    cluster.master.end()
-    assert cluster.master.process.wait(PATIENCE) == 0
+    assert cluster.end(cluster.master, signal.SIGINT) == 0
     assert "Traceback" not in cluster.log_of("master")
     disk.make_room()
     cluster.reconnect()
@@ -309,7 +331,7 @@ def test_a_master_is_stopped_while_its_disk_is_full(cluster, disk) -> None:
     assert cluster.ended("ends").state == "failed"
 
 
-def test_whoever_asked_as_the_disk_became_full_is_told(cluster, disk) -> None:
+def test_a_request_while_the_disk_becomes_full(cluster, disk) -> None:
     """The answer waits for the journal; if the journal is late, the error gives the reason."""
     disk.fill()
     cluster.client._timeout = 1.0

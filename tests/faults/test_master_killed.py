@@ -9,7 +9,6 @@ import os
 import random
 import signal
 import threading
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -18,7 +17,8 @@ import pytest
 from rosrm.config.settings import LivenessSettings, MigrationSettings
 from rosrm.errors import NoMaster, Refused
 from rosrm.model.values import MigrationPolicy, RestartPolicy
-from tests.ros.clusters import PATIENCE, Cluster, alive, host, job, pids_of, python
+from tests.ros.clusters import Cluster, alive, host, job, pids_of, python
+from tests.waiting import PATIENCE, wait_until
 
 KILLS = int(os.environ.get("ROSRM_KILLS", "6"))
 SEED = int(os.environ.get("ROSRM_SEED", "1"))
@@ -155,11 +155,11 @@ def assert_in_order(assigned: list[str], sent: list[str]) -> None:
 
 def running(cluster: Cluster, name: str) -> set[int]:
     """Return the pids of all running processes under a name."""
-    deadline = time.monotonic() + PATIENCE
-    while True:
-        found = pids_of(cluster.directory)
-        pids = {pid for pid, line in found.items() if line.endswith(f"{cluster.directory} {name} ")}
-        pids = {pid for pid in pids if alive(pid)}
-        if len(pids) == 1 or time.monotonic() > deadline:
-            return pids
-        time.sleep(0.05)
+
+    def found() -> set[int]:
+        lines = pids_of(cluster.directory).items()
+        end = f"{cluster.directory} {name} "
+        return {pid for pid, line in lines if line.endswith(end) and alive(pid)}
+
+    wait_until(lambda: len(found()) == 1, f"one {name}", seen=found)
+    return found()

@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from tests.integration.lab.conftest import why_not
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Seconds: on a quiet machine it takes 30.
@@ -88,10 +89,10 @@ def test_a_signal_ends_the_simulated_slaves_and_their_master(tmp_path):
         stderr=subprocess.PIPE, text=True, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)},
     )  # fmt: skip
     try:
-        deadline = time.monotonic() + 90.0
-        while not any("registered" in log.read_text() for log in tmp_path.glob("*/scale.log")):
-            assert time.monotonic() < deadline, "no simulated slave was registered within 90 s"
-            time.sleep(0.1)  # poll interval of the log
+        wait_until(
+            lambda: any("registered" in log.read_text() for log in tmp_path.glob("*/scale.log")),
+            "a simulated slave is registered", 90.0,
+        )  # fmt: skip
         started = {one.pid for one in psutil.Process(process.pid).children(recursive=True)}
         assert len(started) >= 3, "the measurement, its master, its simulated slaves"
     finally:

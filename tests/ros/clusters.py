@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -18,14 +17,13 @@ from rosrm.model.rows import ProcessRow, Snapshot
 from rosrm.model.values import Kind, ProcessSpec, Readiness, StopPolicy
 from rosrm.supervisor.procfs import read_environment
 from rosrm.testing.local_cluster import LocalCluster, Part
+from tests.waiting import PATIENCE, holds_for, wait_until
 
 MIB = 2**20
 QUICK = StopPolicy(interrupt_grace=0.5, terminate_grace=0.5)
 #: For processes that end on a signal, as soon as the machine permits. A killed node leaves its
 #: shared memory behind.
 CALM = StopPolicy(interrupt_grace=20.0, terminate_grace=5.0)
-#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
-PATIENCE = 30.0
 #: For tests that are not about liveness. A busy machine may stall a slave for longer than the usual
 #: second, and then the host gets no work, or its name is given away. The time must not exceed a
 #: restarted slave's wait for its name.
@@ -109,14 +107,37 @@ class Cluster(LocalCluster):
         self.submit(*specs)
         return [self.ended(spec.name, timeout) for spec in specs]
 
-    def wait(self, name: str, *states: str, timeout: float = PATIENCE) -> ProcessRow:
-        """Return the row of a process, once it is in one of these states."""
+    def wait(
+        self,
+        name: str,
+        *states: str,
+        timeout: float = PATIENCE,
+        where: Callable[[ProcessRow], bool] = lambda _: True,
+        **fields,
+    ) -> ProcessRow:
+        """Return the row of a process, once it is in one of these states.
 
-        def there(view: Snapshot) -> bool:
-            return any(row.name == name and row.state in states for row in view.processes)
+        Args:
+            name: of the process.
+            states: any of them.
+            timeout: seconds.
+            where: further condition on the row.
+            fields: values that the row must have, too.
+        """
 
-        view = self.wait_until(f"{name} {' or '.join(states)}", there, timeout)
-        return next(row for row in view.processes if row.name == name)
+        def found(view: Snapshot) -> Iterator[ProcessRow]:
+            return (
+                row for row in view.processes
+                if row.name == name and row.state in states and where(row)
+                and all(getattr(row, field) == value for field, value in fields.items())
+            )  # fmt: skip
+
+        what = f"{name} {' or '.join(states)} {fields or ''}"
+        return next(found(self.wait_until(what, lambda view: any(found(view)), timeout)))
+
+    def stays(self, seconds: float, condition: Callable[[], object], what: str) -> None:
+        """Check that a condition holds at each look for some seconds."""
+        holds_for(seconds, condition, what, pause=self.client.spin)
 
     def ended(self, name: str, timeout: float = PATIENCE) -> ProcessRow:
         return self.wait(name, "finished", "failed", "cancelled", timeout=timeout)
@@ -136,11 +157,14 @@ class Cluster(LocalCluster):
         raise AssertionError(f"{name} was on no host")
 
     def wait_for_log(self, name: str, text: str, timeout: float = PATIENCE) -> str:
-        deadline = time.monotonic() + timeout
-        while text not in (log := self._log_so_far(name)):
-            assert time.monotonic() < deadline, f"{name} did not say {text!r}: {log!r}"
-            self.client.spin(0.05)
-        return log
+        self._await(
+            lambda: text in self._log_so_far(name), f"{name} prints {text!r}", timeout,
+            lambda: self._log_so_far(name),
+        )  # fmt: skip
+        return self._log_so_far(name)
+
+    def _await(self, condition, what: str, timeout: float, seen: Callable[[], object]):
+        return wait_until(condition, what, timeout, seen=seen, pause=self.client.spin)
 
     def _log_so_far(self, name: str) -> str:
         try:
@@ -160,10 +184,10 @@ class Cluster(LocalCluster):
 
     def wait_for_event(self, kind: str, says: str = "", timeout: float = PATIENCE, **narrow):
         """Return the first event of a kind whose message contains a text."""
-        deadline = time.monotonic() + timeout
-        while not (found := [e for e in self.events(kind, **narrow) if says in e.message]):
-            assert time.monotonic() < deadline, f"no {kind} in {timeout} s: {self.log_of('master')}"
-            self.client.spin(0.05)
+        found = self._await(
+            lambda: [e for e in self.events(kind, **narrow) if says in e.message],
+            f"an event {kind} {says}", timeout, lambda: self.log_of("master"),
+        )  # fmt: skip
         return found[0]
 
     def log_of(self, part: str) -> str:
@@ -180,17 +204,35 @@ class Cluster(LocalCluster):
     def is_connected(self) -> bool:
         return self._client is not None
 
+    def end(self, part: Part, number: int) -> int:
+        """Send a signal to a part; return its exit code."""
+        part.end(number)
+        return part.process.wait(PATIENCE)
+
+    def restart_master(self, number: int = signal.SIGKILL) -> None:
+        """End the master with a signal, and start the next one."""
+        self.end(self.master, number)
+        self.reconnect()
+        self.start_master()
+
+    def supervisor(self, name: str) -> int:
+        """Return the pid of the supervisor of a host."""
+        lock = self.directory / "hosts" / name / "supervisor" / "supervisor.lock"
+        return int(wait_until(lock.read_text, "the pid of the supervisor"))
+
     def add(self, config: HostConfig) -> Part:
         part = self.start_slave(config)
         self.wait_for_hosts()
         return part
 
     def start_slave_again(self, name: str) -> Part:
-        """Restart the slave of a host after a SIGKILL, and wait for its registration.
+        """Kill the slave of a host, if it runs, start the next one, and await its registration.
 
         Until then the master may consider the former run alive, and the host available.
         """
         before = self.client.list().last_sequence
+        if name in self.slaves:
+            self.end(self.slaves[name], signal.SIGKILL)
         part = self.start_slave(next(one for one in self.hosts if one.host == name))
         self.wait_for_event("host_registered", host=name, after=before)
         return part
@@ -226,21 +268,6 @@ def shared_memory_of(pid: int) -> set[str]:
         paths = {path.removesuffix(" (deleted)") for path in mapped}
         return {path for path in paths if "fastrtps" in path and "port" not in path}
     return set()
-
-
-def wait_gone(pid: int, timeout: float = PATIENCE) -> None:
-    deadline = time.monotonic() + timeout
-    while Path(f"/proc/{pid}").exists() and not zombie(pid):
-        assert time.monotonic() < deadline, f"process {pid} did not end within {timeout} s"
-        time.sleep(0.01)
-
-
-def wait_until(condition: Callable[[], object], what: str, timeout: float = PATIENCE) -> None:
-    """Poll a condition for which no event exists, such as a file of another process."""
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
-        time.sleep(0.01)
 
 
 def zombie(pid: int) -> bool:
@@ -285,10 +312,9 @@ def end_and_check(cluster: Cluster) -> None:
 
 def wait_until_none(directory: Path, timeout: float = PATIENCE) -> dict[int, str]:
     """Return the processes that are left when the time is up."""
-    deadline = time.monotonic() + timeout
-    while (left := pids_of(directory)) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return left
+    with contextlib.suppress(AssertionError):
+        wait_until(lambda: not pids_of(directory), "no process", timeout)
+    return pids_of(directory)
 
 
 Make = Callable[..., Cluster]
@@ -299,10 +325,11 @@ def clusters(new_directory: Callable[[], Path], **defaults) -> Iterator[Make]:
     """Yield a factory of clusters with default settings; end all clusters afterwards."""
     made: list[Cluster] = []
 
-    def make(*hosts: HostConfig, **cluster) -> Cluster:
+    def make(*hosts: HostConfig, started: bool = True, **cluster) -> Cluster:
         one = Cluster(new_directory(), ClusterConfig(**{**defaults, **cluster}), hosts)
         made.append(one)
-        one.__enter__()
+        if started:
+            one.__enter__()
         return one
 
     faults = []

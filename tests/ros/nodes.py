@@ -6,8 +6,8 @@ can send, or omit, each message at any moment.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,15 +16,18 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
 
 from rosrm.node import Node
 from rosrm.node.handoff.channel import CHANNEL, STATE_CONFIG
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig
+from tests.waiting import PATIENCE, wait_until
 
-PATIENCE = 20.0
 TOPIC = "/rosrm/state_config"
+#: Name of a destination.
+ALIAS = "counter_1700000000"
 CLUSTER = "rosrm"
 EPOCH = 3
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -60,6 +63,20 @@ class Counter(Node):
 
     def restore_total(self, message: Int64) -> None:
         self.total = message.data
+
+
+class Server(Counter):
+    """A counter that answers requests with its name, and counts them."""
+
+    def __init__(self, group: Any = None, **named: Any) -> None:
+        super().__init__(**named)
+        self.served = 0
+        self.create_service(Trigger, "~/poke", self.poke, callback_group=group)
+
+    def poke(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.served += 1
+        response.message = self.get_name()
+        return response
 
 
 class Stage:
@@ -121,12 +138,7 @@ class Stage:
         seen: Callable[[], object] = lambda: "",
     ) -> None:
         """Spin the nodes until a condition holds; `seen` describes the actual state."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < deadline, (
-                f"{what} did not come about in {timeout:g} s: {seen()}"
-            )
-            self.spin(0.05)
+        wait_until(condition, what, timeout, seen=seen, pause=lambda _: self.spin(0.05))
 
     def spin(self, seconds: float) -> None:
         """Execute ready callbacks for at most `seconds`."""
@@ -199,10 +211,37 @@ class Conductor:
             if report.instance == number and report.phase == phase
         )  # fmt: skip
 
-    def hand_over(self) -> None:
-        """Conduct a handoff without faults."""
+    def prepare(self) -> None:
+        """Conduct a handoff until the destination is ready."""
         self.say(StateConfig.SHADOW)
         self.wait(self.config.destination, HandoffReport.READY)
+
+    def hand_over(self) -> None:
+        """Conduct a handoff without faults."""
+        self.prepare()
         self.say(StateConfig.SWITCH)
         self.wait(self.config.destination, HandoffReport.ACTIVE)
         self.wait(self.config.source, HandoffReport.RELEASED)
+
+    def silence(self, destination: Any) -> None:
+        """Silence the source, while its destination, a node, stays a shadow."""
+        destination._rosrm._destination._activate = lambda: None
+        self.prepare()
+        self.say(StateConfig.SWITCH)
+        self.wait(self.config.source, HandoffReport.RELEASED)
+
+    def resume(self) -> None:
+        """Undo a handoff: the source resumes."""
+        self.say(StateConfig.ABORT)
+        self.wait(self.config.destination, HandoffReport.ABORTED)
+        self.say(StateConfig.RESUME)
+        self.wait(self.config.source, HandoffReport.RESUMED)
+
+
+def pair_of(stage: Stage, make: Callable[..., Any], **named: Any) -> SimpleNamespace:
+    """Return a source, its shadow as destination, and the conductor of their handoff."""
+    first = stage.instance(make, 1, **named)
+    second = stage.instance(make, 2, alias=ALIAS, shadow=True, **named)
+    return SimpleNamespace(
+        first=first, second=second, conductor=Conductor(stage, source=1, destination=2)
+    )

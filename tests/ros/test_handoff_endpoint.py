@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 
 from rosrm.core.master.commands import PublishStateConfig
@@ -16,6 +14,7 @@ from rosrm.ros.participant import Participant
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig
+from tests.waiting import holds_for, wait_until
 
 CHANNEL = "/rosrm/handoff/p_2"
 
@@ -49,12 +48,12 @@ class Stage:
         named = {"protocol_version": PROTOCOL_VERSION, "destination": 2, "instance": 2, **fields}
         self.channel.publish(HandoffReport(phase=phase, **named))
 
-    def spin(self, condition, seconds: float = 10.0) -> bool:
-        deadline = time.monotonic() + seconds
-        while not condition() and time.monotonic() < deadline:
-            self.master.spin(0.02)
-            self.nodes.spin(0.02)
-        return bool(condition())
+    def spin(self, seconds: float) -> None:
+        self.master.spin(seconds)
+        self.nodes.spin(seconds)
+
+    def wait(self, condition, what: str) -> None:
+        wait_until(condition, what, seen=lambda: self.events, pause=self.spin)
 
     def close(self) -> None:
         self.nodes.close()
@@ -63,17 +62,17 @@ class Stage:
 
 
 @pytest.fixture
-def stage(monkeypatch):
+def stage():
     one = Stage()
     yield one
     one.close()
 
 
-def test_all_that_a_node_must_know_is_said_and_who_comes_late_hears_it(stage):
+def test_the_state_config_reaches_late_subscribers(stage):
     """The message has cluster, epoch and channel, and reaches late subscribers."""
     stage.say(HandoffPhase.SHADOW)
     stage.listen()
-    assert stage.spin(lambda: stage.configs)
+    stage.wait(lambda: stage.configs, "the message")
     assert stage.configs == [
         StateConfig(
             protocol_version=PROTOCOL_VERSION, cluster="ours", epoch=5, phase=1, process="p",
@@ -83,37 +82,36 @@ def test_all_that_a_node_must_know_is_said_and_who_comes_late_hears_it(stage):
     ]  # fmt: skip
 
 
-def test_what_was_reported_before_the_master_listened_is_heard(stage):
+def test_earlier_reports_reach_the_master(stage):
     """Reports from before the subscription arrive, as after a restart of the master."""
     stage.report(11, message="waits for /scan")
     stage.report(14, sequence=7)
     stage.say(HandoffPhase.SWITCH)
-    assert stage.spin(lambda: len(stage.events) == 2)
+    stage.wait(lambda: len(stage.events) == 2, "both reports")
     assert stage.events == [
         HandoffReported("p", 2, 2, ReportPhase.SHADOWING, 0, "waits for /scan"),
         HandoffReported("p", 2, 2, ReportPhase.ACTIVE, 7, ""),
     ]
 
 
-def test_nonsense_and_other_handoffs_are_not_heard(stage):
+def test_invalid_reports_and_other_handoffs_have_no_effect(stage):
     """Foreign versions and unknown phases are refused with a reason; other handoffs are ignored."""
     stage.say(HandoffPhase.SHADOW)
     stage.report(14, destination=9)
     stage.report(14, protocol_version=PROTOCOL_VERSION + 1)
     stage.report(99)
     stage.report(12)
-    assert stage.spin(lambda: stage.events)
+    stage.wait(lambda: stage.events, "a report")
     assert stage.events == [HandoffReported("p", 2, 2, ReportPhase.READY, 0, "")]
     assert [who for who, _ in stage.refused] == ["p#2 in a handoff"] * 2
     assert stage.refused[1][1] == "unknown phase 99"
 
 
-def test_when_all_is_done_nobody_listens(stage):
+def test_after_done_the_master_does_not_listen(stage):
     """After DONE the master has no reader on the channel."""
     stage.say(HandoffPhase.SHADOW)
-    assert stage.spin(lambda: stage.channel.get_subscription_count() == 1)
+    stage.wait(lambda: stage.channel.get_subscription_count() == 1, "a reader")
     stage.say(HandoffPhase.DONE)
-    assert stage.spin(lambda: stage.channel.get_subscription_count() == 0)
+    stage.wait(lambda: stage.channel.get_subscription_count() == 0, "no reader")
     stage.report(12)
-    stage.spin(lambda: stage.events, 0.5)
-    assert not stage.events
+    holds_for(0.5, lambda: not stage.events, "no event", pause=stage.spin)

@@ -7,6 +7,7 @@ import threading
 import time
 from itertools import groupby, pairwise
 from pathlib import Path
+from statistics import median
 from types import SimpleNamespace
 
 import pytest
@@ -21,7 +22,8 @@ from std_srvs.srv import Trigger
 
 from rosrm.config.settings import MigrationSettings
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness
-from tests.ros.clusters import PATIENCE, host, wait_until
+from tests.ros.clusters import host
+from tests.waiting import PATIENCE, wait_until
 
 PROGRAM = Path(__file__).parent / "programs" / "dock.py"
 DOCK = ProcessSpec(
@@ -33,7 +35,7 @@ DOCK = ProcessSpec(
     readiness=Readiness(timeout=PATIENCE),
 )
 CHARGE = 100  # of each order: more comes than is delivered, so that `current` shows the limit
-ANSWER_TIMEOUT = 1.0  # seconds until a call is given up
+ANSWER_TIMEOUT = 3.0  # seconds until a call is given up, which a busy machine may take
 
 
 class Robots:
@@ -96,7 +98,10 @@ class Robots:
         """Stop the load, and wait for the outstanding messages."""
         for timer in self.timers:
             timer.cancel()
-        wait_until(lambda: len(self.receipts) >= self.orders, f"{self.orders} receipts", 10.0)
+        wait_until(
+            lambda: len(self.receipts) >= self.orders, f"{self.orders} receipts",
+            seen=lambda: f"{len(self.receipts)} came",
+        )  # fmt: skip
         reports = len(self.health)
         wait_until(lambda: len(self.health) >= reports + 2, "a report of the end")
 
@@ -126,11 +131,9 @@ class Robots:
     def ask(self, send):
         """Call a parameter service; repeat the call, because the server may have just gone."""
         for _ in range(5):
-            future = send()
-            deadline = time.monotonic() + 2.0
-            while not future.done() and time.monotonic() < deadline:
-                time.sleep(0.01)
-            if future.done():
+            future, answered = send(), threading.Event()
+            future.add_done_callback(lambda _, answered=answered: answered.set())
+            if answered.wait(2.0):
                 return future.result()
         raise AssertionError("no parameter service of /dock answers")
 
@@ -164,13 +167,7 @@ def move(cluster, robots, to: str, times: int) -> SimpleNamespace:
     """Migrate the dock; return the times of begin and end."""
     began = time.monotonic()
     cluster.client.migrate("dock", to)
-    cluster.wait_until(
-        f"dock on {to}",
-        lambda view: any(
-            (row.name, row.host, row.migrations, row.state) == ("dock", to, times, "running")
-            for row in view.processes
-        ),
-    )
+    cluster.wait("dock", "running", host=to, migrations=times)
     ended = time.monotonic()
     wait_until(lambda: robots.health[-1][0] > ended + 1.0, f"reports from {to}")
     return SimpleNamespace(began=began, ended=ended)
@@ -228,8 +225,8 @@ def test_a_node_from_the_guide_moves_there_and_back_with_its_state(cluster, robo
     # The slow timer keeps its period.
     times, reports = zip(*((when, data[0]) for when, data in robots.health), strict=True)
     assert list(reports) == [reports[0] + n for n in range(len(reports))]
-    assert all(0.3 < b - a < 1.9 for a, b in pairwise(times))
-    assert abs(times[-1] - times[0] - (len(reports) - 1)) < 1.0
+    phases = [when - number for number, when in zip(reports, times, strict=True)]
+    assert abs(median(phases[-5:]) - median(phases[:5])) < 0.5  # one may be late, of a busy machine
 
 
 def counted(number: int) -> range:

@@ -9,7 +9,8 @@ import pytest
 from rosrm.config.settings import MigrationSettings
 from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
-from tests.ros.clusters import PATIENCE, QUICK, host
+from tests.ros.clusters import QUICK, host
+from tests.waiting import PATIENCE
 
 #: Plain rclpy: publishes its state in every cycle; a shadow starts from a received state.
 COUNTER = """
@@ -60,28 +61,17 @@ def counter(name: str = "counter", **options: object) -> ProcessSpec:
     )  # fmt: skip
 
 
-def test_it_goes_on_counting_there_and_back_again(cluster):
+def test_the_count_continues_there_and_back(cluster):
     """The counter migrates twice; the second time the source has an alias."""
     cluster.submit(counter())
     here = cluster.wait("counter", "running").host
     there = {"left": "right", "right": "left"}[here]
     for times, target in enumerate((there, here), start=1):
         cluster.client.migrate("counter", target)
-        row = moved(cluster, times)
-        assert row.host == target
+        cluster.wait("counter", "running", migrations=times, host=target)
         log = cluster.wait_for_log("counter", "began with")
         assert int(log.split("began with")[1].split()[0]) > 10
     cluster.cancel("counter")
-
-
-def moved(cluster, times: int):
-    """Return the row of the process, once it runs after so many migrations."""
-    view = cluster.wait_until(
-        f"moved {times} times",
-        lambda v: any(row.migrations == times and row.state == "running" for row in v.processes),
-        PATIENCE,
-    )
-    return view.processes[0]
 
 
 def test_a_state_below_the_nodes_own_name_is_found_under_an_alias(cluster):
@@ -99,7 +89,7 @@ def test_a_state_below_the_nodes_own_name_is_found_under_an_alias(cluster):
     cluster.cancel("private")
 
 
-def test_a_topic_on_which_nobody_speaks_leaves_it_where_it_is(cluster):
+def test_a_topic_without_a_publisher_undoes_the_migration(cluster):
     """The process stays; the event has the reason from the destination's slave."""
     cluster.submit(counter("lost", state="/wrong/state", ready_timeout=2.0))
     cluster.wait("lost", "running")
@@ -110,6 +100,6 @@ def test_a_topic_on_which_nobody_speaks_leaves_it_where_it_is(cluster):
     cluster.cancel("lost")
 
 
-def test_options_that_make_no_sense_are_refused_by_the_master(cluster):
+def test_invalid_options_are_refused_by_the_master(cluster):
     with pytest.raises(Refused, match="protocol 'mine'; allowed: rosrm, paper"):
         cluster.submit(counter("odd", protocol="mine"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -17,7 +16,8 @@ from rosrm_examples.drives import Drive, default_drive
 from rosrm_examples.map_part import load_parts
 from rosrm_examples.migration_results import LiveRun, differences, summarise, unmigrated_poses
 from rosrm_examples.observer import Observer
-from tests.ros.clusters import host, wait_until
+from tests.ros.clusters import host
+from tests.waiting import holds_for, wait_until
 
 MOVES = 10
 #: Seconds of the complete drive: on a busy machine ten consecutive migrations take so long.
@@ -73,7 +73,7 @@ def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
         cluster.ended("player")
         sent = json.loads(report.read_text())["scans_sent"]
         wait_until(lambda: len(observer.heard) >= sent, "all scans are mapped")
-        time.sleep(1.0)  # one further scan would be one too many
+        holds_for(1.0, lambda: len(observer.heard) == sent, "no further scan")
         heard = list(observer.heard)
     cluster.cancel("slam")
     driven = drive.part(0, sent)
@@ -87,11 +87,4 @@ def move(cluster, moves: int) -> None:
     """Migrate the SLAM to the other host; wait until the number of migrations is `moves`."""
     there = {"left": "right", "right": "left"}[cluster.process("slam").host]
     cluster.client.migrate("slam", there)
-    view = cluster.wait_until(
-        f"slam moved {moves} times",
-        lambda v: any(
-            row.name == "slam" and row.migrations == moves and row.state == "running"
-            for row in v.processes
-        ),
-    )
-    assert next(row for row in view.processes if row.name == "slam").host == there
+    cluster.wait("slam", "running", migrations=moves, host=there)

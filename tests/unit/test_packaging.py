@@ -35,15 +35,10 @@ def read(project: Path) -> dict[str, Any]:
 
 def requirements(project: Path) -> Iterator[Requirement]:
     settings = read(project)
-    lines = [
-        *settings["build-system"]["requires"],
-        *settings["project"].get("dependencies", ()),
-        *(
-            r
-            for extra in settings["project"].get("optional-dependencies", {}).values()
-            for r in extra
-        ),
-    ]
+    lines = list(settings["build-system"]["requires"])
+    lines += settings["project"].get("dependencies", ())
+    for extra in settings["project"].get("optional-dependencies", {}).values():
+        lines += extra
     yield from map(Requirement, lines)
 
 
@@ -72,18 +67,8 @@ OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJEC
 
 
 def test_every_distribution_is_looked_at() -> None:
-    assert {
-        "rosrm",
-        "rosrm-checkpoint",
-        "rosrm-criu",
-        "rosrm-examples",
-        "rosrm-lab",
-        "rosrm-migration",
-        "rosrm-msgs",
-        "rosrm-resources",
-        "rosrm-scoring",
-        "rosrm-simulate",
-    } <= OWN
+    parts = "checkpoint criu examples lab migration msgs resources scoring simulate"
+    assert {"rosrm", *(f"rosrm-{part}" for part in parts.split())} <= OWN
 
 
 @pytest.mark.parametrize("python", PYTHONS)
@@ -131,11 +116,7 @@ def test_rosrm_alone_shows_its_help() -> None:
     plugins = [project.parent.name for project in PROJECTS if project.parent.parent.name]
     absent = [f"rosrm_{name}" for name in plugins] + ["backports.zstd", "cryptography"]
     assert "rosrm_criu" in absent
-    done = subprocess.run(
-        [sys.executable, "-c", ALONE.format(absent=absent)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = [sys.executable, "-c", ALONE.format(absent=absent)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "submit" in done.stdout

@@ -81,13 +81,7 @@ def test_the_lists_of_names_agree():
     """Type checkers read the imports and `__all__`, and the program reads the modules of names."""
     tree = ast.parse(Path(rosrm.__file__).read_text(encoding="utf-8"))
     (static,) = (node for node in tree.body if isinstance(node, ast.If))
-    imports = {
-        one.name: f"rosrm.{module}"
-        for module, names in (
-            (node.module.removeprefix("rosrm."), node.names) for node in static.body
-        )
-        for one in names
-    }
+    imports = {one.name: node.module for node in static.body for one in node.names}
     assert imports == {name: f"rosrm.{module}" for name, module in rosrm._MODULES.items()}
     assert set(rosrm.__all__) == {*imports, "__version__", "PROTOCOL_VERSION"}
     assert len(rosrm.__all__) == len(set(rosrm.__all__))
@@ -107,12 +101,8 @@ def test_an_unknown_name_is_an_attribute_error():
 
 def test_importing_rosrm_loads_nothing_but_the_version():
     """The supervisor imports rosrm too, and has to stay small."""
-    code = (
-        "import typing\n"
-        "before = set(sys.modules)\n"
-        "import rosrm\n"
-        "print(*sorted(set(sys.modules) - before))"
-    )
+    code = "import typing; before = set(sys.modules); import rosrm; "
+    code += "print(*sorted(set(sys.modules) - before))"
     assert run(code).split() == ["rosrm", "rosrm.version"]
 
 

@@ -6,13 +6,16 @@ anything else of that batch: intent is durable before it is acted on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from rosrm.extensions.contracts import Intent, Record
+from rosrm.model.orders import Order, StartInstance, StopInstance
 from rosrm.model.plan import HandoffPhase
-from rosrm.model.values import EMPTY, Assignment, InstanceId, RestartPolicy
+from rosrm.model.values import Assignment, InstanceId
+
+#: Id of an order, unique within one run of the master: its number, or its series and number
+#: (`PendingOrders`).
+OrderId = int | tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,16 +27,30 @@ class Assign:
 
 
 @dataclass(frozen=True, slots=True)
+class SendOrder:
+    """Send an order to one slave; `OrderAnswered` follows, also when no answer arrives."""
+
+    order_id: OrderId
+    host_id: int
+    order: Order
+
+
+@dataclass(frozen=True, slots=True)
 class Withdraw:
     """Withdraw an assignment.
 
-    An assignment that the slave has not fetched yields `AssignmentWithdrawn`. For a fetched one, an
-    order to stop goes to the slave, so that it never runs or ends.
+    An assignment that the slave has not fetched yields `AssignmentWithdrawn`. For a fetched one,
+    `if_fetched` goes to the slave, so that the instance never runs or ends.
     """
 
-    order: int
+    order_id: OrderId
     host_id: int
     instance: InstanceId
+
+    @property
+    def if_fetched(self) -> SendOrder:
+        """Return the order to stop the instance."""
+        return SendOrder(self.order_id, self.host_id, StopInstance(self.instance))
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,35 +60,14 @@ class Redeliver:
     An assignment that the slave has not fetched stays open: it can be withdrawn without an order.
     """
 
-    order: int
+    order_id: OrderId
     host_id: int
     assignment: Assignment
 
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """Send an order to one slave; `OrderAnswered` follows, also when no answer arrives.
-
-    Attributes:
-        action: "stop", "fence", "restart", "start", "execute", "report", "set_restart", "keep" or
-            "drop_kept".
-        assignment: for "start".
-        restart: for "set_restart".
-        executor, arguments, timeout: for "execute".
-        keep_on, keep_every: for "keep": hosts, seconds.
-    """
-
-    order: int
-    host_id: int
-    action: str
-    instance: InstanceId | None = None
-    assignment: Assignment | None = None
-    executor: str = ""
-    arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
-    timeout: float = 0.0
-    restart: RestartPolicy | None = None
-    keep_on: tuple[str, ...] = ()
-    keep_every: float = 0.0
+    @property
+    def if_fetched(self) -> SendOrder:
+        """Return the order to start the instance."""
+        return SendOrder(self.order_id, self.host_id, StartInstance(self.assignment))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,4 +99,4 @@ class Reply:
     host: str = ""
 
 
-Command = Assign | Withdraw | Redeliver | Order | PublishStateConfig | Reply | Record | Intent
+Command = Assign | Withdraw | Redeliver | SendOrder | PublishStateConfig | Reply | Record | Intent

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.core.master.commands import OrderId
+from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.plan import ReportPhase
+from rosrm.model.rows import PluginKind
 from rosrm.model.values import (
     EMPTY,
     HostDescription,
@@ -106,9 +109,9 @@ class StatusesReceived:
     failing_strategies: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     failing_launchers: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
-    def failing_plugins(self) -> dict[tuple[str, str], str]:
+    def failing_plugins(self) -> dict[Plugin, str]:
         """Return all plugins that fail there by kind and name, and why."""
-        by_kind = (
+        by_kind: tuple[tuple[PluginKind, Mapping[str, str]], ...] = (
             ("probe", self.failing),
             ("migration", self.failing_strategies),
             ("launcher", self.failing_launchers),
@@ -197,7 +200,7 @@ class HostStateRequested:
 
     request: int
     host: str
-    action: str
+    action: Literal["cordon", "uncordon", "drain"]
     by: str = ""
 
 
@@ -218,12 +221,12 @@ class PruneRequested:
 
 @dataclass(frozen=True, slots=True)
 class OrderAnswered:
-    """A slave answered an `Order`, or did not in time (code "timeout").
+    """A slave answered a `SendOrder`, or did not in time (code "timeout").
 
     The code `BAD_RESULT`: an executor ran to its end, but answered no JSON object.
     """
 
-    order: int
+    order: OrderId
     accepted: bool
     code: str = ""
     message: str = ""

@@ -9,7 +9,6 @@ from typing import Final
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
 from rosrm.core.master.assignment.reservations import learn_from
-from rosrm.core.master.commands import Order
 from rosrm.core.master.hosts import readoption
 from rosrm.core.master.master_state import (
     WAITING,
@@ -24,6 +23,7 @@ from rosrm.core.master.plugin_failures import note_on_host
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.migration import End, Run
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import FenceInstance, Order, ReportInstances, StopInstance
 from rosrm.model.plan import Start
 from rosrm.model.values import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind, RestartPolicy
 from rosrm.wording import standing
@@ -69,7 +69,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
         reconcile(state, host, event.statuses, now)
         return
     if not is_next:
-        state.emit(Order(state.order_id(), host.host_id, "report"))
+        state.send(host, ReportInstances())
     for status in event.statuses:
         take_status(state, host, status, now)
 
@@ -178,7 +178,7 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
         return
     if status.instance.number in state.instances:  # it is intended, but elsewhere
         if status.state is not InstanceState.STOPPING:
-            state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
+            state.send(host, StopInstance(status.instance))
         return
     followed = readoption.has_successor(state, status)
     how = "has it killed: another instance owns its name" if followed else "stops it"
@@ -207,9 +207,9 @@ def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: flo
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
     """Order an instance to stop for good; the order is repeated until it has ended."""
     instance.stopping = True
-    instance.order, instance.order_at = state.order_id(), now
-    action = "fence" if instance.at_once else "stop"
-    state.emit(Order(instance.order, instance.host.host_id, action, instance.id))
+    order: Order = FenceInstance(instance.id) if instance.at_once else StopInstance(instance.id)
+    state.send(instance.host, order)
+    instance.order_at = now
 
 
 # --- ends -------------------------------------------------------------------------------------

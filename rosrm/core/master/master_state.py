@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass
 from math import inf
+from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
 
-from rosrm.core.master.commands import Command
+from rosrm.core.master.commands import Command, OrderId, SendOrder
 from rosrm.core.master.hosts.fencing import fence_of
-from rosrm.core.master.scheduling.decision import Decision
+from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Abilities
@@ -21,14 +22,17 @@ from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import LearnedNeeds
 from rosrm.core.master.state.migration import Run, run_to_dict
+from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
-from rosrm.core.master.state.process import Instance, Process, ProcessPhase, Wanted
+from rosrm.core.master.state.process import JOURNALED, Instance, Process, ProcessPhase, Wanted
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.replicas import Keeping
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import Order
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 
@@ -42,6 +46,8 @@ _ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTIN
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 #: Most removed processes of which replicas are still dropped.
 _REMOVED_KEPT: Final = 10_000
+#: Faster than `fields_to_plain`, because a process is saved in the turn of its decision.
+_journaled_of: Final = attrgetter(*JOURNALED)
 #: No instance gets a number as large as this.
 _LARGEST: Final = 2**53
 
@@ -115,7 +121,6 @@ class MasterState:
         self.over: dict[str, None] = {}
         self.instances: dict[int, Instance] = {}
         self.runs: dict[str, Run] = {}
-        self.runs_by_order: dict[int, str] = {}
         self.standbys: dict[str, Run] = {}
         self.wants_standby: set[str] = set()
         self.learned = LearnedNeeds()
@@ -129,11 +134,11 @@ class MasterState:
         self.keeping = Keeping()
         self.abilities = Abilities()
         self.images = Images()
+        self.pending_orders = PendingOrders()
         self.periodic = Periodic()
         self.next_order = 1
         self.next_instance = 1
         self.reserved_instances = 1
-        self.next_order_id = 1
         self.wall = 0.0
         self.in_company_since = inf
         self.held_since = inf
@@ -193,15 +198,13 @@ class MasterState:
         return Intent(
             "process", process.name,
             {
-                "spec": process.plain, "order": process.order, "phase": phase.value, "since": began,
-                "wanted": process.wanted.value, "owner": process.owner,
+                "spec": process.plain, "phase": phase.value, "since": began,
                 "host": owner.host.name if owner else process.ended_on, "instances": held,
-                "reason": process.reason, "excluded": dict(process.excluded),
-                "migrations": process.migrations, "exit_code": process.exit_code,
-                "restarts": process.restarts, "node_names": aliases,
-                "standby": self._standby_of(process), "born": process.born,
-                "left_behind": left and [left.number, left.host, left.node_name],
-                "image": None if process.image is None else asdict(process.image),
+                "node_names": aliases, "standby": self._standby_of(process),
+                "left_behind": left and astuple(left),
+                "image": process.image and to_plain(process.image),
+                **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
+                "excluded": dict(process.excluded),
             },
         )  # fmt: skip
 
@@ -227,10 +230,15 @@ class MasterState:
         stopping = [number for number in numbers if self.instances[number].stopping]
         return Intent("migration", run.process, run_to_dict(run, stopping))
 
-    def order_id(self) -> int:
-        """Return a number for an order to a slave, unique within this run of the master."""
-        self.next_order_id += 1
-        return self.next_order_id - 1
+    def send(self, host: Host, order: Order, purpose: Purpose | None = None) -> OrderId:
+        """Send an order to the slave of a host and return its id.
+
+        Args:
+            purpose: of the answer; None: the answer is ignored.
+        """
+        order_id = self.pending_orders.add(purpose)
+        self.emit(SendOrder(order_id, host.host_id, order))
+        return order_id
 
     # --- processes -----------------------------------------------------------------------
 
@@ -417,7 +425,9 @@ class MasterState:
             restored,
         )  # fmt: skip
 
-    def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
+    def note_decision(
+        self, process: Process, decision: Decision, kind: DecisionKind, now: float
+    ) -> None:
         """Remember the newest decision about a process, for `explain`."""
         decision.kind = kind
         process.decision = decision

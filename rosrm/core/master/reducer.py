@@ -33,8 +33,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
+from rosrm.core.master import answers, lifecycle, plugin_failures, pruning, requests, tick
 from rosrm.core.master import events as happened
-from rosrm.core.master import lifecycle, plugin_failures, pruning, requests, tick
 from rosrm.core.master.assignment.assign import place_waiting
 from rosrm.core.master.checkpoint import replication
 from rosrm.core.master.commands import Command
@@ -64,7 +64,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.RestoreRequested: requests.restore_requested,
         happened.HostStateRequested: requests.host_state_requested,
         happened.PruneRequested: pruning.prune_requested,
-        happened.OrderAnswered: executor.order_answered,
+        happened.OrderAnswered: answers.order_answered,
         happened.HandoffReported: handoff.handoff_reported,
         happened.TimePassed: tick.time_passed,
     }

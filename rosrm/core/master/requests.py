@@ -10,18 +10,20 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.checkpoint import image_requests, images, replication
-from rosrm.core.master.commands import Order, Reply
+from rosrm.core.master.commands import Reply
 from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.core.master.migration.eviction import departures, try_move
 from rosrm.core.master.migration.start import why_busy
+from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RestartInstance
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import counted, listed, no_such
 
@@ -294,7 +296,7 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
         # An instance that its slave has not accepted yet starts anyway. An order to restart that
         # arrives before the assignment would prevent the start for good.
         owner.restarting = True
-        state.emit(Order(state.order_id(), owner.host.host_id, "restart", owner.id))
+        state.send(owner.host, RestartInstance(owner.id))
     state.save(process)
 
 
@@ -312,10 +314,10 @@ def migration_requested(state: MasterState, event: happened.MigrationRequested, 
         if host is None:
             return
     (process,) = processes
-    reason = try_move(state, process, asked_for(event.by), now, host=host)
-    if reason:
-        _note_refused_move(state, process, reason, now)
-        refuse(state, event.request, reason)
+    rejected = try_move(state, process, asked_for(event.by), now, host=host)
+    if rejected is not None:
+        _note_refused_move(state, process, rejected.reason, now)
+        refuse(state, event.request, rejected.reason)
         return
     name = state.runs[process.name].destination_host.name
     state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
@@ -343,15 +345,15 @@ def restore_requested(state: MasterState, event: happened.RestoreRequested, now:
 def _begin(
     state: MasterState,
     event: happened.CheckpointRequested | happened.RestoreRequested,
-    begin: Callable[[MasterState, Process, str, float], str],
+    begin: Callable[[MasterState, Process, str, float], Rejected | None],
     now: float,
 ) -> None:
     processes = known_processes(state, event.request, [event.name])
     if processes is None:
         return
-    refusal = begin(state, processes[0], asked_for(event.by), now)
-    if refusal:
-        refuse(state, event.request, refusal)
+    rejected = begin(state, processes[0], asked_for(event.by), now)
+    if rejected is not None:
+        refuse(state, event.request, rejected.reason)
         return
     run = state.runs[event.name]
     message = f"{event.name}: {run.course}"

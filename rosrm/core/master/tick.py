@@ -9,7 +9,7 @@ from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
 from rosrm.core.master.assignment.reservations import settle_charge
 from rosrm.core.master.checkpoint import images, periodic, replication
-from rosrm.core.master.commands import Order, Redeliver, Withdraw
+from rosrm.core.master.commands import Redeliver, Withdraw
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
@@ -24,6 +24,7 @@ from rosrm.core.master.master_state import (
 from rosrm.core.master.migration.eviction import relieve_hosts
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
+from rosrm.model.orders import ReportInstances
 
 #: Seconds between two ticks; this work need not be done with every event.
 _REVIEW_EVERY: Final = 0.2
@@ -74,7 +75,8 @@ def _review_delivery(state: MasterState, instance: Instance, age: float, now: fl
     elif age >= state.settings.order_retry and not instance.given_again:
         instance.given_again = True
         assignment = state.assignment(instance.id, process.spec)
-        state.emit(Redeliver(state.order_id(), instance.host.host_id, assignment))
+        order_id = state.pending_orders.add()
+        state.emit(Redeliver(order_id, instance.host.host_id, assignment))
 
 
 def _take_back(state: MasterState, instance: Instance, now: float) -> None:
@@ -89,13 +91,13 @@ def _take_back(state: MasterState, instance: Instance, now: float) -> None:
 
 def _withdraw(state: MasterState, process: Process, instance: Instance, now: float) -> None:
     """Withdraw an assignment that was not accepted; its process is queued again in any case."""
-    if instance.order and now - instance.order_at < state.settings.delivery_timeout:
+    if now - instance.order_at < state.settings.delivery_timeout:
         return
     if process.wanted is Wanted.RUN:
         process.wanted = Wanted.REQUEUE
         state.save(process)
-    instance.order, instance.order_at = state.order_id(), now
-    state.emit(Withdraw(instance.order, instance.host.host_id, instance.id))
+    instance.order_at = now
+    state.emit(Withdraw(state.pending_orders.add(), instance.host.host_id, instance.id))
 
 
 def _ask_for_missing_statuses(state: MasterState, now: float) -> None:
@@ -106,4 +108,4 @@ def _ask_for_missing_statuses(state: MasterState, now: float) -> None:
         since = state.missing_since.setdefault(column, now)
         if now - since >= _PATIENCE:
             state.missing_since[column] = now
-            state.emit(Order(state.order_id(), column + 1, "report"))
+            state.send(state.hosts.hosts[column], ReportInstances())

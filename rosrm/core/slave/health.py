@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from rosrm.core.slave.watches import Look, Watch
+from rosrm.core.slave.watches import NO_ANSWER, Look, Watch
 from rosrm.model.values import Assignment, Health
 
 #: Seconds between two looks.
@@ -139,7 +139,7 @@ class Judgement:
             yield f"stopped by a signal (SIGSTOP) for {self._stopped.seconds:.1f} s"
         if self._lifecycle.seconds > wanted.timeout:
             silent = f"no answer from {' or '.join(self._watch.services)}"
-            found = f"lifecycle state {seen.state}" if seen.state else silent
+            found = silent if seen.state == NO_ANSWER else f"lifecycle state {seen.state}"
             lasted = self._lifecycle.seconds
             yield f"{found} for {lasted:.1f} s, the state {wanted.lifecycle} is required"
         lasted = self._rate.amiss.seconds

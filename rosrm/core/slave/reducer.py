@@ -30,100 +30,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from rosrm.core.slave.commands import (
-    Amend,
-    Command,
-    Fail,
-    Fence,
-    Forget,
-    Launch,
-    Remember,
-    Renew,
-    Report,
-    Restart,
-    Settle,
-    Stop,
-)
-from rosrm.core.slave.events import (
-    AssignmentsReceived,
-    Event,
-    FenceOrdered,
-    LaunchRefused,
-    LookedAt,
-    MasterHears,
-    MasterLost,
-    Registered,
-    ReportRequested,
-    RestartOrdered,
-    RestartPolicyRecorded,
-    RestartPolicySet,
-    SeenInGraph,
-    StopOrdered,
-    SupervisorReplaced,
-    SupervisorReported,
-    TimePassed,
-)
-from rosrm.core.slave.handlers import (
-    HANDLERS,
-    REMEMBER_END,
-)
-from rosrm.core.slave.health import LOOK_PERIOD
-from rosrm.core.slave.master_clock import BeatClock
-from rosrm.core.slave.state import (
-    Held,
-    SlaveState,
-    awaits_graph,
-    qualified_name,
-    under_limits,
-)
-from rosrm.core.slave.watches import Awaited, Look, Memo, Watch
-
-__all__ = [
-    "HANDLERS",
-    "LOOK_PERIOD",
-    "REMEMBER_END",
-    "Amend",
-    "AssignmentsReceived",
-    "Awaited",
-    "BeatClock",
-    "Command",
-    "Event",
-    "Fail",
-    "Fence",
-    "FenceOrdered",
-    "Forget",
-    "Held",
-    "Launch",
-    "LaunchRefused",
-    "Look",
-    "LookedAt",
-    "MasterHears",
-    "MasterLost",
-    "Memo",
-    "Registered",
-    "Remember",
-    "Renew",
-    "Report",
-    "ReportRequested",
-    "Restart",
-    "RestartOrdered",
-    "RestartPolicyRecorded",
-    "RestartPolicySet",
-    "SeenInGraph",
-    "Settle",
-    "SlaveState",
-    "Stop",
-    "StopOrdered",
-    "SupervisorReplaced",
-    "SupervisorReported",
-    "TimePassed",
-    "Watch",
-    "awaits_graph",
-    "qualified_name",
-    "step",
-    "step_all",
-    "under_limits",
-]
+from rosrm.core.slave.commands import Command, Launch, Report
+from rosrm.core.slave.events import Event
+from rosrm.core.slave.handlers import HANDLERS
+from rosrm.core.slave.state import SlaveState
 
 
 def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:

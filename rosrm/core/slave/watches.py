@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from rosrm.model.values import Health
+
+#: Lifecycle state of a node that does not answer.
+NO_ANSWER: Final = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,7 @@ class Look:
         stopped: a signal has stopped its session leader.
         heard: messages on its topic; None: the topic cannot be received.
         trouble: why the topic cannot be received; "": it can.
-        state: of its lifecycle; "": no answer; None: not known yet.
+        state: of its lifecycle, or `NO_ANSWER`; None: not known yet.
     """
 
     stopped: bool = False

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import signal
-from typing import Final
+from typing import Final, Literal
 
 from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 
+Phase = Literal[
+    "starting", "running", "backoff", "stopping",
+    "exited", "failed", "refused", "fenced", "withdrawn",
+]  # fmt: skip
 STARTING: Final = "starting"
 RUNNING: Final = "running"
 BACKOFF: Final = "backoff"
@@ -16,9 +20,10 @@ FAILED: Final = "failed"
 REFUSED: Final = "refused"
 FENCED: Final = "fenced"
 WITHDRAWN: Final = "withdrawn"
-ENDED: Final = frozenset({EXITED, FAILED, REFUSED, FENCED, WITHDRAWN})
+ENDED: Final[frozenset[Phase]] = frozenset({EXITED, FAILED, REFUSED, FENCED, WITHDRAWN})
 
-#: Next action for a stopping instance once no process of it is left.
+#: Next action for a stopping instance once no process of it is left; "": it is not being stopped.
+Then = Literal["", "end", "restart", "policy"]
 THEN_END: Final = "end"
 THEN_RESTART: Final = "restart"
 THEN_POLICY: Final = "policy"
@@ -93,8 +98,8 @@ class Instance:
         self.fenced = ""
         self.kill_by: float | None = None
         self.withdrawn = False
-        self.phase = STARTING
-        self.then = ""
+        self.phase: Phase = STARTING
+        self.then: Then = ""
         self.pid = 0
         self.exit_code = 0
         self.exit_signal = 0
@@ -125,7 +130,7 @@ class Instance:
         return self.heard + self.fence.after
 
 
-def end(instance: Instance, phase: str, message: str) -> None:
+def end(instance: Instance, phase: Phase, message: str) -> None:
     """Set an instance to ended."""
     instance.phase = phase
     instance.then = ""

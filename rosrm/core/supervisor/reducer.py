@@ -62,104 +62,186 @@ The supervisor imports this package and must stay small. So the package uses not
 
 from __future__ import annotations
 
-from rosrm.core.supervisor.commands import Command, Drop, Leave, Signal, Spawn, Tell, Unspawn
+from collections.abc import Iterator
+from typing import Final
+
+from rosrm.core.supervisor.commands import Command, Drop, Leave, Spawn, Tell
 from rosrm.core.supervisor.events import (
     AmendOrdered,
-    Cleared,
     ClientLost,
     Event,
-    Exited,
     FailOrdered,
     FenceOrdered,
     FencePassed,
     Forgotten,
     Heard,
     RestartOrdered,
-    Resumed,
     ShutdownOrdered,
-    Spawned,
-    SpawnFailed,
     StartOrdered,
     StopOrdered,
     TimePassed,
 )
-from rosrm.core.supervisor.instance import (
-    BACKOFF,
-    ENDED,
-    EXITED,
-    FAILED,
-    FENCED,
-    KILL_AGAIN,
-    MOST_KILLS,
-    REFUSED,
-    RUNNING,
-    STARTING,
-    STEPS,
-    STOPPING,
-    THEN_END,
-    THEN_POLICY,
-    THEN_RESTART,
-    UNKNOWN_EXIT,
-    WITHDRAWN,
-    Instance,
-    signal_name,
-)
-from rosrm.core.supervisor.instances import MOST_TOMBSTONES, Supervision
-from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
-from rosrm.core.supervisor.transitions import TRANSITIONS, Transition, backoff
+from rosrm.core.supervisor.instance import BACKOFF, MOST_KILLS, REFUSED, THEN_END, Instance, end
+from rosrm.core.supervisor.rules import Key, RestartRule, StopRule
+from rosrm.core.supervisor.transitions import TRANSITIONS
 
-__all__ = [
-    "BACKOFF",
-    "ENDED",
-    "EXITED",
-    "FAILED",
-    "FENCED",
-    "KILL_AGAIN",
-    "MOST_KILLS",
-    "MOST_TOMBSTONES",
-    "REFUSED",
-    "RUNNING",
-    "STARTING",
-    "STEPS",
-    "STOPPING",
-    "THEN_END",
-    "THEN_POLICY",
-    "THEN_RESTART",
-    "TRANSITIONS",
-    "UNKNOWN_EXIT",
-    "WITHDRAWN",
-    "AmendOrdered",
-    "Cleared",
-    "ClientLost",
-    "Command",
-    "Drop",
-    "Event",
-    "Exited",
-    "FailOrdered",
-    "FenceOrdered",
-    "FencePassed",
-    "FenceRule",
-    "Forgotten",
-    "Heard",
-    "Instance",
-    "Key",
-    "Leave",
-    "RestartOrdered",
-    "RestartRule",
-    "Resumed",
-    "ShutdownOrdered",
-    "Signal",
-    "Spawn",
-    "SpawnFailed",
-    "Spawned",
-    "StartOrdered",
-    "StopOrdered",
-    "StopRule",
-    "Supervision",
-    "Tell",
-    "TimePassed",
-    "Transition",
-    "Unspawn",
-    "backoff",
-    "signal_name",
-]
+#: Process names whose dead numbers are remembered.
+MOST_TOMBSTONES: Final = 2000
+#: Most restarts by policy within `RESTART_SPAN` seconds, so that instances that crashed together do
+#: not start together.
+MOST_RESTARTS: Final = 8
+RESTART_SPAN: Final = 1.0
+
+_ORDERS: Final = (
+    StartOrdered, StopOrdered, FenceOrdered, RestartOrdered, AmendOrdered, FailOrdered, Forgotten
+)  # fmt: skip
+_OrderOfStranger = StartOrdered | StopOrdered | FenceOrdered | RestartOrdered | AmendOrdered
+
+
+class Supervision:
+    """The instances of one host.
+
+    Attributes:
+        instances: all that are not forgotten.
+        dead: process name to the highest forgotten number; instances up to it never start.
+        closing: a shutdown was ordered.
+    """
+
+    def __init__(self) -> None:
+        self.instances: dict[Key, Instance] = {}
+        self.dead: dict[str, int] = {}
+        self.closing = False
+        self._timed: dict[Key, float] = {}
+        self._restarted: list[float] = []
+
+    def restore(self, instance: Instance) -> None:
+        """Restore an instance that an earlier supervisor of this host recorded."""
+        self.instances[instance.key] = instance
+        self._watch_deadline(instance)
+
+    def deadline(self) -> float | None:
+        """Return the time at which `TimePassed` is due; None: never, as things are."""
+        return min(self._timed.values(), default=None)
+
+    @property
+    def idle(self) -> bool:
+        """Return True if no instance runs, and none will without an order."""
+        return all(instance.ended for instance in self.instances.values())
+
+    def handle(self, event: Event, now: float) -> list[Command]:
+        """Handle an event, and return the commands."""
+        commands = list(self._follow(event, now))
+        if self.closing and self._nothing_to_wait_for():
+            commands.append(Leave())
+        return commands
+
+    def _follow(self, event: Event, now: float) -> Iterator[Command]:
+        if isinstance(event, TimePassed):
+            due = [key for key, deadline in self._timed.items() if deadline <= now]
+            for key in due:
+                yield from self._fence_in_time(self.instances[key], now)
+                if self._has_turn(self.instances[key], now):
+                    yield from self._apply(self.instances[key], event, now)
+        elif isinstance(event, Heard):
+            self._renew(min(event.at, now), min(event.alive, now))
+        elif isinstance(event, ShutdownOrdered):
+            self.closing = True
+            for instance in list(self.instances.values()):
+                instance.withdrawn |= not instance.ended and instance.then != THEN_END
+                yield from self._apply(instance, StopOrdered(instance.key), now)
+        elif isinstance(event, ClientLost):
+            return
+        elif event.instance in self.instances:
+            yield from self._known(self.instances[event.instance], event, now)
+        elif isinstance(event, _OrderOfStranger):
+            yield from self._unknown(event, now)
+
+    def _renew(self, heard: float, alive: float) -> None:
+        """Renew the fences; instances that are fenced already stay so."""
+        for instance in self.instances.values():
+            if instance.fence is None or instance.fence_at is None:
+                continue
+            newest = max(heard, alive) if instance.fence.alive else heard
+            if instance.heard < newest:
+                instance.heard = newest
+                self._watch_deadline(instance)
+
+    def _fence_in_time(self, instance: Instance, now: float) -> list[Command]:
+        at = instance.fence_at
+        if at is None or now < at:
+            return []
+        return self._apply(instance, FencePassed(instance.key), now)
+
+    def _has_turn(self, instance: Instance, now: float) -> bool:
+        """Return True if its step is due and a restart may begin; otherwise it is due later."""
+        if instance.deadline is None or now < instance.deadline:
+            return False
+        if instance.phase != BACKOFF:
+            return True
+        self._restarted = [at for at in self._restarted if now - at < RESTART_SPAN]
+        if len(self._restarted) < MOST_RESTARTS:
+            self._restarted.append(now)
+            return True
+        instance.deadline = self._restarted[0] + RESTART_SPAN
+        self._watch_deadline(instance)
+        return False
+
+    def _known(self, instance: Instance, event: Event, now: float) -> Iterator[Command]:
+        if isinstance(event, Forgotten) and instance.ended:
+            yield self._bury(instance)
+            return
+        commands = self._apply(instance, event, now)
+        yield from commands
+        if not commands and isinstance(event, _ORDERS):
+            yield Tell(instance.key)
+
+    def _unknown(self, event: _OrderOfStranger, now: float) -> Iterator[Command]:
+        name, number = event.instance
+        if isinstance(event, StartOrdered):
+            instance = Instance(event.instance, event.restart, event.stop)
+            instance.fence = event.fence
+            slave_counts = event.fence is not None and event.fence.alive
+            known = None if slave_counts else event.heard
+            instance.heard = now if known is None else min(known, now)
+        else:
+            instance = Instance(event.instance, RestartRule(), StopRule())
+        self.instances[instance.key] = instance
+        if number <= self.dead.get(name, -1):
+            end(instance, REFUSED, f"{name}#{number} or a later one has ended and was forgotten")
+        elif not isinstance(event, StartOrdered):
+            end(instance, REFUSED, "it was never started here")
+        elif self.closing:
+            end(instance, REFUSED, "the supervisor of this host is shutting down")
+        self._watch_deadline(instance)
+        yield Tell(instance.key)
+        if not instance.ended:
+            yield Spawn(instance.key)
+
+    def _apply(self, instance: Instance, event: Event, now: float) -> list[Command]:
+        transition = TRANSITIONS.get((instance.phase, type(event)))
+        if transition is None:
+            return []
+        commands = transition(instance, event, now)
+        self._watch_deadline(instance)
+        return commands
+
+    def _watch_deadline(self, instance: Instance) -> None:
+        due = [at for at in (instance.deadline, instance.fence_at) if at is not None]
+        if due:
+            self._timed[instance.key] = min(due)
+        else:
+            self._timed.pop(instance.key, None)
+
+    def _bury(self, instance: Instance) -> Drop:
+        name, number = instance.key
+        del self.instances[instance.key]
+        newest = max(number, self.dead.pop(name, number))
+        self.dead[name] = newest
+        while len(self.dead) > MOST_TOMBSTONES:
+            del self.dead[next(iter(self.dead))]
+        return Drop(instance.key)
+
+    def _nothing_to_wait_for(self) -> bool:
+        return all(
+            instance.ended or instance.kills > MOST_KILLS for instance in self.instances.values()
+        )

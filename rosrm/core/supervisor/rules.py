@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 #: Process name and number, as in `InstanceId`.
 Key = tuple[str, int]
@@ -11,7 +11,7 @@ Key = tuple[str, int]
 class RestartRule(NamedTuple):
     """Lightweight copy of `rosrm.model.values.RestartPolicy`."""
 
-    when: str = "never"
+    when: Literal["never", "on-failure", "always"] = "never"
     delay: float = 1.0
     max_delay: float = 30.0
     factor: float = 2.0

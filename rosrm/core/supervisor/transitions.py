@@ -39,6 +39,8 @@ from rosrm.core.supervisor.instance import (
     THEN_RESTART,
     WITHDRAWN,
     Instance,
+    Phase,
+    Then,
     end,
     ending,
     stopping,
@@ -214,7 +216,7 @@ def _amend_in_backoff(instance: Instance, event: Event, now: float) -> list[Comm
     return commands
 
 
-TRANSITIONS: Final[dict[tuple[str, type], Transition]] = {
+TRANSITIONS: Final[dict[tuple[Phase, type], Transition]] = {
     (STARTING, Spawned): _spawned,
     (STARTING, SpawnFailed): _spawn_failed,
     (STARTING, StopOrdered): _stop_before_spawn,
@@ -257,7 +259,7 @@ def _start_again(instance: Instance) -> list[Command]:
     return [Tell(instance.key), Spawn(instance.key)]
 
 
-def _begin_stop(instance: Instance, then: str, now: float, first: int = 0) -> list[Command]:
+def _begin_stop(instance: Instance, then: Then, now: float, first: int = 0) -> list[Command]:
     """Begin a stop with the step `first`."""
     instance.phase = STOPPING
     instance.then = then

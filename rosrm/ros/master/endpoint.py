@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Assign, Order, Redeliver, Reply, Withdraw
 from rosrm.ros import names, qos
 from rosrm.ros.master.handoff import HandoffEndpoint
 from rosrm.ros.master.services import Identity, MasterServices, Queries
@@ -27,18 +26,18 @@ from rosrm.ros.participant import Participant
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
 
-__all__ = ["Identity", "MasterEndpoint", "Queries"]
-
 #: Seconds between two load messages of the master.
 _LOAD_EVERY: Final = 1.0
 
 
 class MasterEndpoint:
-    """All messages of the master, sent and received.
+    """The parts that exchange the master's messages; its beats and readings.
 
     Attributes:
         events: received since the runtime took them last.
-        handoffs: messages of handoffs.
+        links: sends orders and assignments to slaves.
+        services: answers requests of slaves and clients.
+        handoffs: exchanges messages with nodes of handoffs.
         rival: newest beat of another master; None: none since the last one was judged.
         incarnation: random number of this run of the master.
     """
@@ -48,28 +47,26 @@ class MasterEndpoint:
         participant: Participant,
         identity: Identity,
         queries: Queries,
-        beat: Callable[[], int],
         control: ControlSettings,
     ) -> None:
         self._identity = identity
         self._guard = participant.guard
-        self._beat = beat
         self.events: list[happened.Event] = []
         self.rival: msg.MasterBeat | None = None
         self.incarnation = identity.incarnation
-        refuse = Refusals(self._take_event)
-        self._links = HostLinks(
+        refuse = Refusals(self.events.append)
+        self.links = HostLinks(
             participant, f"master {identity.name}", identity.epoch, control.order_retry,
-            self._take_event,
+            self.events.append,
         )  # fmt: skip
         self.handoffs = HandoffEndpoint(
-            participant, identity.name, identity.epoch, self._take_event, refuse
+            participant, identity.name, identity.epoch, self.events.append, refuse
         )
-        self._hearing = Hearing(participant, self._links, self._take_event, refuse)
+        self._hearing = Hearing(participant, self.links, self.events.append, refuse)
         self._say(participant)
-        self._services = MasterServices(
-            participant, self._links, identity, queries,
-            beat=beat, control=control, tell=self._take_event, refuse=refuse,
+        self.services = MasterServices(
+            participant, self.links, identity, queries,
+            control=control, tell=self.events.append, refuse=refuse,
         )  # fmt: skip
 
     def _say(self, participant: Participant) -> None:
@@ -83,24 +80,16 @@ class MasterEndpoint:
         self._load_at = 0.0
         self._oldest: list[float] = []
 
-    def _take_event(self, event: happened.Event) -> None:
-        self.events.append(event)
-
     def _take_beat(self, message: msg.MasterBeat) -> None:
         if message.incarnation != self._identity.incarnation:
             self.rival = message
 
-    # --- received ------------------------------------------------------------------------
-
     def poll_readings(self) -> None:
         """Take new readings, even when no other event occurs; called in every tick."""
-        self._take_readings()
-        self._oldest.append(self._links.ledger.ages(time.monotonic())[1])
+        self._guard.call(self._take_readings)
+        self._oldest.append(self.links.ledger.ages(time.monotonic())[1])
 
     def _take_readings(self) -> None:
-        self._guard.call(self._take_new_readings)
-
-    def _take_new_readings(self) -> None:
         readings = self._hearing.poll_readings()
         if readings is not None:
             # Placed first, because a usage must not be judged by readings older than it.
@@ -109,43 +98,10 @@ class MasterEndpoint:
     def take_events(self) -> list[happened.Event]:
         """Return the events since the last call, in order, preceded by the newest readings."""
         if self.events and not isinstance(self.events[0], happened.ReadingsReceived):
-            self._take_readings()
-        events, self.events = self.events, []
+            self._guard.call(self._take_readings)
+        events = list(self.events)
+        self.events.clear()
         return events
-
-    # --- sent ----------------------------------------------------------------------------
-
-    def reply(self, command: Reply) -> None:
-        """Answer a request."""
-        self._services.reply(command)
-
-    def assign(self, command: Assign) -> None:
-        """Keep an assignment for the answer to the host's request."""
-        self._links.assign(command)
-
-    def flush(self, journal: int) -> None:
-        """Answer the open requests of hosts that have assignments.
-
-        Args:
-            journal: sequence of the newest written record.
-        """
-        self._links.flush(journal)
-
-    def withdraw(self, command: Withdraw, now: float) -> None:
-        """Remove an assignment that was not yet fetched, or order its end."""
-        self._links.withdraw(command, now)
-
-    def redeliver(self, command: Redeliver, now: float) -> None:
-        """Order the start of an assignment that was fetched already."""
-        self._links.redeliver(command, now)
-
-    def order(self, command: Order, now: float) -> None:
-        """Send an order to a slave; the answer, or its absence in time, becomes an event."""
-        self._links.order(command, now)
-
-    def expire(self, now: float) -> None:
-        """End the orders and requests that got no answer in time."""
-        self._links.expire(now)
 
     def beat(self, uptime: float, unheard: Sequence[int], journal: int) -> None:
         """Publish the master's beat, and its load at most once a second.
@@ -160,7 +116,7 @@ class MasterEndpoint:
             msg.MasterBeat(
                 protocol_version=PROTOCOL_VERSION, name=identity.name, hostname=identity.hostname,
                 pid=identity.pid, epoch=identity.epoch, incarnation=identity.incarnation,
-                beat=self._beat(), uptime=uptime, journal=journal, unheard=list(unheard),
+                beat=time.monotonic_ns(), uptime=uptime, journal=journal, unheard=list(unheard),
             )
         )  # fmt: skip
         if uptime - self._load_at >= _LOAD_EVERY:
@@ -169,7 +125,7 @@ class MasterEndpoint:
 
     def _say_load(self, uptime: float) -> None:
         """Publish statistics that show if the master keeps up with its slaves' messages."""
-        ledger = self._links.ledger
+        ledger = self.links.ledger
         hosts, _ = ledger.ages(time.monotonic())
         oldest, self._oldest = self._oldest, []
         facts = {

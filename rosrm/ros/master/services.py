@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -50,7 +51,6 @@ class MasterServices:
         links: to the slaves.
         identity: of this master.
         queries: answers read-only requests.
-        beat: this master's clock, ns.
         control: greatest age of a request, and the beat period for slaves.
         tell: receives the events.
         refuse: receives refused peers, and reasons.
@@ -58,14 +58,13 @@ class MasterServices:
 
     def __init__(
         self, participant: Participant, links: HostLinks, identity: Identity, queries: Queries,
-        *, beat: Callable[[], int], control: ControlSettings,
+        *, control: ControlSettings,
         tell: Callable[[happened.Event], None], refuse: Callable[[str, str], None],
     ) -> None:  # fmt: skip
         self._participant = participant
-        self._server = ControlServer(participant, Gate(beat, control.max_age))
+        self._server = ControlServer(participant, Gate(time.monotonic_ns, control.max_age))
         self._identity = identity
         self._queries = queries
-        self._beat = beat
         self._beat_period = control.beat_period
         self._links = links
         self._tell = tell
@@ -151,7 +150,7 @@ class MasterServices:
                 protocol_version=PROTOCOL_VERSION, software_version=__version__,
                 accepted=not fault, message=fault, master=self._identity.name,
                 hostname=self._identity.hostname, pid=self._identity.pid,
-                epoch=self._identity.epoch, beat=self._beat(),
+                epoch=self._identity.epoch, beat=time.monotonic_ns(),
             )
         )  # fmt: skip
 

@@ -7,33 +7,22 @@ discovered the slave's service, because it would be lost otherwise.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Assign, Order, Redeliver, Withdraw
+from rosrm.core.master.commands import Assign, OrderId, Redeliver, SendOrder, Withdraw
 from rosrm.errors import Refused
+from rosrm.model.orders import seconds_of
 from rosrm.model.values import Assignment, HostDescription
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, accepted, version_refusal
 from rosrm.ros.master.reading_stats import Ledger
+from rosrm.ros.orders import order_to_msg
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
-
-_ACTIONS: Final = {
-    "stop": srv.ControlHost.Request.STOP,
-    "fence": srv.ControlHost.Request.FENCE,
-    "restart": srv.ControlHost.Request.RESTART,
-    "start": srv.ControlHost.Request.START,
-    "execute": srv.ControlHost.Request.EXECUTE,
-    "report": srv.ControlHost.Request.REPORT,
-    "set_restart": srv.ControlHost.Request.SET_RESTART,
-    "keep": srv.ControlHost.Request.KEEP,
-    "drop_kept": srv.ControlHost.Request.DROP_KEPT,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,31 +209,28 @@ class HostLinks:
             link.outbox = kept
             self._tell(happened.AssignmentWithdrawn(command.instance))
             return
-        self.order(Order(command.order, command.host_id, "stop", command.instance), now)
+        self.order(command.if_fetched, now)
 
     def redeliver(self, command: Redeliver, now: float) -> None:
         """Order the start of an assignment, unless it waits to be fetched."""
         link, assignment = self._links.get(command.host_id), command.assignment
         if link is None or all(one.instance != assignment.instance for one in link.outbox):
-            self.order(
-                Order(command.order, command.host_id, "start", assignment.instance, assignment), now
-            )
+            self.order(command.if_fetched, now)
 
     # --- orders --------------------------------------------------------------------------
 
-    def order(self, command: Order, now: float) -> None:
+    def order(self, command: SendOrder, now: float) -> None:
         """Send an order to a slave; the answer, or its absence in time, becomes an event."""
         link = self._links.get(command.host_id)
         if link is None:  # expected from the journal, not registered yet
-            self._tell(
-                happened.OrderAnswered(command.order, False, "timeout", "the host does not report")
-            )
+            why = "the host does not report"
+            self._tell(happened.OrderAnswered(command.order_id, False, "timeout", why))
             return
-        request = _order_request(command)
-        deadline = now + command.timeout + self._order_timeout
+        request = order_to_msg(command.order)
+        deadline = now + seconds_of(command.order) + self._order_timeout
 
         def done(response: srv.ControlHost.Response | None) -> None:
-            self._tell(_order_answered(command.order, response))
+            self._tell(_order_answered(command.order_id, response))
 
         def send() -> None:
             if not link.control.service_is_ready():
@@ -269,24 +255,9 @@ class HostLinks:
                 order.done(None)
 
 
-def _order_request(command: Order) -> srv.ControlHost.Request:
-    """Return an order as a message without its envelope."""
-    request = srv.ControlHost.Request(
-        action=_ACTIONS[command.action], executor=command.executor, timeout=float(command.timeout),
-        keep_on=list(command.keep_on), keep_every=float(command.keep_every),
-    )  # fmt: skip
-    if command.instance is not None:
-        request.instance = convert.instance_to_msg(command.instance)
-    if command.assignment is not None:
-        request.assignment = convert.assignment_to_msg(command.assignment)
-    if command.restart is not None:
-        request.restart = convert.restart_to_msg(command.restart)
-    if command.executor:
-        request.arguments = json.dumps(dict(command.arguments))
-    return request
-
-
-def _order_answered(order: int, response: srv.ControlHost.Response | None) -> happened.Event:
+def _order_answered(
+    order: OrderId, response: srv.ControlHost.Response | None
+) -> happened.OrderAnswered:
     if response is None:
         return happened.OrderAnswered(order, False, "timeout", "no answer in time")
     answer = response.answer

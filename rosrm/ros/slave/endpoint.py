@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -12,20 +13,21 @@ import numpy as np
 import numpy.typing as npt
 from rclpy.duration import Duration
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import events
+from rosrm.core.slave.master_clock import BeatClock
+from rosrm.core.slave.state import SlaveState
 from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.values import HostDescription, InstanceStatus, KeptState
 from rosrm.ros import convert, names, qos
-from rosrm.ros.control import Call, ControlClient, Gate, version_refusal
+from rosrm.ros.control import Call, ControlClient, version_refusal
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave.journal_watermark import JournalSeen, Seen
 from rosrm.ros.slave.reporter import Reporter
-from rosrm.ros.slave.services import Host, LogQuery, LogSlice, SlaveServices
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import msg, srv
 
-__all__ = ["Host", "Link", "LogQuery", "LogSlice", "SlaveEndpoint"]
+_log = logging.getLogger("rosrm.slave")
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0
@@ -63,21 +65,31 @@ class Link(Enum):
 class SlaveEndpoint:
     """The slave's publishers, subscriptions and requests to its master.
 
+    Args:
+        participant: of this slave.
+        description: of this host.
+        state: instances of the slave; read-only here.
+        take: takes events for the core.
+        kept_states: returns all snapshots on this host.
+        seen: newest journal records of the masters that this host knows.
+
     Attributes:
         link: state of the connection to the master.
         failure: reason to give up; "": there is none.
         superseded: the reason is another live slave with its name.
         cluster: name of the last master that greeted this slave; "" before the first one.
+        epoch: newest known epoch of the master.
         failing: kind and name of each failing plugin on this host, with the reason; sent with the
             statuses. A probe is named by the resource that it reads.
     """
 
     def __init__(
-        self, participant: Participant, host: Host, description: HostDescription, max_age: float,
-        seen: JournalSeen | None = None,
+        self, participant: Participant, description: HostDescription, state: SlaveState, *,
+        take: Callable[[events.Event], None],
+        kept_states: Callable[[], Sequence[KeptState]] = tuple, seen: JournalSeen | None = None,
     ) -> None:  # fmt: skip
         self._participant = participant
-        self._host = host
+        self._state, self._take, self._kept_states = state, take, kept_states
         self._description = description
         self._seen = seen or JournalSeen()
         self.link = Link.SEARCHING
@@ -86,14 +98,14 @@ class SlaveEndpoint:
         self.cluster = ""
         self.failing: dict[Plugin, str] = {}
         self.host_id = 0
-        self._epoch = 0
+        self.epoch = 0
         self._master_beat = 0
         self._beat_at = 0.0
         self._beat_period = 1.0
         self._greeting = srv.Handshake.Response()
         self._greeted_at = 0.0
         self._asked_at = 0.0
-        self._beat_clock = core.BeatClock()
+        self._beat_clock = BeatClock()
         self._newest_beat: msg.MasterBeat | None = None
         self._incarnation = 0  # of the master of this registration, complete or in progress
         self._registered_with = 0  # incarnation of the last master that accepted the registration
@@ -106,9 +118,9 @@ class SlaveEndpoint:
         self._status_sequence = 0
         self._control = ControlClient(participant, f"slave {description.name}")
         self._names = names.Names(participant.settings.namespace)
-        self._join(max_age)
+        self._join()
 
-    def _join(self, max_age: float) -> None:
+    def _join(self) -> None:
         node, path = self._participant.node, self._names
         self._clients = {
             kind: node.create_client(kind, path(name), qos_profile=qos.SERVICE)
@@ -135,8 +147,6 @@ class SlaveEndpoint:
             msg.MasterBeat, path(names.MASTER_BEAT),
             self._participant.counted(self._take_beat), qos.BEAT_IN,
         )  # fmt: skip
-        gate = Gate(time.monotonic_ns, max_age)
-        SlaveServices(self._participant, self._host, description.name, gate, lambda: self._epoch)
 
     # --- finding the master --------------------------------------------------------------
 
@@ -187,8 +197,8 @@ class SlaveEndpoint:
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
-            instances=[convert.status_to_msg(status) for status in self._host.statuses()],
-            kept=[convert.kept_to_msg(one) for one in self._host.kept_states()],
+            instances=[convert.status_to_msg(status) for status in self._state.statuses()],
+            kept=[convert.kept_to_msg(one) for one in self._kept_states()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
         self._incarnation = beat.incarnation
@@ -216,20 +226,20 @@ class SlaveEndpoint:
         self._taken_since = None
         self.host_id = response.host_id
         another = self._registered_with not in (0, self._incarnation)
-        renumbers = another and answer.epoch <= self._epoch
-        self._registered_with, self._epoch = self._incarnation, answer.epoch
+        renumbers = another and answer.epoch <= self.epoch
+        self._registered_with, self.epoch = self._incarnation, answer.epoch
         self._beat_period = response.beat_period
         self._beat_at = now
         self._poll_anew = _FIRST_POLL_ANEW
         self._reporter.begin(self.host_id, self._beat_period)
         self.link = Link.REGISTERED
-        self._host.take(core.MasterHears(self._asked_at))
-        self._host.take(core.Registered(answer.epoch, renumbers))
+        self._take(events.MasterHears(self._asked_at))
+        self._take(events.Registered(answer.epoch, renumbers))
         greeting = self._greeting
-        self._host.say(
-            f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "
-            f"as host {self.host_id}"
-        )
+        _log.info(
+            "registered with master %s (pid %d on %s) as host %d",
+            greeting.master, greeting.pid, greeting.hostname, self.host_id,
+        )  # fmt: skip
         if self._leaves is not None:  # the former master was gone before it recorded this
             self._send_leave(self._leaves, lambda: None)
 
@@ -238,17 +248,17 @@ class SlaveEndpoint:
         self.link = Link.SEARCHING
         if self._waits_since is None:
             self._waits_since = now
-            self._host.say(f"the master takes no host in, asking on: {why}")
+            _log.info("the master takes no host in, asking on: %s", why)
 
     def _turned_down(self, answer: msg.Answer, now: float) -> None:
         """Retry for a while if the name is taken, as a former run of this slave may hold it."""
         if self._taken_since is None:
             self._taken_since = now
             if answer.code == "name_taken":
-                self._host.say(
-                    f"{answer.message}. Asking again for {self._patience():g} s, as that slave may "
-                    f"have been killed a moment ago"
-                )
+                _log.info(
+                    "%s. Asking again for %g s, as that slave may have been killed a moment ago",
+                    answer.message, self._patience(),
+                )  # fmt: skip
         if answer.code != "name_taken" or now - self._taken_since >= self._patience():
             self.failure = answer.message
             self.superseded = answer.code == "name_taken"
@@ -256,7 +266,7 @@ class SlaveEndpoint:
         self.link = Link.SEARCHING
 
     def _patience(self) -> float:
-        found = any(not status.state.ended for status in self._host.statuses())
+        found = any(not status.state.ended for status in self._state.statuses())
         return _NAME_TAKEN_BY_FORMER if found and not self.host_id else _NAME_TAKEN
 
     def _lose_master(self, reason: str) -> None:
@@ -264,15 +274,15 @@ class SlaveEndpoint:
         self._poll_at = 0.0
         self._newest_beat = None
         self._control.forget()
-        self._host.take(core.MasterLost())
-        self._host.say(reason)
+        self._take(events.MasterLost())
+        _log.info("%s", reason)
 
     def _take_beat(self, beat: msg.MasterBeat) -> None:
         if version_refusal(beat.protocol_version, "the master"):
             return  # the handshake reports the version mismatch
         now = time.monotonic()
         if self.link is Link.REGISTERED and beat.incarnation != self._incarnation:
-            if beat.epoch <= self._epoch and not self._missed(_MISSED_BY_ANOTHER, now):
+            if beat.epoch <= self.epoch and not self._missed(_MISSED_BY_ANOTHER, now):
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
@@ -280,7 +290,7 @@ class SlaveEndpoint:
         if self.link is Link.REGISTERED:
             self._seen.note(Seen(beat.journal, beat.incarnation, self.cluster))
         if self.link is Link.REGISTERED and self.host_id not in beat.unheard:
-            self._host.take(core.MasterHears(said_at))
+            self._take(events.MasterHears(said_at))
         if self.link is Link.LISTENING:
             self._register_if_known()
 
@@ -310,7 +320,7 @@ class SlaveEndpoint:
         if self._poll is not None:
             self._poll.deadline = now + _PATIENCE
         request = srv.RequestProcess.Request(
-            envelope=self._control.envelope(self._master_beat, self._epoch),
+            envelope=self._control.envelope(self._master_beat, self.epoch),
             host_id=self.host_id, incarnation=self._description.incarnation,
         )  # fmt: skip
         self._poll = self._control.call(
@@ -331,10 +341,10 @@ class SlaveEndpoint:
         try:
             work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
         except Refused as refusal:
-            self._host.say(f"an assignment that makes no sense was refused: {refusal}")
+            _log.info("an assignment that makes no sense was refused: %s", refusal)
             return
         given_at = response.slave_beat / 1e9 if response.slave_beat else None
-        self._host.take(core.AssignmentsReceived(work, given_at))
+        self._take(events.AssignmentsReceived(work, given_at))
 
     # --- reports ---------------------------------------------------------------------------
 
@@ -403,9 +413,7 @@ class SlaveEndpoint:
         if self.link is not Link.REGISTERED:
             return
         if not self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS)):
-            self._host.say(
-                f"the master did not acknowledge the last statuses within {_LAST_WORDS:g} s"
-            )
+            _log.info("the master did not acknowledge the last statuses within %g s", _LAST_WORDS)
 
     def leave(self, done: Callable[[], None], kept: Sequence[InstanceStatus] = ()) -> None:
         """Report that this slave stops; `done` is called when the master knows, or is silent.
@@ -424,7 +432,7 @@ class SlaveEndpoint:
 
     def _send_leave(self, kept: Sequence[InstanceStatus], done: Callable[[], None]) -> None:
         request = srv.Leave.Request(
-            envelope=self._control.envelope(self._master_beat, self._epoch),
+            envelope=self._control.envelope(self._master_beat, self.epoch),
             host_id=self.host_id, incarnation=self._description.incarnation,
             kept=[convert.status_to_msg(status) for status in kept],
         )  # fmt: skip

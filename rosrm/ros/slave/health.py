@@ -23,7 +23,7 @@ from rclpy.qos import (
     qos_profile_services_default,
 )
 
-from rosrm.core.slave.reducer import Watch
+from rosrm.core.slave.watches import NO_ANSWER, Watch
 from rosrm.ros.slave.graph import GraphWatch
 
 #: Seconds between two checks of the graph while a topic is subscribed.
@@ -62,7 +62,7 @@ class HealthEar:
         return (None, "") if self._topic is None else self._topic.look(pids, now)
 
     def state(self, now: float) -> str | None:
-        """Return the lifecycle state; "": the node does not answer; None: not known yet."""
+        """Return the lifecycle state, or `NO_ANSWER`; None: not known yet."""
         return None if self._state is None else self._state.look(now)
 
     def close(self) -> None:
@@ -176,7 +176,7 @@ class _StateEar:
         for client in self._clients:
             self._hear(client, now)
         if now - self._answered > self._period + _PATIENCE:
-            self._state = ""
+            self._state = NO_ANSWER
         if now - self._asked >= self._period:
             self._asked = now
             for client in self._clients:

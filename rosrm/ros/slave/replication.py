@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from rosrm.ros import names, qos
 from rosrm.ros.control import ControlClient, accepted, refused, version_refusal
@@ -20,11 +20,24 @@ _IDLE: Final = 60.0
 MOST: Final = 256 << 10
 
 
+class NotStored(NamedTuple):
+    """Reason why a slave has not stored a part of a snapshot.
+
+    Attributes:
+        code: "newer": it has this snapshot or a newer one; "order": the parts before are missing;
+            "full": no room; "damaged": the digest differs; "timeout": no answer.
+        message: as text for the user.
+    """
+
+    code: Literal["newer", "order", "full", "damaged", "timeout", "version"]
+    message: str
+
+
 class KeptHost(Protocol):
     """Interface of the slave for its replication endpoint."""
 
-    def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
-        """Store a part of a replica; `answer` with a code and a message, both "" when accepted."""
+    def take_part(self, part: Part, answer: Callable[[NotStored | None], None]) -> None:
+        """Store a part of a replica; `answer` with None, or with the reason of a refusal."""
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,
@@ -60,12 +73,12 @@ class KeptEndpoint:
         def take(request: srv.KeepState.Request, open_request: OpenRequest) -> None:
             fault = version_refusal(request.protocol_version, f"the slave of {request.sender}")
 
-            def answer(code: str, message: str) -> None:
-                answer = refused(code, message) if code else accepted()
+            def answer(refusal: NotStored | None) -> None:
+                answer = accepted() if refusal is None else refused(*refusal)
                 open_request.answer(srv.KeepState.Response(answer=answer))
 
             if fault:
-                answer("version", fault)
+                answer(NotStored("version", fault))
                 return
             part = Part(
                 request.process, request.number, request.sequence, request.offset, request.total,
@@ -112,9 +125,9 @@ class KeptEndpoint:
 
     def give(
         self, host: str, part: Part, now: float, timeout: float,
-        done: Callable[[str, str], None],
+        done: Callable[[NotStored | None], None],
     ) -> None:  # fmt: skip
-        """Send a part to a slave; `done` gets a code and a message, both "" when accepted."""
+        """Send a part to a slave; `done` gets None when it was stored, else the reason."""
         request = srv.KeepState.Request(
             protocol_version=PROTOCOL_VERSION, sender=self._name, process=part.process,
             number=part.number, sequence=part.sequence, offset=part.offset, total=part.total,
@@ -123,10 +136,10 @@ class KeptEndpoint:
 
         def answered(response: srv.KeepState.Response | None) -> None:
             if response is None:
-                done("timeout", f"no answer within {timeout:g} s")
+                done(NotStored("timeout", f"no answer within {timeout:g} s"))
             else:
                 answer = response.answer
-                done("" if answer.accepted else answer.code or "refused", answer.message)
+                done(None if answer.accepted else NotStored(answer.code, answer.message))
 
         client = self._peer(srv.KeepState, names.KEEP_STATE, host, now)
         self._client.call(client, request, now + timeout, answered)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, NamedTuple
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave.events import Event
+from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
-from rosrm.model.values import InstanceId, InstanceStatus, KeptState, RestartPolicy
-from rosrm.ros import convert, names
+from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
+from rosrm.model.rows import LogPart
+from rosrm.model.values import InstanceId
+from rosrm.ros import names
 from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
+from rosrm.ros.orders import order_from_msg
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm_msgs import srv
 
@@ -27,62 +32,44 @@ class LogQuery:
     max_bytes: int = 0
 
 
+class ExecutorOutcome(NamedTuple):
+    """Outcome of an executor.
+
+    Attributes:
+        code: "" after a success; "unable": the executor reported a failure by a `ValueError` or an
+            error of rosrm, which is a valid answer; "bad_result": it answered no JSON object;
+            "failed": it raised another exception.
+        message: of a failure.
+        result: as JSON; "" after a failure.
+    """
+
+    code: Literal["", "unable", "bad_result", "failed"]
+    message: str = ""
+    result: str = ""
+
+
 @dataclass(frozen=True, slots=True)
-class LogSlice:
-    """A part of a log as in the answer of `ReadLog`; a mark is (time, offset, pid)."""
+class Duties:
+    """Functions of a slave that execute requests; each is called in the loop's thread.
 
-    number: int
-    numbers: Sequence[int]
-    content: bytes
-    offset: int
-    next_offset: int
-    ended: bool
-    marks: Sequence[tuple[float, int, int]]
+    Attributes:
+        take: takes an event for the core.
+        set_restart: replaces the restart policy of an instance. It calls its last argument with ""
+            when the policy is durable, whichever process is killed, else with the reason why there
+            is no such instance.
+        keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
+        drop_kept: deletes the snapshots of a process, of instances up to this one.
+        execute: runs an executor, and calls its last argument with the outcome. If that takes
+            longer than the order allows, the executor's strategy counts as failing.
+        read_log: returns a part of a log; raises `Refused`.
+    """
 
-
-class Host(Protocol):
-    """Interface of the slave's runtime for its endpoint."""
-
-    def take(self, event: core.Event) -> None:
-        """Handle an event."""
-
-    def statuses(self) -> Sequence[InstanceStatus]:
-        """Return the statuses of all instances on this host."""
-
-    def kept_states(self) -> Sequence[KeptState]:
-        """Return all snapshots that this host holds."""
-
-    def read_log(self, query: LogQuery) -> LogSlice:
-        """Return a part of a log; raises `Refused`."""
-
-    def set_restart(
-        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
-    ) -> None:
-        """Replace the restart policy of an instance.
-
-        Args:
-            settled: called in the loop's thread; with "" when the policy is durable, whichever
-                process is killed, else with the reason why there is no such instance.
-        """
-
-    def execute(
-        self, executor: str, arguments: dict[str, Any], timeout: float,
-        done: Callable[[str, str, str], None],
-    ) -> None:  # fmt: skip
-        """Run an executor; `done(code, message, result)` is called in the loop's thread.
-
-        The code is "" after a success. If the executor takes longer than `timeout` seconds, its
-        strategy counts as failing.
-        """
-
-    def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
-        """Replicate an instance's snapshot to these hosts from now on, every `every` seconds."""
-
-    def drop_kept(self, instance: InstanceId) -> None:
-        """Delete the snapshots of a process, of instances up to this one."""
-
-    def say(self, message: str) -> None:
-        """Show a message to the user."""
+    take: Callable[[Event], None]
+    set_restart: Callable[[SetRestartPolicy, Callable[[str], None]], None]
+    keep: Callable[[InstanceId, Sequence[str], float], None]
+    drop_kept: Callable[[InstanceId], None]
+    execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
+    read_log: Callable[[LogQuery], LogPart]
 
 
 class SlaveServices:
@@ -90,63 +77,57 @@ class SlaveServices:
 
     Args:
         participant: offers the services.
-        host: carries out the requests.
-        name: of the host.
-        gate: admits or refuses every order.
+        duties: execute the requests.
+        host: name of the host.
+        max_age: seconds after which an order is stale.
         epoch: newest known epoch of the master; older orders are refused.
     """
 
     def __init__(
-        self, participant: Participant, host: Host, name: str, gate: Gate, epoch: Callable[[], int]
-    ) -> None:
-        self._host = host
+        self, participant: Participant, duties: Duties, host: str, max_age: float,
+        epoch: Callable[[], int],
+    ) -> None:  # fmt: skip
+        self._duties = duties
         path = names.Names(participant.settings.namespace)
-        server = ControlServer(participant, gate, epoch)
-        server.offer(srv.ControlHost, path.of_host(name, names.CONTROL), self._take_order)
-        participant.serve(srv.ReadLog, path.of_host(name, names.READ_LOG), self._take_log)
+        server = ControlServer(participant, Gate(time.monotonic_ns, max_age), epoch)
+        server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
+        participant.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
 
     def _take_order(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        kind = srv.ControlHost.Request
+        """Carry out an order; the outcomes of executors and restart policies come later."""
         try:
-            if request.action == kind.EXECUTE:
-                self._execute(request, respond)
-                return
-            if request.action == kind.SET_RESTART:
-                self._set_restart(request, respond)
-                return
-            if request.action in (kind.KEEP, kind.DROP_KEPT):
-                self._keep_or_drop(request)
-            else:
-                self._host.take(_ordered(request))
+            order = order_from_msg(request)
+            match order:
+                case RunExecutor():
+                    self._execute(order, respond)
+                    return
+                case SetRestartPolicy():
+                    self._set_restart(order, respond)
+                    return
+                case ReplicateSnapshot(instance, hosts, every):
+                    self._duties.keep(instance, hosts, every)
+                case DropReplica(instance):
+                    self._duties.drop_kept(instance)
+                case _:
+                    self._duties.take(event_of(order, request.envelope.receiver_beat / 1e9))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
 
-    def _keep_or_drop(self, request: srv.ControlHost.Request) -> None:
-        instance = convert.instance_from_msg(request.instance)
-        if request.action == request.KEEP:
-            self._host.keep(instance, tuple(request.keep_on), request.keep_every)
-        else:
-            self._host.drop_kept(instance)
-
-    def _set_restart(
-        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
-    ) -> None:
+    def _set_restart(self, order: SetRestartPolicy, respond: Callable[[Any], None]) -> None:
         def settled(refusal: str) -> None:
             answer = refused("unknown", refusal) if refusal else accepted()
             respond(srv.ControlHost.Response(answer=answer))
 
-        restart = convert.restart_from_msg(request.restart)
-        self._host.set_restart(convert.instance_from_msg(request.instance), restart, settled)
+        self._duties.set_restart(order, settled)
 
-    def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        def done(code: str, message: str, result: str) -> None:
-            answer = refused(code, message) if code else accepted()
-            respond(srv.ControlHost.Response(answer=answer, result=result))
+    def _execute(self, order: RunExecutor, respond: Callable[[Any], None]) -> None:
+        def done(outcome: ExecutorOutcome) -> None:
+            answer = refused(outcome.code, outcome.message) if outcome.code else accepted()
+            respond(srv.ControlHost.Response(answer=answer, result=outcome.result))
 
-        arguments = convert.json_object(request.arguments, "the arguments of an executor")
-        self._host.execute(request.executor, arguments, request.timeout, done)
+        self._duties.execute(order, done)
 
     def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "a reader of logs")
@@ -154,7 +135,7 @@ class SlaveServices:
             open_request.answer(srv.ReadLog.Response(answer=refused("version", fault)))
             return
         try:
-            part = self._host.read_log(
+            part = self._duties.read_log(
                 LogQuery(
                     request.process, request.number, request.offset, request.tail, request.since,
                     request.max_bytes,
@@ -173,23 +154,3 @@ class SlaveServices:
                 mark_pids=[mark[2] for mark in part.marks],
             )
         )  # fmt: skip
-
-
-def _ordered(request: srv.ControlHost.Request) -> core.Event:
-    """Return the core event of an order; raises `Refused`."""
-    kind = srv.ControlHost.Request
-    if request.action == kind.START:
-        given_at = request.envelope.receiver_beat / 1e9
-        return core.AssignmentsReceived(
-            (convert.assignment_from_msg(request.assignment),), given_at
-        )
-    instance = convert.instance_from_msg(request.instance)
-    orders: dict[int, core.Event] = {
-        kind.STOP: core.StopOrdered(instance),
-        kind.FENCE: core.FenceOrdered(instance),
-        kind.RESTART: core.RestartOrdered(instance),
-        kind.REPORT: core.ReportRequested(),
-    }
-    if request.action not in orders:
-        raise Refused(f"unknown action {request.action}")
-    return orders[request.action]

@@ -15,7 +15,8 @@ from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.environment import Whereabouts, process_environment
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ros_arguments
-from rosrm.supervisor.client import LaunchOrder, log_path
+from rosrm.supervisor.client import log_path
+from rosrm.supervisor.client_values import LaunchOrder
 
 
 def launch_order(

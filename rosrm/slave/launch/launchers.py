@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,16 +25,14 @@ from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 T = TypeVar("T")
 L = TypeVar("L")
 
+_log = logging.getLogger("rosrm.slave")
+
 #: Seconds for `prepare`: the loop of the slave waits for it.
 PREPARE_LIMIT: Final = 10.0
 
 
 def _no_capabilities(_spec: ProcessSpec) -> Capabilities:
     return Capabilities()
-
-
-def _no_log(_message: str) -> None:
-    """Log nothing: there is no launcher that could fail."""
 
 
 @dataclass
@@ -44,29 +43,24 @@ class Launchers:
         made: by name.
         unusable: name to the reason, of those that are absent or broken here.
         capabilities_of: names the launcher of a process.
-        log: logs a fault, once until the launcher has another one.
     """
 
     made: Mapping[str, MadeLauncher] = field(default_factory=lambda: EMPTY)
     unusable: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     capabilities_of: Callable[[ProcessSpec], Capabilities] = _no_capabilities
-    log: Callable[[str], None] = _no_log
     _logged: dict[str, str] = field(init=False, default_factory=dict)
 
     @classmethod
     def of(
-        cls,
-        offered: MadeLaunchers,
-        capabilities_of: Callable[[ProcessSpec], Capabilities],
-        log: Callable[[str], None],
+        cls, offered: MadeLaunchers, capabilities_of: Callable[[ProcessSpec], Capabilities]
     ) -> Launchers:
         """Return the launchers of this host; log which of them cannot be used, and why."""
         absent = {name: f"absent: {reason}" for name, reason in offered.absent.items()}
         broken = {name: f"broken: {reason}" for name, reason in offered.broken.items()}
         unusable = {**absent, **broken}
         for name, reason in unusable.items():
-            log(f"launcher {name} is {reason}")
-        return cls(offered.made, unusable, capabilities_of, log)
+            _log.info("launcher %s is %s", name, reason)
+        return cls(offered.made, unusable, capabilities_of)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -157,5 +151,5 @@ class Launchers:
             reason = f"the launcher {name!r} fails: {method}: {describe_plugin_fault(fault)}"
             if self._logged.get(name) != reason:
                 self._logged[name] = reason
-                self.log(reason)
+                _log.info("%s", reason)
             return otherwise

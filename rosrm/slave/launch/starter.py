@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rosrm.config.settings import HostConfig
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, events
+from rosrm.core.slave.state import Held, SlaveState
 from rosrm.errors import LaunchError
 from rosrm.model.values import Assignment, InstanceId, InstanceState
 from rosrm.ros.names import STATE_CONFIG, Names
@@ -23,6 +25,8 @@ from rosrm.slave.replication.service import Keeping
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.wording import one_line
+
+_log = logging.getLogger("rosrm.slave")
 
 
 @dataclass
@@ -40,20 +44,18 @@ class Starter:
         sessions: process tree of each instance.
         launchers: of this host.
         take: takes events for the core.
-        say: logs a message for the user.
     """
 
     config: HostConfig
     kept: Path
-    state: core.SlaveState
+    state: SlaveState
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint
     keeping: Keeping
     graph: GraphWatch
     sessions: SessionTable
     launchers: Launchers
-    take: Callable[[core.Event], None]
-    say: Callable[[str], None]
+    take: Callable[[events.Event], None]
     _environment: Mapping[str, str] = field(init=False)
     _graph_before: dict[InstanceId, frozenset[bytes]] = field(init=False, default_factory=dict)
     _closed: bool = field(init=False, default=False)
@@ -77,7 +79,7 @@ class Starter:
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
 
-    def call_off(self, command: core.Command) -> bool:
+    def call_off(self, command: commands.Command) -> bool:
         """Apply a command to an instance that still waits for its snapshot.
 
         Stop and fence cancel the start; a restart has no effect, because the start follows anyway.
@@ -86,14 +88,14 @@ class Starter:
             False if the command is another one, or the instance does not wait; then the supervisor
             has to execute the command.
         """
-        if not isinstance(command, core.Stop | core.Fence | core.Restart):
+        if not isinstance(command, commands.Stop | commands.Fence | commands.Restart):
             return False
         if not self.keeping.is_preparing(command.instance):
             return False
-        if not isinstance(command, core.Restart):  # a restart needs nothing: the start follows
+        if not isinstance(command, commands.Restart):  # a restart needs nothing: the start follows
             self.keeping.forget(command.instance)
             refusal = "it was stopped before it was started"
-            self.take(core.LaunchRefused(command.instance, refusal))
+            self.take(events.LaunchRefused(command.instance, refusal))
         return True
 
     def close(self) -> None:
@@ -104,13 +106,13 @@ class Starter:
         """Return True if the supervisor has or had the instance."""
         return instance not in self.state.waiting and not self.keeping.is_preparing(instance)
 
-    def look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
+    def look_at_graph(self, awaited: Mapping[InstanceId, Held]) -> None:
         """Report the awaited nodes that are in the ROS graph now."""
         for instance, held in awaited.items():
             before = self._graph_before.get(instance, frozenset())
             pids = self.sessions.known_as(held.status.pid)
             if held.awaited and self.graph.sees(held.awaited.node_name, pids, before):
-                self.take(core.SeenInGraph(instance))
+                self.take(events.SeenInGraph(instance))
 
     def ended(self, instance: InstanceId) -> None:
         """Stop awaiting the node of an instance."""
@@ -138,8 +140,10 @@ class Starter:
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
-                self.say(f"{assignment.instance} cannot be started here: {one_line(str(error))}")
-                self.take(core.LaunchRefused(assignment.instance, str(error)))
+                _log.info(
+                    "%s cannot be started here: %s", assignment.instance, one_line(str(error))
+                )
+                self.take(events.LaunchRefused(assignment.instance, str(error)))
         if orders:
             self.supervisor.start(orders)
 

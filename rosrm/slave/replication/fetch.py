@@ -8,7 +8,7 @@ from functools import partial
 from typing import Final
 
 from rosrm.model.values import Assignment
-from rosrm.ros.slave.replication import KeptEndpoint
+from rosrm.ros.slave.replication import KeptEndpoint, NotStored
 from rosrm.snapshots import Head, Part
 
 #: Seconds for the discovery of a slave, or its answer; then the next host is asked.
@@ -25,13 +25,13 @@ class Fetch:
         hosts: that hold a replica, the newest first.
         endpoint: sends requests to their slaves.
         here: the newest snapshot on this host; None: there is none.
-        take: writes a part, and calls back with a code and a message.
+        take: writes a part, and calls back with None, or with the reason why it was not stored.
         ended: called once, with a message for the user.
     """
 
     def __init__(
         self, assignment: Assignment, hosts: tuple[str, ...], endpoint: KeptEndpoint, *,
-        here: Head | None, take: Callable[[Part, Callable[[tuple[str, str]], None]], None],
+        here: Head | None, take: Callable[[Part, Callable[[NotStored | None], None]], None],
         ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._assignment = assignment
@@ -75,13 +75,12 @@ class Fetch:
         else:
             self._take(part, partial(self._taken, part))
 
-    def _taken(self, part: Part, outcome: tuple[str, str]) -> None:
+    def _taken(self, part: Part, refusal: NotStored | None) -> None:
         if self._over:
             return
-        code, message = outcome
         now = time.monotonic()
-        if code:
-            self._next_host(message, now)
+        if refusal is not None:
+            self._next_host(refusal.message, now)
         elif part.is_last:
             self._end(
                 f"the state of {part.process}#{part.number}, cycle {part.sequence}, was fetched "

@@ -6,6 +6,7 @@ their results to the loop. So a slow disk, or a snapshot of many megabytes, dela
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
@@ -18,10 +19,12 @@ from typing import Any, Final
 from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, KeptState
-from rosrm.ros.slave.replication import MOST, KeptEndpoint
+from rosrm.ros.slave.replication import MOST, KeptEndpoint, NotStored
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import KeptStore
 from rosrm.snapshots import Head, Part
+
+_log = logging.getLogger("rosrm.slave")
 
 #: Seconds between two scans of the snapshots on this host.
 _SCAN_EVERY: Final = 1.0
@@ -37,7 +40,7 @@ _LOST_WORDS: Final = frozenset({"timeout", "order"})
 
 
 #: Answer for a part that could not be written because of an unexpected error.
-_FAILED: Final = ("full", "the slave failed to store it; its log has the reason")
+_FAILED: Final = NotStored("full", "the slave failed to store it; its log has the reason")
 
 
 @dataclass(slots=True)
@@ -85,19 +88,18 @@ class Keeping:
         settings: limits.
         endpoint: exchanges messages with other slaves.
         post: schedules a call in the loop; may be called from any thread.
-        say: logs a message for the user.
         publish: reports the snapshots to the master; returns False if there is no master.
     """
 
     def __init__(
         self, root: Path, host: str, settings: KeepSettings, endpoint: KeptEndpoint, *,
-        post: Callable[[Callable[[], None]], None], say: Callable[[str], None],
+        post: Callable[[Callable[[], None]], None],
         publish: Callable[[Sequence[KeptState]], bool],
     ) -> None:  # fmt: skip
         self._host = host
         self._settings = settings
         self._endpoint = endpoint
-        self._post, self._say, self._publish = post, say, publish
+        self._post, self._publish = post, publish
         self._store = KeptStore(root, settings.max_bytes)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._shipments: dict[str, _Shipment] = {}
@@ -134,7 +136,7 @@ class Keeping:
             try:
                 outcome = work()
             except Exception as error:  # noqa: BLE001 - the thread has to live on
-                self._post(partial(self._say, f"a snapshot: {type(error).__name__}: {error}"))
+                _log.info("a snapshot: %s: %s", type(error).__name__, error)
                 outcome = otherwise
             self._post(partial(then, outcome))
 
@@ -249,11 +251,11 @@ class Keeping:
         answered = partial(self._given, transfer, len(data))
         self._endpoint.give(transfer.host, part, now, _PART_TIMEOUT, answered)
 
-    def _given(self, transfer: _Transfer, size: int, code: str, message: str) -> None:
+    def _given(self, transfer: _Transfer, size: int, refusal: NotStored | None) -> None:
         shipment, head, host = transfer.shipment, transfer.head, transfer.host
         now = time.monotonic()
-        if code and head is not None:
-            self._not_taken(shipment, host, head, now, code, message)
+        if refusal is not None and head is not None:
+            self._not_taken(shipment, host, head, now, refusal)
             self._end(transfer)
             return
         transfer.offset += size
@@ -266,19 +268,20 @@ class Keeping:
             self._go_on(transfer, now)
 
     def _not_taken(
-        self, shipment: _Shipment, host: str, head: Head, now: float, code: str, message: str
+        self, shipment: _Shipment, host: str, head: Head, now: float, refusal: NotStored
     ) -> None:
         """Schedule another transfer, at once if only a message was lost."""
-        if code == "newer":  # the acknowledgement of the last part may be lost
+        if refusal.code == "newer":  # the acknowledgement of the last part may be lost
             shipment.sent[host] = head.age
             return
-        if code in _LOST_WORDS:
+        if refusal.code in _LOST_WORDS:
             shipment.due[host] = now
         else:
             shipment.due[host] = now + max(_AGAIN, shipment.every)
-        if shipment.said.get(host) != code:
-            shipment.said[host] = code
-            self._say(f"{host} does not keep the state of {shipment.instance}: {message}")
+        if shipment.said.get(host) != refusal.code:
+            shipment.said[host] = refusal.code
+            instance, why = shipment.instance, refusal.message
+            _log.info("%s does not keep the state of %s: %s", host, instance, why)
 
     def _end(self, transfer: _Transfer) -> None:
         process = transfer.shipment.instance.process
@@ -287,13 +290,13 @@ class Keeping:
 
     # --- from other hosts ----------------------------------------------------------------
 
-    def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
+    def take_part(self, part: Part, answer: Callable[[NotStored | None], None]) -> None:
         """Store a part of a snapshot from another host."""
 
-        def taken(outcome: tuple[str, str]) -> None:
-            if part.is_last and not outcome[0]:
+        def taken(refusal: NotStored | None) -> None:
+            if part.is_last and refusal is None:
                 self._next_scan = 0.0  # the master may need the new replica at once
-            answer(*outcome)
+            answer(refusal)
 
         self._in_thread(partial(self._store.take, part, bounded=True), taken, _FAILED)
 
@@ -347,7 +350,7 @@ class Keeping:
 
         def ended(message: str) -> None:
             if self.forget(instance):
-                self._say(message)
+                _log.info("%s", message)
                 done(assignment)
 
         fetch = self._preparing[instance] = Fetch(
@@ -356,7 +359,7 @@ class Keeping:
         )  # fmt: skip
         fetch.go_on(time.monotonic())
 
-    def _take_fetched(self, part: Part, then: Callable[[tuple[str, str]], None]) -> None:
+    def _take_fetched(self, part: Part, then: Callable[[NotStored | None], None]) -> None:
         self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)
 
     def is_preparing(self, instance: InstanceId) -> bool:

@@ -11,6 +11,7 @@ from typing import Final
 from rosrm import snapshots
 from rosrm.model.values import InstanceId, KeptState
 from rosrm.ros.names import token
+from rosrm.ros.slave.replication import NotStored
 from rosrm.snapshots import Part
 
 #: Seconds for which a snapshot stays in memory between reads of its parts.
@@ -93,7 +94,7 @@ class KeptStore:
 
     # --- incoming snapshots --------------------------------------------------------------
 
-    def take(self, part: Part, *, bounded: bool) -> tuple[str, str]:
+    def take(self, part: Part, *, bounded: bool) -> NotStored | None:
         """Write a part of a snapshot; the last part completes the replica.
 
         Args:
@@ -101,15 +102,15 @@ class KeptStore:
             bounded: True for a process of another host, whose replicas are limited by `max_bytes`.
 
         Returns:
-            Code and message of a refusal; ("", ""): the part was written.
+            The reason of a refusal; None: the part was written.
         """
         if part.offset == 0:
             refusal = self._begin(part, bounded=bounded)
-            if refusal[0]:
+            if refusal is not None:
                 return refusal
         coming = self._coming.get(part.process)
         if coming is None or coming.age != part.age or coming.writer.size != part.offset:
-            return "order", "it does not follow the part before it: send all parts again"
+            return NotStored("order", "it does not follow the part before it: send all parts again")
         try:
             coming.writer.append(part.data)
             coming.digest = zlib.crc32(part.data, coming.digest)
@@ -117,28 +118,34 @@ class KeptStore:
                 self._finish(part, coming)
         except OSError as error:
             self._abandon(part.process)
-            return "full", f"it cannot be written: {error.strerror}"
+            return NotStored("full", f"it cannot be written: {error.strerror}")
         except snapshots.Damaged as fault:
-            return "damaged", str(fault)
-        return "", ""
+            return NotStored("damaged", str(fault))
+        return None
 
-    def _begin(self, part: Part, *, bounded: bool) -> tuple[str, str]:
+    def _begin(self, part: Part, *, bounded: bool) -> NotStored | None:
         self._abandon(part.process)
         directory = self.directory(part.process)
         newest = snapshots.newest_head(directory)
         if newest is not None and newest.age >= part.age:
-            return "newer", f"{newest.process}#{newest.instance}, cycle {newest.sequence} is here"
+            return NotStored(
+                "newer", f"{newest.process}#{newest.instance}, cycle {newest.sequence} is here"
+            )
         if part.total > snapshots.LARGEST:
-            return "full", f"it has {part.total} bytes; at most {snapshots.LARGEST} are kept"
+            return NotStored(
+                "full", f"it has {part.total} bytes; at most {snapshots.LARGEST} are kept"
+            )
         if bounded and not self._has_room(part):
-            return "full", f"with it there were more than {self._max_bytes} bytes (keep.max_bytes)"
+            return NotStored(
+                "full", f"with it there were more than {self._max_bytes} bytes (keep.max_bytes)"
+            )
         self.make()
         try:
             writer = snapshots.CopyWriter(directory)
         except OSError as error:
-            return "full", f"it cannot be written: {error.strerror}"
+            return NotStored("full", f"it cannot be written: {error.strerror}")
         self._coming[part.process] = _Coming(part.age, part.total, writer)
-        return "", ""
+        return None
 
     def _has_room(self, part: Part) -> bool:
         """Return True if a snapshot fits beside other replicas and running transfers."""

@@ -11,7 +11,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -77,7 +77,8 @@ class Run:
         deadline = time.monotonic() + seconds
         while self.demo.poll() is None and time.monotonic() < deadline:
             self.look()
-            time.sleep(1.0)
+            with suppress(subprocess.TimeoutExpired):
+                self.demo.wait(1.0)
         output, errors = self.demo.communicate(timeout=1.0)
         return self.demo.returncode, output, errors
 

@@ -15,11 +15,9 @@ import pytest
 
 from rosrm.testing.local_cluster import claim_domain
 from rosrm_examples.pieces import load_piece
+from tests.waiting import PATIENCE, wait_until
 
 Start = Callable[..., subprocess.Popen[str]]
-
-#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
-PATIENCE = 30.0
 
 
 @pytest.fixture
@@ -76,13 +74,12 @@ class Listener:
         """Return True if a publisher is discovered; earlier messages do not arrive."""
         return bool(self._subscription.get_publisher_count())
 
-    def wait_for(self, count: int, seconds: float = PATIENCE) -> None:
-        """Wait until `count` messages have arrived; fail after `seconds`."""
-        deadline = time.monotonic() + seconds
-        while len(self.heard) < count:
-            left = deadline - time.monotonic()
-            assert left > 0.0, f"{len(self.heard)} of {count} messages came within {seconds} s"
-            self._executor.spin_once(timeout_sec=left)
+    def wait_for(self, count: int) -> None:
+        """Wait until `count` messages have arrived."""
+        wait_until(
+            lambda: len(self.heard) >= count, f"{count} messages", seen=lambda: len(self.heard),
+            pause=lambda seconds: self._executor.spin_once(timeout_sec=seconds),
+        )  # fmt: skip
 
     def sees(self, name: str) -> bool:
         """Return True if a node of this name is in the graph."""
@@ -120,14 +117,6 @@ def resident_mb(process: subprocess.Popen[str]) -> float:
     """Return the private resident memory of a process, in MB."""
     pages = Path(f"/proc/{process.pid}/statm").read_text().split()
     return (int(pages[1]) - int(pages[2])) * os.sysconf("SC_PAGESIZE") / 1e6
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    """Wait until a condition holds; fail after `seconds`."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come true in time"
-        time.sleep(0.02)
 
 
 def test_map_piece_maps_its_piece(start: Start, tmp_path: Path) -> None:
@@ -193,7 +182,7 @@ def test_a_played_drive_is_mapped_as_one_that_is_read(
 
     parameters = ["-p", f"state:={state}", "-p", f"out:={tmp_path / 'parts'}"]
     slam = start("slam_node", "--ros-args", *parameters)
-    wait_until(listener.is_matched)
+    wait_until(listener.is_matched, "the node's publisher")
     report = tmp_path / "report.json"
     player = start("player", "--drive", "street:20", "--hz", "25", "--report", str(report))
     output, errors = player.communicate(timeout=PATIENCE)
@@ -239,24 +228,24 @@ def test_the_slam_node_says_what_it_cannot_use(start: Start) -> None:
 def test_holder_holds_what_it_is_told_until_a_signal(start: Start, stop: signal.Signals) -> None:
     """The process holds 60 MB more than an empty holder, and a signal ends it with 0."""
     empty, full = start("holder", "--mb", "0"), start("holder", "--mb", "60")
-    wait_until(lambda: abs(resident_mb(full) - resident_mb(empty) - 60) < 3)
+    wait_until(lambda: abs(resident_mb(full) - resident_mb(empty) - 60) < 3, "60 MB")
     full.send_signal(stop)
     assert (full.wait(timeout=PATIENCE), full.communicate()) == (0, ("", ""))
 
 
 def test_holder_grows_and_ends_by_itself(start: Start) -> None:
     """Memory grows at the requested rate, and the process ends with 0 after its time."""
-    holder = start("holder", "--mb", "10", "--grow", "40", "--seconds", "1.5")
-    wait_until(lambda: resident_mb(holder) > 45)
-    assert (holder.wait(timeout=PATIENCE), holder.communicate()) == (0, ("", ""))
+    process = start("holder", "--mb", "10", "--grow", "40", "--seconds", "1.5")
+    wait_until(lambda: resident_mb(process) > 45, "45 MB")
+    assert (process.wait(timeout=PATIENCE), process.communicate()) == (0, ("", ""))
 
 
 def test_holder_grows_up_to_its_most(start: Start) -> None:
     """The process grows to `--most`, holds that, and never has more."""
     empty = start("holder", "--mb", "0", "--seconds", "0.5")
-    holder = start("holder", "--mb", "10", "--grow", "100", "--most", "40", "--seconds", "1.5")
+    process = start("holder", "--mb", "10", "--grow", "100", "--most", "40", "--seconds", "1.5")
     least = peak_mb(empty)
-    assert peak_mb(holder) - least == pytest.approx(40, abs=3)
+    assert peak_mb(process) - least == pytest.approx(40, abs=3)
 
 
 def test_holder_is_small_without_ros() -> None:
@@ -272,26 +261,26 @@ def test_holder_is_small_without_ros() -> None:
 def test_holder_can_be_a_ros_node(start: Start, listen) -> None:
     """With --ros it is in the ROS graph, takes remappings, and still stops by a signal with 0."""
     listener = listen("/nothing")
-    holder = start("holder", "--mb", "5", "--ros", "--ros-args", "-r", "__node:=h1")
-    wait_until(lambda: listener.sees("h1"))
-    holder.send_signal(signal.SIGTERM)
-    output, errors = holder.communicate(timeout=PATIENCE)
-    assert (holder.returncode, output, errors) == (0, "", "")
+    process = start("holder", "--mb", "5", "--ros", "--ros-args", "-r", "__node:=h1")
+    wait_until(lambda: listener.sees("h1"), "the node in the graph")
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, output, errors) == (0, "", "")
 
 
 @pytest.mark.parametrize("size", ["-5", "much", "nan", "inf"])
 def test_holder_refuses_what_is_no_size(start: Start, size: str) -> None:
-    """The error names the option and what is allowed."""
-    holder = start("holder", "--mb", size)
-    _, errors = holder.communicate(timeout=PATIENCE)
-    assert holder.returncode == 2
+    """The error names the option and what is allowed; the process blocks signals, so it is real."""
+    process = start("holder", "--mb", size)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2
     assert f"argument --mb: {size} is not a number from 0" in errors
 
 
 def test_holder_says_when_there_is_no_more_memory(start: Start) -> None:
     """A size beyond the machine's memory gives one line, not a traceback."""
-    holder = start("holder", "--mb", "1e12")
-    _, errors = holder.communicate(timeout=PATIENCE)
-    assert holder.returncode == 1
+    process = start("holder", "--mb", "1e12")
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
     assert errors.startswith("holder: no more memory to be had: ")
     assert errors.count("\n") == 1

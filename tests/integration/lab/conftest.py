@@ -12,9 +12,6 @@ import pytest
 from rosrm.errors import LabError
 from rosrm_lab import MIB, Lab, needs, store, uniform
 
-#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
-PATIENCE = 30.0
-
 
 def why_not() -> str:
     """Return the missing requirement of a lab; "" if all are met.

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from rosrm_lab import DATA, GIB, MIB, HostPlan, Lab, uniform
+from tests.waiting import wait_until
 
 ROSRM = str(Path(sys.executable).parent / "rosrm")
 #: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
@@ -48,13 +49,17 @@ class Cluster:
 
     def wait(self, what: str, look, condition):
         """Repeat `look` until its result meets the condition; a failure shows the last result."""
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            seen = look()
-            if condition(seen):
-                return seen
-            assert time.monotonic() < deadline, f"{what}: {seen}\n{self.said()}"
-            time.sleep(0.2)
+        looks = []
+
+        def met() -> bool:
+            looks.append(look())
+            return condition(looks[-1])
+
+        wait_until(
+            met, what, PATIENCE, seen=lambda: f"{looks[-1]}\n{self.said()}",
+            pause=lambda _: time.sleep(0.2),  # each look is a command
+        )  # fmt: skip
+        return looks[-1]
 
     def wait_for_hosts(self, **states: str):
         return self.wait(

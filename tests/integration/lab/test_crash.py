@@ -18,8 +18,8 @@ import pytest
 from rosrm.errors import LabError
 from rosrm_lab import MIB, Lab, all_labs, disks, store, uniform
 from tests.integration.lab.conftest import remains
+from tests.waiting import PATIENCE, wait_until
 
-PATIENCE = 30.0
 ROSRM = Path(sys.executable).parent / "rosrm"
 SIZES = ["-n", "2", "--memory", "64MiB", "--cpu", "0.5", "--disk", "16MiB"]
 
@@ -259,10 +259,7 @@ def test_down_ends_what_ignores_signals_and_daemons(lab):
     """`down` also ends processes that run outside the quota."""
     stubborn = "trap '' TERM INT HUP; (setsid sleep 1000 &) ; sleep 1000"
     process = lab.popen("host1", ["sh", "-c", stubborn], limited=False)
-    deadline = time.monotonic() + PATIENCE
-    while len(lab.pids("host1")) < 3:  # the shell and two sleepers
-        assert time.monotonic() < deadline, "they did not start"
-        time.sleep(0.02)
+    wait_until(lambda: len(lab.pids("host1")) >= 3, "the shell and two sleepers")
     pids = lab.pids("host1")
     assert lab.down()
     # The shell may see the end of its sleeper before its own.

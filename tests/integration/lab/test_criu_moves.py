@@ -10,7 +10,7 @@ import pytest
 from benchmarks.criu import parts, play
 from rosrm_criu.engine import restore_result
 from rosrm_lab import DATA, GIB, HostPlan, Lab, uniform
-from tests.integration.lab.conftest import PATIENCE
+from tests.waiting import PATIENCE
 
 HOSTS = ("host1", "host2")
 

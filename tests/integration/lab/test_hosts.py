@@ -6,15 +6,14 @@ import os
 import signal
 import socket
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from rosrm.errors import ConfigError, LabError
 from rosrm_lab import DATA, MIB, HostPlan, Lab, uniform
+from tests.waiting import PATIENCE, wait_until
 
-PATIENCE = 30.0
 PYTHON = [sys.executable, "-ISc"]
 
 
@@ -175,10 +174,7 @@ def test_booting_a_host_that_is_up_is_refused(lab):
 def test_the_status_tells_what_there_is(lab):
     """The status has the fields of `rosrm lab status --json`."""
     sleeper = lab.popen("host1", ["sleep", "1000"])
-    deadline = time.monotonic() + PATIENCE
-    while lab.status()[0].processes != 1:
-        assert time.monotonic() < deadline, "the process was not counted"
-        time.sleep(0.02)
+    wait_until(lambda: lab.status()[0].processes == 1, "the process is counted")
     lab.kill("host2")
     one, two, desk = lab.status()
     assert (one.state, one.memory, one.cpu, one.disk) == ("up", 128 * MIB, 0.5, 32 * MIB)

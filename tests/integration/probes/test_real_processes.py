@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -20,6 +21,7 @@ from rosrm_resources.cgroups import find_group
 from rosrm_resources.cpu import CgroupCpu, GroupTime, MachineCpu, SliceCpu
 from rosrm_resources.memory import CgroupMemory, SliceMemory
 from rosrm_resources.plugin import register_probes
+from tests.waiting import wait_until
 
 BURN = "while True: pass"
 HOLD = "import sys; block = bytearray(int(sys.argv[1])); print('ready', flush=True); input()"
@@ -123,10 +125,10 @@ def test_sessions_find_the_children(start):
     try:
         table = SessionTable()
         table.add(shell.pid)
-        _until(lambda: table.refresh(time.monotonic()) or len(table.pids()) == 3)
+        wait_until(lambda: table.refresh(time.monotonic()) or len(table.pids()) == 3, "3 pids")
         assert table.usage()[shell.pid].memory > 0
         shell.stdin.write(b"\n")
-        _until(lambda: table.refresh(time.monotonic()) or len(table.pids()) == 2)
+        wait_until(lambda: table.refresh(time.monotonic()) or len(table.pids()) == 2, "2 pids")
     finally:
         os.killpg(shell.pid, 9)
         shell.wait(10)
@@ -249,7 +251,7 @@ def test_limited_group_of_version_1(tmp_path):
         capacity, grown, cores, busy = map(float, done.stdout.split())
     finally:
         for directory in made:
-            _until(lambda: _removed(directory))  # noqa: B023 - called at once
+            wait_until(partial(_removed, directory), "no process in the group")
     assert (capacity, cores) == (256 * MIB, 0.5)
     assert grown == pytest.approx(20 / 256, abs=0.02)
     assert 0.3 < busy < 1.35  # a busy machine may give less than the quota
@@ -271,11 +273,3 @@ def _removed(directory):
     except OSError:  # its last process is still exiting
         return False
     return True
-
-
-def _until(condition, timeout=10.0):
-    tick = threading.Event()
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        tick.wait(0.02)

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import os
-import select
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor import instance_record, procfs
-from rosrm.supervisor.client import Amended, LaunchOrder, SupervisorClient, log_path
+from rosrm.supervisor.client import SupervisorClient, log_path
+from rosrm.supervisor.client_values import Amended, LaunchOrder
+from tests.waiting import PATIENCE, command_of, wait_gone
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
-#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
-TIMEOUT = 30.0
 
 
 class Host:
@@ -47,7 +48,7 @@ class Host:
 
     def wait(self, client, name: str, *states: InstanceState, number: int = 1):
         """Return the first status of an instance in one of the given states."""
-        instance, deadline = InstanceId(name, number), time.monotonic() + TIMEOUT
+        instance, deadline = InstanceId(name, number), time.monotonic() + PATIENCE
         seen = []
         while time.monotonic() < deadline:
             for status in client.receive(deadline - time.monotonic()):
@@ -56,7 +57,7 @@ class Host:
                     continue
                 if status.instance == instance and status.state in states:
                     return status
-        pytest.fail(f"{instance} was in none of {states} within {TIMEOUT} s; told: {seen}")
+        pytest.fail(f"{instance} was in none of {states} within {PATIENCE} s; told: {seen}")
 
     def run(self, client, order: LaunchOrder):
         """Start an order and return its final status."""
@@ -72,16 +73,34 @@ class Host:
 
     def amend(self, client, name: str, restart: RestartPolicy) -> None:
         """Change the restart policy as the slave does; wait for the supervisor's record."""
-        instance, deadline = InstanceId(name, 1), time.monotonic() + TIMEOUT
+        instance, deadline = InstanceId(name, 1), time.monotonic() + PATIENCE
         client.amend(instance, restart, {"ROSRM_SHADOW": None})
         wanted = Amended(instance, restart)
         while wanted not in client.receive(max(0.0, deadline - time.monotonic())):
-            assert time.monotonic() < deadline, f"{wanted} was not told within {TIMEOUT} s"
+            assert time.monotonic() < deadline, f"{wanted} was not told within {PATIENCE} s"
 
     def kill_supervisor(self, client) -> None:
         os.kill(client.pid, signal.SIGKILL)
         wait_gone(client.pid)
         client.close()
+
+    def replace_supervisor(self, client) -> SupervisorClient:
+        """Kill the supervisor with SIGKILL; return the connection to the next one."""
+        self.kill_supervisor(client)
+        return self.connect()
+
+    def reconnect(self, client) -> SupervisorClient:
+        """Close a connection, and return another one."""
+        client.close()
+        return self.connect()
+
+    def rewrite(self, change: Callable[[dict], object]) -> None:
+        """Change each line of the record, as another version or another boot would have left it."""
+        path = self.state / "instances.jsonl"
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        for line in lines:
+            change(line)
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
     def alive(self) -> list[int]:
         """Return the pids of all processes of the supervisor and their descendants."""
@@ -95,7 +114,7 @@ class Host:
         if lock.exists():
             self.pids.add(int(lock.read_text() or 0))
         for pid in self.pids:
-            if str(self.state) in command_line(pid):
+            if str(self.state) in command_of(pid):
                 os.kill(pid, signal.SIGKILL)
                 wait_gone(pid)
         for pid in {*self.recorded(), *self.alive()}:
@@ -110,35 +129,6 @@ class Host:
             if stat is not None and procfs.was_born(stat, recorded.births[key]):
                 leaders.append(instance.pid)
         return leaders
-
-
-def command_line(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-    except OSError:
-        return ""
-
-
-def wait_gone(pid: int, timeout: float = TIMEOUT) -> None:
-    """Wait until a process has ended."""
-    try:
-        pidfd = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return
-    poll = select.poll()
-    poll.register(pidfd, select.POLLIN)
-    ended = poll.poll(timeout * 1000)
-    os.close(pidfd)
-    assert ended, f"process {pid} did not end within {timeout} s: {command_line(pid)}"
-
-
-def wait_until(condition, what: str, timeout: float = TIMEOUT):
-    """Poll a condition for which no event exists, such as a file of another process."""
-    deadline = time.monotonic() + timeout
-    while not (result := condition()):
-        assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
-        time.sleep(0.01)
-    return result
 
 
 @pytest.fixture

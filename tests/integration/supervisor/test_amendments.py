@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 
 import pytest
 
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
-
-from .conftest import wait_gone, wait_until
+from tests.waiting import wait_gone, wait_until
 
 NEVER = RestartPolicy("never")
 ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
 SAYS_WHAT_IT_IS = ("sh", "-c", "echo shadow: $ROSRM_SHADOW; exec sleep 1000")
 
-#: Kill of the supervisor before or after the change, or no kill.
-KILLS = pytest.mark.parametrize("killed", ["never", "before", "after"])
+#: Kill of the supervisor before or after the change.
+KILLS = pytest.mark.parametrize("killed", ["before", "after"])
 
 
 def shadow(host, name: str, **options):
@@ -29,12 +27,10 @@ def shadow(host, name: str, **options):
 def amended(host, client, name: str, restart: RestartPolicy, killed: str):
     """Set the policy, with a SIGKILL of the supervisor before or after; return the client."""
     if killed == "before":
-        host.kill_supervisor(client)
-        client = host.connect()
+        client = host.replace_supervisor(client)
     host.amend(client, name, restart)
     if killed == "after":
-        host.kill_supervisor(client)
-        client = host.connect()
+        client = host.replace_supervisor(client)
     return client
 
 
@@ -75,8 +71,7 @@ def test_an_end_while_no_supervisor_runs_follows_the_new_policy(host, client):
     source = host.running(client, "source").pid
     host.amend(client, "copy", ON_FAILURE)
     host.amend(client, "source", NEVER)
-    client.close()
-    client = host.connect()
+    client = host.reconnect(client)
     copy = next(one.pid for one in client.instances if one.instance.process == "copy")
     host.kill_supervisor(client)
     for pid in (source, copy):
@@ -91,20 +86,11 @@ def test_a_shadow_ends_for_good_whoever_is_killed(host, client):
     """An unconfirmed shadow does not restart, even after restarts of slave and supervisor."""
     client.start([shadow(host, "copy")])
     pid = host.running(client, "copy").pid
-    host.kill_supervisor(client)
-    client = host.connect()
+    client = host.replace_supervisor(client)
     kill(host, pid, "copy")
     assert host.ended(client, "copy").state is InstanceState.FAILED
-    client.close()
-    client = host.connect()
+    client = host.reconnect(client)
     assert [one.state for one in client.instances] == [InstanceState.FAILED]
-
-
-def test_a_shadow_says_nothing_of_those_beside_it(host, client):
-    """The first order's environment is the base of the others, without its shadow mark."""
-    client.start([shadow(host, "copy"), host.order("plain", *SAYS_WHAT_IT_IS)])
-    host.running(client, "plain")
-    wait_until(lambda: host.log("plain").read_text() == "shadow:\n", "it has spoken")
 
 
 def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
@@ -119,34 +105,13 @@ def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
     wait_until(lambda: host.log("copy").read_text() == said, "both runs have spoken")
 
 
-def test_an_amendment_of_what_has_ended_is_answered(host, client):
-    """The reply is the instance's end, which the amendment does not change."""
-    host.run(client, host.order("job", "false"))
-    host.amend(client, "job", ON_FAILURE)
-    client.close()
-    client = host.connect()
-    assert [one.state for one in client.instances] == [InstanceState.FAILED]
-
-
-def test_a_restart_beats_the_end_that_is_under_way(host, client):
-    """An order to restart is kept while the children of an ended leader are being stopped."""
-    leaves = "echo run; trap '' INT; (trap '' INT; sleep 1000) & sleep 0.2; exit 0"
-    client.start([host.order("leaver", "sh", "-c", leaves)])
-    host.wait(client, "leaver", InstanceState.STOPPING)
-    client.restart(InstanceId("leaver", 1))
-    host.wait(client, "leaver", InstanceState.STARTING)
-    wait_until(lambda: host.log("leaver").read_text().startswith("run\nrun\n"), "it ran again")
-    assert host.ended(client, "leaver").state is InstanceState.EXITED
-
-
 def test_what_is_to_be_remembered_is(host, client):
     """Memos outlive slave and supervisor (SIGKILL), and end with their instance."""
     kept, other = InstanceId("kept", 1), InstanceId("other", 1)
     orders = [host.order("kept", "sleep", "1000", memo="a"), host.order("other", "sleep", "1000")]
     client.start(orders)
     host.running(client, "other")
-    client.close()
-    client = host.connect()
+    client = host.reconnect(client)
     assert client.memos == {kept: "a"}
     client.remember(kept, "b")
     client.remember(other, "c")
@@ -154,24 +119,5 @@ def test_what_is_to_be_remembered_is(host, client):
     host.ended(client, "kept")  # by then the supervisor has read the orders
     client.remember(kept, "too late")
     host.amend(client, "other", NEVER)
-    host.kill_supervisor(client)
-    client = host.connect()
+    client = host.replace_supervisor(client)
     assert client.memos == {other: "c"}
-
-
-def test_a_record_of_an_earlier_version_is_taken_over(host, client):
-    """Launches recorded by an earlier version, without memos, run on and can be amended."""
-    client.start([host.order("kept", *SAYS_WHAT_IT_IS)])
-    pid = host.running(client, "kept").pid
-    host.kill_supervisor(client)
-    path = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for line in lines:
-        line.pop("memo", None)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    client = host.connect()
-    assert [(one.state, one.pid) for one in client.instances] == [(InstanceState.RUNNING, pid)]
-    assert client.notes == ()
-    host.amend(client, "kept", ON_FAILURE)
-    kill(host, pid, "kept")
-    assert host.wait(client, "kept", InstanceState.RUNNING).restarts == 1

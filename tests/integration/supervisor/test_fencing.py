@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -15,8 +14,7 @@ import pytest
 
 import rosrm
 from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
-
-from .conftest import TIMEOUT, wait_gone, wait_until
+from tests.waiting import PATIENCE, holds_for, wait_gone, wait_until
 
 SLEEPS = ("sleep", "1000")
 DEAF = ("sh", "-c", "trap '' INT TERM; echo deaf; (trap '' INT TERM; sleep 1000) & wait; wait")
@@ -28,7 +26,8 @@ SLAVE = """
     import os, sys, time
     from pathlib import Path
     from rosrm.model.values import Fence, InstanceId
-    from rosrm.supervisor.client import LaunchOrder, SupervisorClient
+    from rosrm.supervisor.client_values import LaunchOrder
+    from rosrm.supervisor.client import SupervisorClient
     client = SupervisorClient.connect(Path(sys.argv[1]))
     fences = {"one": Fence(3.0, 0.5), "driver": None}
     client.start([
@@ -75,7 +74,7 @@ def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
     stopped = time.monotonic()
     wait_gone(one)
     took = time.monotonic() - stopped
-    assert 1.5 < took < TIMEOUT / 2, took  # the last renewal was 0.1 s before, on a quiet machine
+    assert 1.5 < took < PATIENCE / 2, took  # the last renewal was 0.1 s before, on a quiet machine
     assert alive(driver)
     slave.kill()
     slave.wait()
@@ -100,21 +99,6 @@ def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client
     assert "no activity of its slave" in status.message
 
 
-def test_it_goes_on_while_somebody_says_heard(host, client):
-    """Renewals keep an instance alive far beyond its fence; without one the instance ends."""
-    client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0), restart=ALWAYS)])
-    pid = host.running(client, "one").pid
-    until = time.monotonic() + 5.0
-    while time.monotonic() < until:
-        heard = time.monotonic()
-        client.heard(heard, 0.0)
-        assert client.receive(0.1) == []
-    status = host.ended(client, "one")
-    assert time.monotonic() - heard >= 2.0
-    assert (status.state, status.restarts) == (InstanceState.FENCED, 0)
-    wait_gone(pid)
-
-
 def test_all_of_it_ends_within_its_grace(host, client):
     """An instance deaf to SIGINT and SIGTERM ends by SIGKILL, with its child, within the fence."""
     graces = StopPolicy(interrupt_grace=500.0, terminate_grace=500.0)
@@ -125,34 +109,14 @@ def test_all_of_it_ends_within_its_grace(host, client):
     assert host.alive() == []
 
 
-def test_the_order_to_fence_leaves_nothing(host, client):
-    """A fence order sends SIGKILL at once, and nothing restarts."""
-    client.start([host.order("one", *DEAF, restart=ALWAYS)])
-    host.running(client, "one")
-    wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
-    client.fence(ONE)
-    status = host.ended(client, "one")
-    assert status.message == "fenced: it has a successor; stopped by SIGKILL"
-    assert host.alive() == []
-
-
-def test_one_that_was_fenced_before_its_start_came_is_refused(host, client):
-    """Orders may overtake one another, so a fence refuses a later start."""
-    client.fence(ONE)
-    client.start([host.order("one", *SLEEPS)])
-    assert host.ended(client, "one").state is InstanceState.REFUSED
-    assert host.alive() == []
-
-
 def test_a_killed_supervisor_puts_no_fence_off(host, client):
     """Repeated kills of the supervisor do not postpone the fence."""
     client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0))])
     pid = host.running(client, "one").pid
-    deadline = time.monotonic() + TIMEOUT
+    deadline = time.monotonic() + PATIENCE
     while alive(pid):
-        assert time.monotonic() < deadline, f"not fenced within {TIMEOUT} s"
-        host.kill_supervisor(client)
-        client = host.connect()
+        assert time.monotonic() < deadline, f"not fenced within {PATIENCE} s"
+        client = host.replace_supervisor(client)
         client.receive(0.3)
     if not of_one(client).state.ended:
         host.ended(client, "one")
@@ -168,8 +132,7 @@ def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
     client.start([host.order("other", "true")])
     host.ended(client, "other")  # by then the supervisor has read all orders
     wait_until(lambda: time.monotonic() > heard + 1.5, "its start lies back so far")
-    host.kill_supervisor(client)
-    client = host.connect()
+    client = host.replace_supervisor(client)
     assert client.fenced == {ONE}
     assert (of_one(client).state, of_one(client).pid) == (InstanceState.RUNNING, pid)
     assert client.receive(0.5) == []
@@ -181,9 +144,7 @@ def test_without_a_supervisor_nobody_fences_until_the_next(host, client):
     client.start([host.order("one", *SLEEPS, fence=Fence(0.5, 0.0))])
     pid = host.running(client, "one").pid
     host.kill_supervisor(client)
-    begun = time.monotonic()
-    wait_until(lambda: time.monotonic() > begun + 1.0, "its fence has passed")
-    assert alive(pid)
+    holds_for(1.0, lambda: alive(pid), "twice its fence")
     client = host.connect()
     if not of_one(client).state.ended:
         host.ended(client, "one")
@@ -200,8 +161,7 @@ def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
     client = host.connect()
     if not of_one(client).state.ended:
         host.ended(client, "one")
-    client.close()
-    client = host.connect()
+    client = host.reconnect(client)
     assert of_one(client).state is InstanceState.FENCED
     assert of_one(client).message.startswith("fenced: ")
     wait_until(host.alive, "the driver was started again")
@@ -228,30 +188,20 @@ def lose_power(host, client, *pids: int) -> None:
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
         wait_gone(pid)
-    rewrite(host, boot="another")
+    host.rewrite(lambda line: line["record"] == "header" and line.update(boot="another"))
 
 
-def rewrite(host, **header) -> None:
-    """Rewrite the record's header as another machine, or another version, would have left it."""
-    path = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for line in lines:
-        if line["record"] == "header":
-            line.update(header)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+def without_fences(line: dict) -> None:
+    for name in ("fence", "fenced", "heard", "kill_by", "memo"):
+        line.pop(name, None)
 
 
-def test_a_record_without_fences_is_taken_over(host, client):
-    """Instances in a record of an earlier version, without fences, keep running."""
+def test_a_record_of_an_earlier_version_is_taken_over(host, client):
+    """Instances in a record without fences and memos keep running."""
     client.start([host.order("one", *SLEEPS)])
     pid = host.running(client, "one").pid
     host.kill_supervisor(client)
-    path = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for line in lines:
-        for name in ("fence", "fenced", "heard", "kill_by"):
-            line.pop(name, None)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    host.rewrite(without_fences)
     client = host.connect()
     assert client.notes == ()
     assert client.fenced == frozenset()
@@ -264,15 +214,14 @@ def test_a_supervisor_that_was_stopped_hears_first_what_was_said_in_time(host, c
     pid = host.running(client, "one").pid
     os.kill(client.pid, signal.SIGSTOP)
     try:
-        until = time.monotonic() + 2.5
-        while time.monotonic() < until:
-            client.heard(0.0, time.monotonic())
-            time.sleep(0.05)
+        holds_for(2.5, lambda: client.heard(0.0, time.monotonic()) is None, "more than its fence")
     finally:
         client.heard(0.0, time.monotonic())
         os.kill(client.pid, signal.SIGCONT)
-    until = time.monotonic() + 0.7
-    while time.monotonic() < until:
+
+    def goes_on() -> bool:
         client.heard(0.0, time.monotonic())
-        assert not any(status.state.ended for status in client.receive(0.05))
-    os.kill(pid, 0)
+        return not any(status.state.ended for status in client.receive(0.05))
+
+    holds_for(0.7, goes_on, "not fenced")
+    assert alive(pid)

@@ -19,8 +19,9 @@ from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 from rosrm.supervisor import instance_record, messages, procfs
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
+from tests.waiting import command_of, wait_gone, wait_until
 
-from .conftest import Host, command_line, wait_gone, wait_until
+from .conftest import Host
 
 OURS = messages.PROTOCOL
 
@@ -28,7 +29,8 @@ SLAVE = """
     import os, sys
     from pathlib import Path
     from rosrm.model.values import InstanceId
-    from rosrm.supervisor.client import LaunchOrder, SupervisorClient
+    from rosrm.supervisor.client_values import LaunchOrder
+    from rosrm.supervisor.client import SupervisorClient
     client = SupervisorClient.connect(Path(sys.argv[1]))
     order = LaunchOrder(InstanceId("kept", 1), ("sleep", "1000"), dict(os.environ))
     client.start([order])
@@ -67,7 +69,7 @@ def test_processes_survive_a_killed_slave(host, slave):
     (status,) = client.instances
     assert status.instance == InstanceId("kept", 1)
     assert status.state is InstanceState.RUNNING
-    wait_until(lambda: command_line(status.pid).startswith("sleep"), "the process is executed")
+    wait_until(lambda: command_of(status.pid).startswith("sleep"), "the process is executed")
 
 
 def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):
@@ -99,27 +101,22 @@ def test_a_slave_of_another_version_is_refused(host, client, monkeypatch, number
     assert [status.pid for status in host.connect().instances] == [pid]
 
 
-def test_final_statuses_are_kept_until_forgotten(host):
+def test_final_statuses_are_kept_until_forgotten(host, client):
     """The supervisor reports final statuses at each connection until the client acknowledges."""
-    client = host.connect()
     final = host.run(client, host.order("job", "sh", "-c", "exit 5"))
-    client.close()
-    client = host.connect()
+    client = host.reconnect(client)
     assert client.instances == (final,)
     client.forget([InstanceId("job", 1)])
-    client.close()
-    client = host.connect()
+    client = host.reconnect(client)
     assert client.instances == ()
 
 
-def test_a_killed_supervisor_is_taken_over(host):
+def test_a_killed_supervisor_is_taken_over(host, client):
     """After a SIGKILL the next supervisor has the same processes, and can stop them."""
-    client = host.connect()
     client.start([host.order("kept", "sh", "-c", "echo ran; sleep 1000 & wait")])
     before = host.running(client, "kept")
     wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
-    host.kill_supervisor(client)
-    client = host.connect()
+    client = host.replace_supervisor(client)
     (status,) = client.instances
     assert (status.state, status.pid) == (InstanceState.RUNNING, before.pid)
     client.stop(InstanceId("kept", 1))
@@ -128,9 +125,8 @@ def test_a_killed_supervisor_is_taken_over(host):
     assert host.log("kept").read_text() == "ran\n"
 
 
-def test_an_end_that_nobody_saw_is_said_to_be_unknown(host):
+def test_an_end_that_nobody_saw_is_said_to_be_unknown(host, client):
     """A process that ended without a supervisor has failed, with exit code unknown; no restart."""
-    client = host.connect()
     client.start([host.order("gone", "sleep", "1000")])
     pid = host.running(client, "gone").pid
     host.kill_supervisor(client)
@@ -142,24 +138,8 @@ def test_an_end_that_nobody_saw_is_said_to_be_unknown(host):
     assert "not known" in status.message
 
 
-def test_an_unseen_end_follows_the_restart_policy(host):
-    """For a process with a restart policy, an unknown exit is a failure."""
-    client = host.connect()
-    restart = RestartPolicy(when="on-failure", delay=0.05)
-    client.start([host.order("again", "sleep", "1000", restart=restart)])
-    pid = host.running(client, "again").pid
-    host.kill_supervisor(client)
-    os.kill(pid, signal.SIGKILL)
-    wait_gone(pid)
-    client = host.connect()
-    (status,) = client.instances
-    assert status.state is InstanceState.BACKOFF
-    assert host.running(client, "again").restarts == 1
-
-
-def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host):
+def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host, client):
     """The next supervisor finds and stops the child of a dead leader."""
-    client = host.connect()
     client.start([host.order("leaver", "sh", "-c", "sleep 1000 & wait")])
     pid = host.running(client, "leaver").pid
     wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
@@ -171,20 +151,17 @@ def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host):
     assert host.alive() == []
 
 
-def test_a_taken_over_process_that_ends_is_noticed(host):
+def test_a_taken_over_process_that_ends_is_noticed(host, client):
     """The new supervisor is not the parent, and notices the end by the pidfd."""
-    client = host.connect()
     client.start([host.order("kept", "sleep", "1000")])
     pid = host.running(client, "kept").pid
-    host.kill_supervisor(client)
-    client = host.connect()
+    client = host.replace_supervisor(client)
     os.kill(pid, signal.SIGKILL)
     assert host.ended(client, "kept").exit_code == -1
 
 
-def test_a_spawn_without_an_outcome_is_not_tried_again(host):
+def test_a_spawn_without_an_outcome_is_not_tried_again(host, client):
     """A kill between the spawn and its record: the process may have run, so no second run."""
-    client = host.connect()
     host.run(client, host.order("model", "touch", "ran"))
     host.kill_supervisor(client)
     record = host.state / "instances.jsonl"
@@ -199,9 +176,8 @@ def test_a_spawn_without_an_outcome_is_not_tried_again(host):
     assert not (host.state / "work" / "ran").exists()
 
 
-def test_a_start_that_was_never_tried_is_carried_out(host):
+def test_a_start_that_was_never_tried_is_carried_out(host, client):
     """A kill between the order's record and the spawn: the next supervisor spawns it, once."""
-    client = host.connect()
     host.run(client, host.order("model", "sh", "-c", "echo ran"))
     host.kill_supervisor(client)
     record = host.state / "instances.jsonl"
@@ -215,9 +191,8 @@ def test_a_start_that_was_never_tried_is_carried_out(host):
     assert host.log("model").read_text() == "ran\n"
 
 
-def test_a_spawn_without_a_record_is_found_by_its_marks(host):
+def test_a_spawn_without_a_record_is_found_by_its_marks(host, client):
     """A kill right after the spawn: the next supervisor finds the unrecorded process."""
-    client = host.connect()
     client.start([host.order("found", "sleep", "1000")])
     pid = host.running(client, "found").pid
     host.kill_supervisor(client)
@@ -230,9 +205,8 @@ def test_a_spawn_without_a_record_is_found_by_its_marks(host):
     assert (status.state, status.pid) == (InstanceState.RUNNING, pid)
 
 
-def test_a_torn_tail_is_left_out_and_said(host):
+def test_a_torn_tail_is_left_out_and_said(host, client):
     """A record that ends in half a line is read up to there, and the client gets a note."""
-    client = host.connect()
     client.start([host.order("kept", "sleep", "1000")])
     host.running(client, "kept")
     host.kill_supervisor(client)
@@ -243,9 +217,8 @@ def test_a_torn_tail_is_left_out_and_said(host):
     assert any("torn line" in note for note in client.notes)
 
 
-def test_a_damaged_line_is_left_out_and_said(host):
+def test_a_damaged_line_is_left_out_and_said(host, client):
     """An unreadable line is skipped, and the client gets a note with its line number."""
-    client = host.connect()
     host.run(client, host.order("job", "true"))
     host.kill_supervisor(client)
     record = host.state / "instances.jsonl"
@@ -256,9 +229,8 @@ def test_a_damaged_line_is_left_out_and_said(host):
     assert any("instances.jsonl:2" in note for note in client.notes)
 
 
-def test_what_starts_after_the_record_was_compacted_is_taken_over(host):
+def test_what_starts_after_the_record_was_compacted_is_taken_over(host, client):
     """Compaction with nothing running keeps the environment that the client sent once."""
-    client = host.connect()
     large = "x" * (instance_record.COMPACT_BYTES + 1)
     host.run(client, host.order("large", "/no/such/program", memo=large))
     always = RestartPolicy(when="always", delay=0.01)
@@ -266,8 +238,7 @@ def test_what_starts_after_the_record_was_compacted_is_taken_over(host):
     client.start([host.python("later", code, restart=always)])
     pid = host.running(client, "later").pid
     assert (host.state / "instances.jsonl").stat().st_size < instance_record.COMPACT_BYTES
-    host.kill_supervisor(client)
-    client = host.connect()
+    client = host.replace_supervisor(client)
     assert client.notes == ()
     assert {status.pid for status in client.instances} == {0, pid}
     os.kill(pid, signal.SIGKILL)
@@ -275,9 +246,8 @@ def test_what_starts_after_the_record_was_compacted_is_taken_over(host):
     wait_until(lambda: host.log("later").read_text().count(os.environ["PATH"]) == 2, "both runs")
 
 
-def test_without_its_environment_nothing_is_restarted(host):
+def test_without_its_environment_nothing_is_restarted(host, client):
     """The process with a lost environment is taken over, but refused a restart, with the reason."""
-    client = host.connect()
     always = RestartPolicy(when="always", delay=0.01)
     client.start([host.order("one", "sleep", "1000", restart=always)])
     pid = host.running(client, "one").pid
@@ -367,15 +337,6 @@ def test_shutdown_ends_everything_and_leaves_nothing(host, client):
     wait_gone(client.pid)
     assert host.alive() == []
     assert not (host.state / "supervisor.sock").exists()
-
-
-def test_sigterm_is_a_shutdown(host, client):
-    """A plain `kill` of the supervisor stops everything too."""
-    client.start([host.order("a", "sleep", "1000")])
-    host.running(client, "a")
-    os.kill(client.pid, signal.SIGTERM)
-    wait_gone(client.pid)
-    assert host.alive() == []
 
 
 def test_it_ends_when_nothing_runs_and_nobody_is_there(host):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from rosrm.model.values import InstanceId
-from rosrm.supervisor import log_index
-from rosrm.supervisor.client import LogLimits, newest_log
-from rosrm.supervisor.logs import PROCESSES_AT_ONCE
+import pytest
 
-from .conftest import wait_until
+from rosrm.errors import Refused
+from rosrm.model.values import InstanceId
+from rosrm.slave.logs import newest_instance
+from rosrm.supervisor import log_index
+from rosrm.supervisor.logs import PROCESSES_AT_ONCE, LogLimits
+from tests.waiting import wait_until
 
 KIB = 1024
 FLOOD = """
@@ -57,7 +59,7 @@ def test_logs_of_old_instances_are_pruned(host):
         client.forget([InstanceId("many", number)])
     numbers = {file.name.split(".")[1] for file in host.log("many").parent.iterdir()}
     assert numbers == {"3", "4", "5"}
-    assert newest_log(host.state, "many") == InstanceId("many", 5)
+    assert newest_instance(host.state, "many") == InstanceId("many", 5)
 
 
 def test_the_index_of_logs_survives_the_supervisor(host):
@@ -82,23 +84,25 @@ def test_logs_of_old_processes_are_pruned(host):
         client.forget([InstanceId(f"job{number}", number)])
     left = list(host.log("any").parent.iterdir())
     assert len(left) < 2 * (10 + PROCESSES_AT_ONCE)
-    assert newest_log(host.state, "job99") == InstanceId("job99", 99)
-    assert newest_log(host.state, "job0") is None
+    assert newest_instance(host.state, "job99") == InstanceId("job99", 99)
+    with pytest.raises(Refused):
+        newest_instance(host.state, "job0")
 
 
-def test_logs_with_numbers_in_the_name_stay_apart(host):
+def test_logs_with_numbers_in_the_name_stay_apart(host, client):
     """The processes `a` and `a.1` have separate logs."""
-    client = host.connect()
     host.run(client, host.order("a", "echo", "first", number=2))
     host.run(client, host.order("a.1", "echo", "second", number=3))
-    assert newest_log(host.state, "a") == InstanceId("a", 2)
-    assert newest_log(host.state, "a.1") == InstanceId("a.1", 3)
+    assert newest_instance(host.state, "a") == InstanceId("a", 2)
+    assert newest_instance(host.state, "a.1") == InstanceId("a.1", 3)
 
 
-def test_any_process_name_is_a_safe_file_name(host):
+@pytest.mark.parametrize(
+    "name", ["../../ns/talker é", "/absolute", "with space", "a\nb", "."], ids=repr
+)
+def test_any_process_name_is_a_safe_file_name(host, name):
     """A process name with slashes and dots gives a path below the log folder."""
     client = host.connect()
-    name = "../../ns/talker é"
     host.run(client, host.order(name, "echo", "hello"))
     assert host.log(name).read_text() == "hello\n"
     assert host.state / "logs" in host.log(name).resolve().parents

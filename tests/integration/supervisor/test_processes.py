@@ -6,14 +6,12 @@ import itertools
 import os
 import re
 import signal
-import time
 from functools import partial
 
 import pytest
 
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
-
-from .conftest import wait_gone, wait_until
+from tests.waiting import wait_gone, wait_until
 
 IGNORES_ALL = """
 import signal, time
@@ -151,20 +149,6 @@ def test_a_daemon_that_left_the_session_is_found(host, client):
     assert host.alive() == []
 
 
-def test_a_deaf_child_that_is_left_over_is_killed(host, client):
-    """The escalation to SIGKILL also applies to children that outlive their leader."""
-    code = f"""
-import os, time
-if os.fork() == 0:
-    exec({IGNORES_ALL!r})
-time.sleep(0.3)
-"""
-    status = host.run(client, host.python("deaf", code))
-    assert status.state is InstanceState.EXITED
-    assert status.exit_code == 0
-    assert host.alive() == []
-
-
 @pytest.mark.parametrize(
     ("argv", "directory", "said"),
     [
@@ -208,49 +192,21 @@ def test_restarts_back_off_and_run_out(host, client):
     assert all(wait >= 0.8 * most for wait, most in zip(waits, (0.05, 0.1, 0.2), strict=True))
 
 
-def test_a_forced_restart_is_a_new_process(host, client):
-    """A restart by order gives another pid for the same instance, and counts no restart."""
-    client.start([host.order("again", "sleep", "1000")])
-    before = host.running(client, "again").pid
-    client.restart(InstanceId("again", 1))
-    after = host.running(client, "again")
-    assert after.pid != before
-    assert after.restarts == 0
-    wait_gone(before)
-
-
-def test_a_late_start_is_refused(host, client):
-    """A stop that arrives before its start leaves a tombstone."""
-    client.stop(InstanceId("late", 1))
-    assert host.ended(client, "late").state is InstanceState.REFUSED
-    status = host.run(client, host.order("late", "touch", "ran"))
-    assert status.state is InstanceState.REFUSED
-    assert not (host.state / "work" / "ran").exists()
-
-
-def test_a_repeated_start_starts_once(host, client):
-    """A start order repeated by DDS starts one process."""
-    order = host.order("once", "sh", "-c", "echo ran; sleep 1000")
-    client.start([order, order])
-    client.start([order])
-    host.running(client, "once")
-    wait_until(lambda: host.log("once").read_text(), "it ran")
-    client.stop(InstanceId("once", 1))
-    host.ended(client, "once")
-    assert host.log("once").read_text() == "ran\n"
-
-
-def test_three_hundred_at_once(host, client):
-    """A burst of 300 short jobs ends with one final status for each."""
-    began = time.monotonic()
-    client.start([host.order(f"job{number}", "true", number=number) for number in range(300)])
-    final = {}
-    while len(final) < 300:
-        statuses = client.receive(10)
-        assert statuses, f"nothing told for 10 s, {len(final)} of 300 ended"
-        for status in statuses:
-            if status.state.ended:
-                assert status.instance not in final
-                final[status.instance] = status
-    assert all(status.state is InstanceState.EXITED for status in final.values())
-    assert time.monotonic() - began < 30
+@pytest.mark.parametrize("killed", ["never", "after"])
+def test_a_stopped_process_ends_and_starts_again(host, client, killed):
+    """The order ends the whole paused tree, which SIGINT cannot reach, and survives a kill."""
+    again = RestartPolicy("on-failure", delay=0.05)
+    client.start([host.order("hung", "sh", "-c", "sleep 1000; true", restart=again)])
+    pid = host.running(client, "hung").pid
+    os.kill(pid, signal.SIGSTOP)
+    client.fail(InstanceId("hung", 1), pid, "unhealthy: stopped for 5 s", kill=True)
+    if killed == "after":
+        host.wait(client, "hung", InstanceState.STOPPING, InstanceState.BACKOFF)
+        client = host.replace_supervisor(client)
+        found = [one for one in client.instances if one.pid not in (0, pid)]
+    else:
+        assert host.wait(client, "hung", InstanceState.BACKOFF).message.startswith("unhealthy: st")
+        found = []
+    found = found or [host.running(client, "hung")]
+    assert found[0].pid != pid
+    wait_gone(pid)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import signal
@@ -11,13 +12,12 @@ import time
 import pytest
 
 from rosrm.config.settings import LogSettings
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave import commands, events
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.supervisor import send_buffer
 from rosrm.supervisor.client import SupervisorClient
-
-from .conftest import TIMEOUT, wait_gone
+from tests.waiting import PATIENCE, wait_gone
 
 #: Together more than a socket buffer holds.
 COUNT, LARGE = 10, "x" * 100_000
@@ -27,15 +27,14 @@ MANY = tuple(InstanceId(f"p{number}", 1) for number in range(COUNT))
 class Loop:
     """The event loop of a slave: it runs posted functions one after the other."""
 
-    def __init__(self, host) -> None:
+    def __init__(self, host, log) -> None:
         self.posted: queue.Queue = queue.Queue()
-        self.events: list[core.Event] = []
-        self.said: list[str] = []
+        self.events: list[events.Event] = []
         self.ended: list[str] = []
-        self.host = host
+        self.host, self.log = host, log
         self.link = SupervisorLink(
             host.state, LogSettings(), post=self.posted.put, take=self.events.append,
-            follow=lambda status: None, say=self.said.append, ended=self.ended.append,
+            follow=lambda status: None, ended=self.ended.append,
         )  # fmt: skip
         self.pid = self.supervisor()
         self.link.take_over()
@@ -47,20 +46,20 @@ class Loop:
         return pid
 
     def wait(self, condition, what: str) -> None:
-        deadline = time.monotonic() + TIMEOUT
+        deadline = time.monotonic() + PATIENCE
         while not condition():
             left = deadline - time.monotonic()
-            assert left > 0, f"not within {TIMEOUT} s: {what}; said: {self.said}, {self.ended}"
+            assert left > 0, f"not within {PATIENCE} s: {what}; {self.log.messages}, {self.ended}"
             try:
                 self.posted.get(timeout=min(left, 0.1))()
             except queue.Empty:
                 continue
 
-    def replaced(self) -> list[core.SupervisorReplaced]:
-        return [one for one in self.events if isinstance(one, core.SupervisorReplaced)]
+    def replaced(self) -> list[events.SupervisorReplaced]:
+        return [one for one in self.events if isinstance(one, events.SupervisorReplaced)]
 
     def started(self) -> set[InstanceId]:
-        told = [one for one in self.events if isinstance(one, core.SupervisorReported)]
+        told = [one for one in self.events if isinstance(one, events.SupervisorReported)]
         return {status.instance for one in told for status in one.statuses if status.pid}
 
     def start_many(self) -> None:
@@ -69,8 +68,9 @@ class Loop:
 
 
 @pytest.fixture
-def loop(host):
-    loop = Loop(host)
+def loop(host, caplog):
+    caplog.set_level(logging.INFO)
+    loop = Loop(host, caplog)
     yield loop
     loop.link.close()
 
@@ -93,10 +93,10 @@ def test_a_killed_supervisor_is_replaced_without_the_loop(loop, monkeypatch) -> 
     next_pid = loop.supervisor()
     assert next_pid != loop.pid
     assert [status.instance.process for status in loop.replaced()[1].statuses] == ["one"]
-    assert loop.said[-1] == f"a new supervisor (pid {next_pid}) manages 1 process"
+    assert loop.log.messages[-1] == f"a new supervisor (pid {next_pid}) manages 1 process"
     assert by
     assert threading.current_thread() not in by
-    loop.link.carry_out(core.Stop(InstanceId("one", 1)))
+    loop.link.carry_out(commands.Stop(InstanceId("one", 1)))
     loop.wait(lambda: not loop.host.alive(), "the next one takes orders")
 
 
@@ -107,7 +107,7 @@ def test_a_supervisor_that_was_ended_by_another_is_replaced(loop) -> None:
     os.kill(loop.pid, signal.SIGTERM)
     loop.wait(lambda: len(loop.replaced()) == 2, "another one has taken over")
     next_pid = loop.supervisor()
-    assert loop.said[-1] == f"a new supervisor (pid {next_pid}) manages no processes"
+    assert loop.log.messages[-1] == f"a new supervisor (pid {next_pid}) manages no processes"
     assert not loop.ended
     (status,) = loop.replaced()[1].statuses
     assert status.state is InstanceState.WITHDRAWN
@@ -119,8 +119,8 @@ def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
     """Orders beyond the socket's buffer do not block the loop, and all arrive in order."""
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
-    loop.link.carry_out(core.Fence(MANY[-1]))
-    loop.link.carry_out(core.Renew(time.monotonic(), time.monotonic()))
+    loop.link.carry_out(commands.Fence(MANY[-1]))
+    loop.link.carry_out(commands.Renew(time.monotonic(), time.monotonic()))
     os.kill(loop.pid, signal.SIGCONT)
     loop.wait(lambda: loop.started() >= set(MANY[:-1]), "all of them run")
     loop.wait(lambda: len(loop.host.alive()) == COUNT - 1, "the last one was fenced")
@@ -133,7 +133,9 @@ def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, mon
     monkeypatch.setattr(send_buffer, "MOST_UNSENT", 300_000)
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
-    loop.wait(lambda: any("takes no orders" in one for one in loop.said), "it is said")
+    loop.wait(
+        lambda: any("takes no orders" in one for one in loop.log.messages), "a log line about it"
+    )
     os.kill(loop.pid, signal.SIGCONT)
     loop.wait(lambda: len(loop.replaced()) == 2, "it is connected to anew")
     assert {status.instance for status in loop.replaced()[1].statuses} == set(MANY)
@@ -149,7 +151,7 @@ def test_a_launch_that_comes_between_two_supervisors_is_not_lost(loop) -> None:
     stopped = InstanceId("stopped", 1)
     loop.link.start([loop.host.order("one", "sleep", "1000")])
     loop.link.start([loop.host.order("stopped", "sleep", "1000")])
-    loop.link.carry_out(core.Stop(stopped))
+    loop.link.carry_out(commands.Stop(stopped))
     loop.wait(lambda: len(loop.replaced()) == 2, "another one has taken over")
     loop.supervisor()
     (status,) = loop.replaced()[1].statuses
@@ -163,7 +165,7 @@ def test_the_shutdown_reaches_one_that_is_just_taking_over(loop) -> None:
     loop.wait(loop.started, "it runs")
     os.kill(loop.pid, signal.SIGKILL)
     wait_gone(loop.pid)
-    loop.wait(lambda: any("connecting" in one for one in loop.said), "its end is noticed")
+    loop.wait(lambda: any("connecting" in one for one in loop.log.messages), "its end is noticed")
     loop.link.shut_down()
     loop.wait(lambda: loop.ended, "the next one has stopped everything")
     assert loop.ended == [""]

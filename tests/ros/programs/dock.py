@@ -59,9 +59,9 @@ class Dock(Node):
         sensor = qos_profile_sensor_data
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.current_out = self.create_publisher(Float64MultiArray, "current", sensor)
-        self.receipts_out = self.create_publisher(Int64MultiArray, "receipts", 100)
+        self.receipts_out = self.create_publisher(Int64MultiArray, "receipts", 1000)
         self.health_out = self.create_publisher(Float64MultiArray, "~/health", latched)
-        self.create_subscription(Int64MultiArray, "orders", self.on_order, 100)
+        self.create_subscription(Int64MultiArray, "orders", self.on_order, 1000)
         self.create_subscription(Float64, "voltage", self.on_voltage, sensor, buffer=False)
         self.create_service(Trigger, "reserve", self.reserve)
         self.create_timer(PERIOD, self.control)

@@ -19,7 +19,7 @@ def test_the_same_seed_draws_the_same_faults():
 
 
 def test_faults_are_numbered_and_each_has_a_target_of_its_own():
-    """Two at once on one target would undo each other; every kind occurs, and can be done."""
+    """Two at once on one target would undo each other; every kind occurs."""
     rounds = drawn(3, 500)
     faults = [fault for one in rounds for fault in one.faults]
     assert [fault.number for fault in faults] == list(range(1, len(faults) + 1))

@@ -11,13 +11,7 @@ import pytest
 import benchmarks.chaos
 from benchmarks.chaos.excuses import OVERLOAD, Harm, Promise
 from benchmarks.chaos.outputs import Outputs, Run
-from benchmarks.chaos.rules import (
-    Judgement,
-    chain,
-    judge_job,
-    judge_line,
-    judge_service,
-)
+from benchmarks.chaos.rules import Judgement, chain, judge_job, judge_line, judge_service
 
 FOLDER = Path(benchmarks.chaos.__file__).parent
 JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py", "excuses.py"]
@@ -71,13 +65,10 @@ def test_two_active_owners_only_while_they_were_parted():
     assert parted == pytest.approx([0.5])
     assert kinds(elsewhere, [longer, beside], [CUT])[0] == ["doubled"]
     assert kinds(Promise(), [longer, beside], [KILLED])[0] == ["doubled"]
-    assert kinds(Promise(elsewhere=True, isolated=True), [run(last=17.0), beside], [CUT])[0] == [
-        "doubled"
-    ]
-    assert kinds(Promise(), [longer, beside], [Harm("overlap", 15.0, 15.0, process="a")]) == (
-        [],
-        {"overlaps": 1},
-    )
+    isolated = Promise(elsewhere=True, isolated=True)
+    assert kinds(isolated, [run(last=17.0), beside], [CUT])[0] == ["doubled"]
+    overlap = Harm("overlap", 15.0, 15.0, process="a")
+    assert kinds(Promise(), [longer, beside], [overlap]) == ([], {"overlaps": 1})
 
 
 def test_a_host_that_comes_up_late_is_given_its_second_from_then_on():
@@ -120,14 +111,11 @@ SHORT = Harm("host_cut", 19.6, 19.9, frozenset({"host1"}), hides=True)
 def test_a_silence_too_short_to_lose_a_host_or_to_be_fenced_excuses_nothing():
     """Two seconds may lose a host; for `isolation: stop`, 0.8 s is less than its fence may take."""
     elsewhere, isolated = Promise(elsewhere=True), Promise(elsewhere=True, isolated=True)
-
-    def cut(seconds):
-        return Harm("host_cut", 20.0 - seconds, 20.0, frozenset({"host1"}), hides=True)
-
-    assert kinds(elsewhere, [FIRST, SECOND], [cut(1.9)])[0] == ["touched"]
-    assert kinds(elsewhere, [FIRST, SECOND], [cut(2.1)])[0] == []
-    assert kinds(isolated, [FIRST, SECOND], [cut(0.7)])[0] == ["touched"]
-    assert kinds(isolated, [FIRST, SECOND], [cut(0.9)])[0] == []
+    bounds = [(elsewhere, 1.9, ["touched"]), (elsewhere, 2.1, []),
+              (isolated, 0.7, ["touched"]), (isolated, 0.9, [])]  # fmt: skip
+    for promise, seconds, violations in bounds:
+        cut = Harm("host_cut", 20.0 - seconds, 20.0, frozenset({"host1"}), hides=True)
+        assert kinds(promise, [FIRST, SECOND], [cut])[0] == violations
 
 
 def test_silences_add_up_and_a_part_that_starts_again_is_silent_until_it_is_up():
@@ -163,24 +151,24 @@ def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
         return kinds(promise, [FIRST, run("a#2", host, 21.0, 30.0, (first, 200))], [*harms, KILLED])
 
     full = Harm("disk_full", 5.0, 30.0, frozenset({"host1"}), fills=True)
-    assert after(kept, 99, "host1") == ([], {"state_cycles_repeated": 1})
-    assert after(kept, 90, "host1") == ([], {"state_seconds_repeated": 1})
-    assert after(kept, 88, "host1")[0] == ["state"]
-    assert after(kept, 102, "host1")[0] == ["state"]
-    assert after(kept, 1, "host1")[0] == ["state"]
-    assert after(kept, 50, "host1", full) == ([], {"state_older_disk_full": 1})
-    assert after(kept, 50, "host1", replace(full, hosts=frozenset({"host3"})))[0] == ["state"]
-    assert after(kept, 50, "host1", replace(full, begun=18.0))[0] == ["state"]
-    assert after(copied, 80, "host2", replace(full, begun=18.0)) == (
-        [],
-        {"state_older_disk_full": 1},
-    )
-    assert after(kept, 1, "host2") == ([], {"state_from_nothing": 1})
-    assert after(kept, 50, "host2")[0] == ["state"]
-    assert after(copied, 96, "host2") == ([], {"state_seconds_repeated": 1})
-    assert after(copied, 95, "host2")[0] == ["state"]
-    assert after(copied, 1, "host2")[0] == ["state"]
-    assert after(Promise(stateful=True, standby=True), 1, "host2")[0] == ["state"]
+    late = replace(full, begun=18.0)
+    allowed = [
+        (kept, 99, "host1", "state_cycles_repeated"), (kept, 90, "host1", "state_seconds_repeated"),
+        (kept, 50, "host1", "state_older_disk_full", full),
+        (kept, 1, "host2", "state_from_nothing"),
+        (copied, 80, "host2", "state_older_disk_full", late),
+        (copied, 96, "host2", "state_seconds_repeated"),
+    ]  # fmt: skip
+    for promise, first, host, kind, *harms in allowed:
+        assert after(promise, first, host, *harms) == ([], {kind: 1})
+    violated = [
+        *((kept, first, "host1") for first in (88, 102, 1)), (kept, 50, "host1", late),
+        (kept, 50, "host1", replace(full, hosts=frozenset({"host3"}))), (kept, 50, "host2"),
+        (copied, 95, "host2"), (copied, 1, "host2"),
+        (Promise(stateful=True, standby=True), 1, "host2"),
+    ]  # fmt: skip
+    for promise, first, host, *harms in violated:
+        assert after(promise, first, host, *harms)[0] == ["state"]
 
 
 def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
@@ -202,12 +190,8 @@ def test_a_state_that_came_to_no_other_host_in_time_is_lost():
     other = Harm("host_off", 19.0, 25.0, frozenset({"host3"}), kills=True, hides=True)
     overload = Harm(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True, deafens=True)
     assert kinds(copied, [FIRST, anew], [OFF])[0] == ["state"]
-    for none in (
-        overload,
-        KILLED,
-        replace(other, hosts=OFF.hosts),
-        replace(SHORT, hosts=other.hosts),
-    ):
+    same, short = replace(other, hosts=OFF.hosts), replace(SHORT, hosts=other.hosts)
+    for none in (overload, KILLED, same, short):
         assert kinds(copied, [FIRST, anew], [OFF, none])[0] == ["state"]
     unrelated = [replace(other, hosts=frozenset({host})) for host in ("host3", "host4")]
     assert kinds(copied, [FIRST, anew], [KILLED, *unrelated])[0] == ["state"]

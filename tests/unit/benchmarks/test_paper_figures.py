@@ -105,30 +105,30 @@ def test_fig6_does_not_hold_when_its_replay_decides_differently():
     assert fig6.replayed_otherwise({**alike, "replayed_decisions": 0}) != []
 
 
-def test_fig8_holds_for_a_line_only():
+ONE = Line(8.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("top", "state", "counts", "line", "said"),
+    [
+        (0.8, "queued", [8, 16, 24], ONE, None),
+        (0.8, "queued", [8, *range(17, 90, 9)], Line(9.0, -1.0, 1.0), None),
+        (0.8, "queued", [8, 16, 22], Line(7.0, 1.0, 0.99), "R2 is 0.99000"),
+        (0.8, "running", [8, 16], ONE, "queue became empty"),
+        # The first slave holds something else.
+        (0.8, "queued", [28, 36, 44], Line(8.0, 20.0, 1.0),
+         "not in proportion: R2 of the line through the origin"),
+        # With more than one process beyond it, their number does not show the limit.
+        (0.84, "queued", [8, 16], ONE, None),
+        (0.9, "queued", [8, 16], ONE, "host1 reached 90.0 %, more than one process"),
+    ],
+)  # fmt: skip
+def test_fig8_holds_for_a_proportion_up_to_the_limit_only(top, state, counts, line, said):
     """The bound is on R2, and the queue must not have run dry."""
-    trace = Trace(looks=[Look(0.0, {}, {"a": "queued"})])
-    assert fig8.judge(trace, [8, 16, 24], Line(8.0, 0.0, 1.0))[0] == []
-    assert fig8.judge(trace, [8, *range(17, 90, 9)], Line(9.0, -1.0, 1.0))[0] == []
-    assert "R2 is 0.99000" in fig8.judge(trace, [8, 16, 22], Line(7.0, 1.0, 0.99))[0][0]
-    dry = Trace(looks=[Look(0.0, {}, {"a": "running"})])
-    assert "queue became empty" in fig8.judge(dry, [8, 16], Line(8.0, 0.0, 1.0))[0][0]
-
-
-def test_fig8_holds_for_a_proportion_only():
-    """A line that misses the origin shows that the first slave holds something else."""
-    trace = Trace(looks=[Look(0.0, {}, {"a": "queued"})])
-    (wrong,) = fig8.judge(trace, [28, 36, 44], Line(8.0, 20.0, 1.0))[0]
-    assert wrong.startswith("not in proportion: R2 of the line through the origin")
-
-
-@pytest.mark.parametrize(("top", "holds"), [(0.84, True), (0.9, False)])
-def test_fig8_counts_one_process_beyond_the_limit(top, holds):
-    """With more than one, the number of processes does not show the limit."""
     host = HostLook(top, 0.0, 1e9, accepting=False)
-    trace = Trace(looks=[Look(0.0, {"host1": host}, {"a": "queued"})])
-    wrong, _ = fig8.judge(trace, [8, 16], Line(8.0, 0.0, 1.0))
-    assert wrong == [] if holds else "host1 reached 90.0 %, more than one process" in wrong[0]
+    trace = Trace(looks=[Look(0.0, {"host1": host}, {"a": state})])
+    wrong, _ = fig8.judge(trace, counts, line)
+    assert wrong == [] if said is None else said in wrong[0]
 
 
 KEPT_UP = {
@@ -154,19 +154,20 @@ def test_fig9_counts_only_where_the_master_kept_up(changes, said):
     assert wrong == [] if said is None else (len(wrong) == 1 and said in wrong[0])
 
 
-def test_fig9_holds_below_the_papers_slope_only():
+@pytest.mark.parametrize(
+    ("point", "fitted", "line", "said"),
+    [
+        ({}, {}, Line(0.02, 0.0, 1.0), None),
+        ({}, {}, Line(0.09, 0.0, 1.0), "the paper: 84.3"),
+        ({}, {}, Line(0.02, 0.0, 0.5), "does not describe"),
+        ({"missed": 59_000}, {}, Line(0.02, 0.0, 1.0), "59000 of 59400"),
+        ({}, {"ms": 120.0}, Line(0.02, 0.0, 1.0), "of a cycle of 100 ms"),
+    ],
+)
+def test_fig9_holds_below_the_papers_slope_only(point, fitted, line, said):
     """All slaves must be within one cycle, too."""
-    points = [{**KEPT_UP, "ms": 20.0}]
-    wrong, figures = fig9.judge(points, points, Line(0.02, 0.0, 1.0))
-    assert (wrong, figures["slope_us"]) == ([], 20.0)
-    assert "the paper: 84.3" in fig9.judge(points, points, Line(0.09, 0.0, 1.0))[0][0]
-    assert "does not describe" in fig9.judge(points, points, Line(0.02, 0.0, 0.5))[0][0]
-    assert (
-        "59000 of 59400"
-        in fig9.judge([{**KEPT_UP, "missed": 59_000}], points, Line(0.02, 0.0, 1.0))[0][0]
-    )
-    slow = [{"slaves": 1000, "ms": 120.0}]
-    assert "of a cycle of 100 ms" in fig9.judge(points, slow, Line(0.02, 0.0, 1.0))[0][0]
+    wrong, figures = fig9.judge([{**KEPT_UP, **point}], [{**KEPT_UP, **fitted}], line)
+    assert (wrong, figures["slope_us"]) == ([], 20.0) if said is None else said in wrong[0]
 
 
 def spent(*counts):
@@ -184,16 +185,16 @@ def test_table3_is_judged_by_the_medians():
     assert "1.060 times" in table3.judge(slow, spent(1, 1), 10)[0][0]
 
 
-def test_table3_does_not_hold_when_pieces_share_a_host():
-    """The measurement is then not of one piece per host."""
-    seconds = {"one_host": [100.0], "ideal": [10.0], "rosrm": [10.0]}
-    assert "shared a host" in table3.judge(seconds, spent(2, 0), 10)[0][0]
-
-
-def test_table3_does_not_hold_when_ten_hosts_are_hardly_faster_than_one():
-    """The hosts did not work in parallel then."""
-    seconds = {"one_host": [30.0], "ideal": [10.0], "rosrm": [10.0]}
-    assert "10 hosts are only 3.0 times as fast" in table3.judge(seconds, spent(1, 1), 10)[0][0]
+@pytest.mark.parametrize(
+    ("one_host", "counts", "said"),
+    [
+        (100.0, (2, 0), "shared a host"),  # measured are not single pieces
+        (30.0, (1, 1), "10 hosts are only 3.0 times as fast"),  # not in parallel
+    ],
+)
+def test_table3_does_not_hold_where_hosts_do_not_work_in_parallel(one_host, counts, said):
+    seconds = {"one_host": [one_host], "ideal": [10.0], "rosrm": [10.0]}
+    assert said in table3.judge(seconds, spent(*counts), 10)[0][0]
 
 
 def test_what_is_said_of_the_size_is_of_this_run():
@@ -210,6 +211,14 @@ def test_what_is_said_of_the_size_is_of_this_run():
 # --- failures -------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def measured(monkeypatch, tmp_path):
+    """Return a function that replaces the measurement of figure 9."""
+    monkeypatch.setattr(paper, "raise_signals", lambda: None)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return lambda measure: monkeypatch.setattr(fig9, "measure", measure)
+
+
 @pytest.mark.parametrize(
     "error",
     [
@@ -218,9 +227,7 @@ def test_what_is_said_of_the_size_is_of_this_run():
         Failed("the client at the desk did not answer"),
     ],
 )
-def test_a_figure_that_fails_leaves_its_logs_and_no_old_numbers(
-    error, tmp_path, monkeypatch, capsys
-):
+def test_a_figure_that_fails_leaves_its_logs_and_no_old_numbers(error, measured, tmp_path, capsys):
     """The output has one line for the error and one for the logs; old numbers are removed."""
     folders = []
 
@@ -229,9 +236,7 @@ def test_a_figure_that_fails_leaves_its_logs_and_no_old_numbers(
         (options.folder / "master.log").write_text("why")
         raise error
 
-    monkeypatch.setattr(fig9, "measure", fail)
-    monkeypatch.setattr(paper, "raise_signals", lambda: None)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    measured(fail)
     out = tmp_path / "out"
     out.mkdir()
     (out / "fig9.json").write_text("{}")
@@ -243,12 +248,10 @@ def test_a_figure_that_fails_leaves_its_logs_and_no_old_numbers(
     assert list(out.iterdir()) == []
 
 
-def test_a_figure_that_is_measured_says_its_size_and_leaves_no_folder(tmp_path, monkeypatch):
+def test_a_figure_that_is_measured_says_its_size_and_leaves_no_folder(measured, tmp_path):
     """The numbers mark a small run."""
     result = Result([], {"slope_us": 1.0}, {"hosts": "few"}, lambda path: path.touch())
-    monkeypatch.setattr(fig9, "measure", lambda _: result)
-    monkeypatch.setattr(paper, "raise_signals", lambda: None)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    measured(lambda _: result)
     out = tmp_path / "out"
     assert paper.main(["fig9", "--out", str(out), "--small"]) == 0
     report = json.loads((out / "fig9.json").read_text())
@@ -306,13 +309,8 @@ def test_every_form_of_picture_is_drawn(tmp_path):
 )
 def test_bad_arguments_are_refused(words, said, tmp_path):
     """The error is argparse's, with status 2."""
-    ended = subprocess.run(
-        [sys.executable, "-m", "benchmarks.paper", *words, "--out", str(tmp_path / "out")],
-        check=False,
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-    )
+    command = [sys.executable, "-m", "benchmarks.paper", *words, "--out", str(tmp_path / "out")]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, cwd=ROOT)
     assert ended.returncode == 2
     assert said in ended.stderr
     assert "Traceback" not in ended.stderr

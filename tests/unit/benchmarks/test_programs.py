@@ -76,13 +76,9 @@ def test_every_benchmark_is_ended_so(program):
 @pytest.mark.parametrize("program", needs.COMMANDS)
 def test_chaos_names_a_missing_program_before_it_begins(monkeypatch, tmp_path, program):
     """`nft` is checked too, though only the first network fault needs it."""
-    found = shutil.which
+    found = shutil.which("true")
     monkeypatch.setattr(needs, "check_rights", lambda: None)
-    monkeypatch.setattr(
-        shutil,
-        "which",
-        lambda name, **options: None if name == program else found("true", **options),
-    )
+    monkeypatch.setattr(shutil, "which", lambda name, **_: None if name == program else found)
     out = tmp_path / "out"
     with pytest.raises(LabError, match=f"the command '{program}' is missing.*apt-get install"):
         chaos.main(["--out", str(out)])

@@ -32,18 +32,10 @@ def host(
 
 def process(name, state="running", host="alpha", *, number=1, kind="service", **more):
     values = {
-        "pid": 99 if state == "running" else 0,
-        "restarts": 0,
-        "migrations": 0,
-        "exit_code": 0,
-        "priority": 0,
-        "queue_position": 0,
-        "since": 12.0,
-        "cpu": 0.5,
-        "memory": 64_000_000,
-        "reason": "",
-        **more,
-    }
+        "pid": 99 if state == "running" else 0, "restarts": 0, "migrations": 0, "exit_code": 0,
+        "priority": 0, "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000,
+        "reason": "", **more,
+    }  # fmt: skip
     return ProcessRow(name=name, kind=kind, state=state, host=host, number=number, **values)
 
 
@@ -65,15 +57,9 @@ PLUGINS = [
 ]
 EVENTS = [event(1, "submitted", host=""), event(2)]
 STORY = {
-    "process": "talker",
-    "state": "running",
-    "host": "alpha",
-    "reason": "",
+    "process": "talker", "state": "running", "host": "alpha", "reason": "",
     "decision": {
-        "kind": "assigned",
-        "elapsed": 61.0,
-        "policy": "weighted",
-        "chosen": "alpha",
+        "kind": "assigned", "elapsed": 61.0, "policy": "weighted", "chosen": "alpha",
         "need": {"memory": 64e6, "cpu": 0.5},
         "hosts": [
             {"name": "alpha", "verdict": "chosen", "score": 0.41234, "reason": "memory 0.41"},
@@ -83,7 +69,7 @@ STORY = {
         "omitted": {"cannot take it now": 5, "would take it at a higher score": 0},
     },
     "history": [{"elapsed": 62.0, "kind": "submitted", "message": "talker was submitted"}],
-}
+}  # fmt: skip
 
 
 @dataclass
@@ -147,21 +133,15 @@ class FakeClient:
     def list(self, *, hosts=False, processes=False, plugins=False, events=False, process="",
              host="", after=0, newest=0):  # fmt: skip
         self._note("list", {"process": process, "host": host, "after": after, "newest": newest})
-        chosen = [
-            row
-            for row in self.events
-            if row.sequence > after and process in ("", row.process) and host in ("", row.host)
-        ]
+        chosen = [row for row in self.events if row.sequence > after]
+        chosen = [one for one in chosen if process in ("", one.process) and host in ("", one.host)]
         return Snapshot(
-            master="lab",
-            uptime=125.0,
-            trouble=self.trouble,
+            master="lab", uptime=125.0, trouble=self.trouble,
             last_sequence=max((row.sequence for row in self.events), default=0),
-            hosts=self.hosts if hosts else (),
-            processes=self.processes if processes else (),
+            hosts=self.hosts if hosts else (), processes=self.processes if processes else (),
             plugins=[row for row in self.plugins if plugins and plugins in (True, row.state)],
             events=chosen[-newest:] if events and newest else chosen if events else (),
-        )
+        )  # fmt: skip
 
 
 @pytest.fixture
@@ -175,6 +155,32 @@ def client(monkeypatch):
 
     monkeypatch.setattr(connection, "connect", connect)
     return fake
+
+
+@pytest.fixture
+def while_asleep(client, monkeypatch):
+    """Return a function that sets what happens in each sleep of a command, in turn.
+
+    A step is a mapping of new values of the client, or a function.
+    """
+
+    def set_steps(*steps):
+        left = list(steps)
+
+        def sleep(seconds):
+            assert left, "the command sleeps once more than expected"
+            step = left.pop(0)
+            step() if callable(step) else vars(client).update(step)
+
+        monkeypatch.setattr("time.sleep", sleep)
+        return left
+
+    return set_steps
+
+
+def interrupt():
+    """Press Ctrl-C."""
+    raise KeyboardInterrupt
 
 
 @pytest.fixture

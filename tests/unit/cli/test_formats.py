@@ -8,20 +8,14 @@ from rosrm.cli.output import formats
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (64.06e6, "64.1 MB"), (2**31, "2.1 GB"),
-     (999_999, "1.0 MB"), (123e9, "123 GB")],
+    ("value", "binary", "text"),
+    [(0, False, "0 B"), (999, False, "999 B"), (1000, False, "1.0 kB"), (64.06e6, False, "64.1 MB"),
+     (2**31, False, "2.1 GB"), (999_999, False, "1.0 MB"), (123e9, False, "123 GB"),
+     (1023, True, "1023 B"), (1024, True, "1.0 KiB"), (2**30, True, "1.0 GiB"),
+     (850 * 2**20, True, "850 MiB")],
 )  # fmt: skip
-def test_sizes_have_three_digits(value, text):
-    assert formats.size(value) == text
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(1023, "1023 B"), (1024, "1.0 KiB"), (2**30, "1.0 GiB"), (850 * 2**20, "850 MiB")],
-)
-def test_sizes_in_powers_of_1024(value, text):
-    assert formats.size(value, binary=True) == text
+def test_sizes_have_three_digits(value, binary, text):
+    assert formats.size(value, binary=binary) == text
 
 
 @pytest.mark.parametrize(

@@ -103,9 +103,8 @@ def test_two_distributions_with_one_command_are_both_named(rosrm, installed):
 
     result = rosrm("hello", "you")
 
-    assert (result.code, result.err) == (
-        1, "rosrm: the command 'hello' is in acme 1.5 and bolt 1.5; uninstall all but one\n",
-    )  # fmt: skip
+    said = "rosrm: the command 'hello' is in acme 1.5 and bolt 1.5; uninstall all but one\n"
+    assert (result.code, result.err) == (1, said)
 
 
 def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installed):
@@ -127,9 +126,8 @@ def test_a_command_whose_distribution_is_absent_names_it(rosrm, monkeypatch, com
 
     result = rosrm(command, "up", "--help")
 
-    assert (result.code, result.out, result.err) == (
-        2, "", f"rosrm: the command {command!r} comes with `pip install {distribution}`\n",
-    )  # fmt: skip
+    said = f"rosrm: the command {command!r} comes with `pip install {distribution}`\n"
+    assert (result.code, result.out, result.err) == (2, "", said)
 
 
 def test_a_command_of_rosrm_is_found_without_a_search(rosrm, monkeypatch):

@@ -83,6 +83,31 @@ def slaves(client, tmp_path):
     return made
 
 
+@pytest.fixture
+def lines(rosrm):
+    """Return a function that gives the lines of `rosrm logs`, without those before a start."""
+
+    def lines(*words):
+        out = rosrm("logs", *words).out
+        return [line for line in out.splitlines() if "---" not in line]
+
+    return lines
+
+
+@pytest.fixture
+def silent(client, slaves):
+    """Return a function from which on no slave answers on alpha."""
+    there = client.read_log
+
+    def read(on, *query, **more):
+        if on == "alpha":
+            client.asked.append("alpha")
+            raise NoMaster("no slave answers on alpha")
+        return there(on, *query, **more)
+
+    return lambda: setattr(client, "read_log", read)
+
+
 # --- all of it --------------------------------------------------------------------------------
 
 
@@ -91,14 +116,6 @@ def test_a_log_is_copied_byte_by_byte_in_parts(rosrm, client, slaves, monkeypatc
     slaves.write("alpha", 1, "one\ntwo ä\nend".encode())
     result = rosrm("logs", "talker")
     assert (result.code, result.out) == (0, "one\ntwo ä\nend")
-
-
-def test_rotated_files_are_part_of_it(rosrm, client, slaves):
-    for word in (b"one\n", b"two\n"):
-        slaves.write("alpha", 1, word)
-        slaves.rotate("alpha", 1)
-    slaves.write("alpha", 1, b"three\n")
-    assert rosrm("logs", "talker").out == "one\ntwo\nthree\n"
 
 
 def test_what_was_dropped_is_said_with_its_size(rosrm, client, slaves):
@@ -137,16 +154,15 @@ def test_the_log_of_an_ended_process_is_found_by_its_events(rosrm, client, slave
 # --- a part of it -----------------------------------------------------------------------------
 
 
-def test_tail_counts_lines_over_rotations_and_instances(rosrm, client, slaves):
+def test_tail_counts_lines_over_rotations_and_instances(rosrm, slaves, lines):
     slaves.write("alpha", 1, b"a\nb\n")
     slaves.write("alpha", 2, b"c\n")
     slaves.rotate("alpha", 2)
     slaves.write("alpha", 2, b"d\ne")
     slaves.start("alpha", 3)
-    for tail, lines in ((1, "e"), (2, "d\ne"), (3, "c\nd\ne")):
-        assert rosrm("logs", "talker", "--tail", tail).out == lines
-    out = rosrm("logs", "talker", "--tail", "4").out
-    assert [line for line in out.splitlines() if "---" not in line] == ["b", "c", "d", "e"]
+    for tail, out in ((1, "e"), (2, "d\ne"), (3, "c\nd\ne")):
+        assert rosrm("logs", "talker", "--tail", tail).out == out
+    assert lines("talker", "--tail", "4") == ["b", "c", "d", "e"]
     result = rosrm("logs", "talker", "--tail", "64kB")
     assert (result.code, "--tail" in result.err) == (2, True)
 
@@ -218,7 +234,7 @@ def test_several_logs_are_merged_by_time(rosrm, client, slaves, monkeypatch):
     ]  # fmt: skip
 
 
-def test_lines_without_a_time_stay_where_they_are_in_their_log(rosrm, client, slaves):
+def test_lines_without_a_time_stay_where_they_are_in_their_log(client, slaves, lines):
     """An earlier instance may be from before there were times."""
     client.processes = [process("talker"), process("ear")]
     slaves.write("alpha", 1, b"one\n")
@@ -226,11 +242,9 @@ def test_lines_without_a_time_stay_where_they_are_in_their_log(rosrm, client, sl
     slaves.path("alpha", 2).with_name("talker.2.log.1").write_bytes(b"old\n")
     slaves.write("alpha", 3, b"three\n", at=NOON + 2)
     slaves.write("alpha", 4, b"a\nb\n", "ear", at=NOON + 1)
-    lines = rosrm("logs", "talker", "ear").out.splitlines()
-    assert [line for line in lines if "---" not in line] == [
-        "talker | one", "talker | old",
-        "ear    | a", "ear    | b",
-        "talker | two", "talker | three",
+    assert lines("talker", "ear") == [
+        "talker | one", "talker | old", "ear    | a", "ear    | b", "talker | two",
+        "talker | three",
     ]  # fmt: skip
 
 
@@ -270,11 +284,9 @@ def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
     client.hosts = [host("alpha", state)]
     client.processes = [process("talker", "unreachable", reason="alpha is lost")]
     result = rosrm("logs", "talker")
-    assert result.code == 1
-    assert (
-        "the log of talker is on alpha. talker has been unreachable for 12 s: alpha is lost. "
-        "To read it, start the slave of alpha again (`rosrm slave`). `rosrm events" in result.err
-    )
+    since = "the log of talker is on alpha. talker has been unreachable for 12 s: alpha is lost."
+    remedy = "To read it, start the slave of alpha again (`rosrm slave`). `rosrm events"
+    assert (result.code, f"{since} {remedy}" in result.err) == (1, True)
     client.processes = [process("talker", "unreachable")]
     verb = "has" if state == "left" else "is"
     assert f"the log of talker is on alpha, and alpha {verb}" in rosrm("logs", "talker").err
@@ -301,21 +313,13 @@ def test_one_name_that_fails_does_not_keep_the_others(rosrm, client, slaves):
     assert "no such process: 'nobody'; there are: talker, " in result.err
 
 
-def test_a_host_that_does_not_answer_is_asked_once(rosrm, client, slaves):
+def test_a_host_that_does_not_answer_is_asked_once(rosrm, client, slaves, silent):
     """Report each log that is only there, and show those of other hosts at once."""
     client.processes = [process(name, host="alpha") for name in ("one", "two")]
     client.processes.append(process("ear", host="beta", number=3))
     client.events = [event(1, process="ear", host="alpha")]
     slaves.write("beta", 3, b"heard\n", "ear")
-    there = client.read_log
-
-    def read(on, *query, **more):
-        if on == "alpha":
-            client.asked.append("alpha")
-            raise NoMaster("no slave answers on alpha")
-        return there(on, *query, **more)
-
-    client.read_log = read
+    silent()
     result = rosrm("logs", "one", "two", "ear")
     assert client.asked.count("alpha") == 1
     assert result.out.endswith("\near | heard\n")
@@ -326,22 +330,21 @@ def test_a_host_that_does_not_answer_is_asked_once(rosrm, client, slaves):
     ])  # fmt: skip
 
 
-def test_a_lost_host_holds_up_no_other_log(rosrm, client, slaves, monkeypatch):
+def test_a_lost_host_holds_up_no_other_log(rosrm, client, slaves, while_asleep, monkeypatch):
     """With -f, too, the report comes before the other logs are followed."""
     client.hosts = [host("alpha", "lost"), host("beta")]
     client.processes = [process("talker", "unreachable"), process("ear", host="beta", number=2)]
     slaves.write("beta", 2, b"heard\n", "ear")
     slaves.live.add(("beta", 2))
-    reported = []
+    capture, reported = StringIO(), []
+    monkeypatch.setattr(log_copies.typer, "echo", lambda text, err: capture.write(text))
 
-    def later(seconds):
+    def end():
         reported.append(capture.getvalue())
         slaves.live.clear()
         client.processes = [process("ear", "finished")]
 
-    capture = StringIO()
-    monkeypatch.setattr(log_copies.typer, "echo", lambda text, err: capture.write(text))
-    monkeypatch.setattr(log_copies.time, "sleep", later)
+    while_asleep(end)
     result = rosrm("logs", "talker", "ear", "-f")
     assert (result.code, result.out.splitlines()[1:]) == (1, ["ear    | heard"])
     assert "the log of talker is on alpha, and alpha is lost" in reported[0]
@@ -351,37 +354,29 @@ def test_a_lost_host_holds_up_no_other_log(rosrm, client, slaves, monkeypatch):
 # --- follow -----------------------------------------------------------------------------------
 
 
-def test_follow_shows_what_is_added_over_a_rotation(rosrm, client, slaves, monkeypatch):
+def test_follow_shows_what_is_added_over_a_rotation(rosrm, client, slaves, while_asleep):
     slaves.write("alpha", 1, b"one\n")
     slaves.live.add(("alpha", 1))
-    steps = iter(["grow", "rotate", "end"])
 
-    def later(seconds):
-        step = next(steps)
-        if step == "grow":
-            slaves.write("alpha", 1, b"two\n")
-        elif step == "rotate":
-            slaves.write("alpha", 1, b"thr")
-            slaves.rotate("alpha", 1)
-            slaves.write("alpha", 1, b"ee\n")
-        else:
-            slaves.live.clear()
-            client.processes = [process("talker", "finished")]
+    def rotate():
+        slaves.write("alpha", 1, b"thr")
+        slaves.rotate("alpha", 1)
+        slaves.write("alpha", 1, b"ee\n")
 
-    monkeypatch.setattr("time.sleep", later)
+    def end():
+        slaves.live.clear()
+        client.processes = [process("talker", "finished")]
+
+    while_asleep(lambda: slaves.write("alpha", 1, b"two\n"), rotate, end)
     result = rosrm("logs", "talker", "-f")
     assert (result.code, result.out) == (0, "one\ntwo\nthree\n")
 
 
-def test_follow_continues_where_the_process_moves_to(rosrm, client, slaves, monkeypatch):
+def test_follow_continues_where_the_process_moves_to(rosrm, client, slaves, while_asleep):
     slaves.write("alpha", 1, b"on alpha\n")
     slaves.write("beta", 2, b"on beta\n")
-    moves = iter([process("talker", "running", "beta", number=2), process("talker", "finished")])
-
-    def later(seconds):
-        client.processes = [next(moves)]
-
-    monkeypatch.setattr("time.sleep", later)
+    moved = process("talker", "running", "beta", number=2)
+    while_asleep({"processes": [moved]}, {"processes": [process("talker", "finished")]})
     result = rosrm("logs", "talker", "-f")
     assert result.code == 0
     first, mark, last = result.out.splitlines()
@@ -389,7 +384,9 @@ def test_follow_continues_where_the_process_moves_to(rosrm, client, slaves, monk
     assert mark.startswith("--- started on beta at ")
 
 
-def test_follow_waits_for_a_log_that_its_host_is_about_to_begin(rosrm, client, slaves, monkeypatch):
+def test_follow_waits_for_a_log_that_its_host_is_about_to_begin(
+    rosrm, client, slaves, while_asleep
+):
     client.processes = [process("talker", "assigned")]
 
     def refuse(*_, **__):
@@ -398,61 +395,48 @@ def test_follow_waits_for_a_log_that_its_host_is_about_to_begin(rosrm, client, s
     there, client.read_log = client.read_log, refuse
     assert rosrm("logs", "talker").code == 1
 
-    def appear(seconds):
+    def appear():
         client.read_log = there
         slaves.write("alpha", 1, b"begun\n")
-        monkeypatch.setattr("time.sleep", end)
 
-    def end(seconds):
-        client.processes = [process("talker", "finished")]
-
-    monkeypatch.setattr("time.sleep", appear)
+    while_asleep(appear, {"processes": [process("talker", "finished")]})
     result = rosrm("logs", "talker", "-f")
     assert (result.code, result.out) == (0, "begun\n")
 
 
-def test_several_are_followed_at_once(rosrm, client, slaves, monkeypatch):
+def test_several_are_followed_at_once(client, slaves, lines, while_asleep):
     client.processes = [process("talker"), process("ear", number=2)]
     slaves.write("alpha", 1, b"one\n")
     slaves.write("alpha", 2, b"a\n", "ear")
     slaves.live |= {("alpha", 1), ("alpha", 2)}
 
-    def later(seconds):
+    def end():
         slaves.write("alpha", 1, b"two\n")
         slaves.write("alpha", 2, b"b\n", "ear")
         slaves.live.clear()
         client.processes = [process("talker", "finished"), process("ear", "finished")]
 
-    monkeypatch.setattr(log_copies.time, "sleep", later)
-    lines = rosrm("logs", "talker", "ear", "-f").out.splitlines()
-    assert [line for line in lines if "---" not in line] == [
-        "talker | one", "ear    | a", "talker | two", "ear    | b",
-    ]  # fmt: skip
+    while_asleep(end)
+    shown = ["talker | one", "ear    | a", "talker | two", "ear    | b"]
+    assert lines("talker", "ear", "-f") == shown
 
 
-def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, monkeypatch):
+def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, while_asleep, silent):
     """Report the lost log with its unfinished line, and follow the other log to its end."""
     client.processes = [process("talker"), process("ear", host="beta", number=2)]
     slaves.write("alpha", 1, b"half")
     slaves.write("beta", 2, b"a\n", "ear")
     slaves.live |= {("alpha", 1), ("beta", 2)}
-    there = client.read_log
 
-    def read(on, *query, **more):
-        if on == "alpha":
-            raise NoMaster("no slave answers on alpha")
-        return there(on, *query, **more)
-
-    def lose(seconds):
-        client.read_log = read
+    def lose():
+        silent()
         slaves.write("beta", 2, b"b\n", "ear")
-        monkeypatch.setattr(log_copies.time, "sleep", end)
 
-    def end(seconds):
+    def end():
         slaves.live.clear()
         client.processes = [process("ear", "finished")]
 
-    monkeypatch.setattr(log_copies.time, "sleep", lose)
+    while_asleep(lose, end)
     result = rosrm("logs", "talker", "ear", "-f")
     assert [line for line in result.out.splitlines() if "---" not in line] == [
         "ear    | a", "talker | half", "ear    | b",

@@ -9,10 +9,9 @@ import pytest
 from rich.console import Console
 
 from rosrm.cli.output import tables
-from rosrm.errors import ConfigError
 from rosrm_simulate import picture
-from rosrm_simulate.runs import agreement_of
-from tests.unit.simulation.workloads import host, plan, recorded, simulation
+from rosrm_simulate.runs import Request, carry_out
+from tests.unit.tools.simulate.workloads import host, plan, recorded, simulation
 
 WORKLOAD = """
 hosts: [{name: 'h{i}', foreach: {i: 'range(0, 2)'}, memory: 1GB, cpu: 2}]
@@ -45,11 +44,8 @@ def test_a_workload_is_compared_with_its_variants(rosrm, workload):
     result = rosrm("simulate", workload, "--policy", "threshold", "--hosts", "4")
     assert result.code == 0
     rows = [line for line in result.out.splitlines() if "/7" in line]
-    assert [row.split("  ")[0] for row in rows] == [
-        "as given",
-        "scoring.policy threshold",
-        "hosts 4",
-    ]
+    runs = ["as given", "scoring.policy threshold", "hosts 4"]
+    assert [row.split("  ")[0] for row in rows] == runs
     assert "as given: 1 never placed: lonely: " in result.out
     assert "events in" in result.out
 
@@ -93,19 +89,6 @@ def test_the_runs_are_drawn(rosrm, workload, tmp_path):
     assert len(drawn) > 5000
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [("p.gif", "has to end with .png, .svg, .pdf"), ("no/p.png", "there is no directory")],
-)
-def test_a_picture_that_cannot_be_drawn_is_refused_before_the_run(
-    rosrm, workload, tmp_path, name, said
-):
-    result = rosrm("simulate", workload, "--plot", tmp_path / name)
-    assert result.code == 2
-    assert said in result.err
-    assert not result.out
-
-
 def test_without_matplotlib_it_says_what_to_install(rosrm, workload, tmp_path, monkeypatch):
     monkeypatch.setattr(picture, "find_spec", lambda _name: None)
     result = rosrm("simulate", workload, "--plot", tmp_path / "p.png")
@@ -125,9 +108,8 @@ def test_a_record_is_replayed_simulated_and_compared(rosrm, record):
     result = rosrm("simulate", record, "--hosts", "3")
     assert result.code == 0
     assert "replayed: all 6 decisions are the same" in result.out
-    assert [line.split()[0] for line in result.out.splitlines()[4:7]] == [
-        "recorded", "simulated", "hosts",
-    ]  # fmt: skip
+    rows = [line.split()[0] for line in result.out.splitlines()[4:7]]
+    assert rows == ["recorded", "simulated", "hosts"]
     assert "  6 of 6 processes started on the same host\n" in result.out
     assert "  moves: 0 recorded, 0 simulated\n" in result.out
 
@@ -182,61 +164,43 @@ def test_a_replay_that_decides_otherwise_is_said(rosrm, tmp_path, content):
 def test_a_bad_record_is_one_clear_error(rosrm, tmp_path, content, change, said):
     (tmp_path / "r.rosrec").write_bytes(change(content))
     result = rosrm("simulate", tmp_path / "r.rosrec")
-    assert result.code == 2
-    assert result.err.count("\n") == 1
+    assert (result.code, result.err.count("\n"), result.out) == (2, 1, "")
     assert f"r.rosrec: {said}" in result.err
-    assert not result.out
 
 
-@pytest.mark.parametrize("tail", [b"", bytes(4096)])
-def test_one_that_is_cut_short_can_be_used_as_far_as_it_goes(rosrm, tmp_path, content, tail):
-    (tmp_path / "r.rosrec").write_bytes(content[:-200] + tail)
+def test_one_that_is_cut_short_can_be_used_as_far_as_it_goes(rosrm, tmp_path, content):
+    (tmp_path / "r.rosrec").write_bytes(content[:-200])
     result = rosrm("simulate", tmp_path / "r.rosrec", "--cut")
-    assert result.code == 0
-    assert "cut short" in result.out
+    assert (result.code, "cut short" in result.out) == (0, True)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("words", "said"),
     [
-        (
-            ["--policy", "wieghted"],
-            "--policy wieghted: unknown scoring policy 'wieghted'; did you mean",
-        ),
-        (["--hosts", "0"], "--hosts 0: hosts: 0 is not within 1..10000"),
-        (["--hosts", "-2"], "--hosts -2: hosts: -2 is not within 1..10000"),
-        (["--until", "-5s"], "--until: '-5s' is not greater than 0"),
-        (["--variant", "[1"], "--variant:1:3: unreadable YAML"),
-        (["--cut"], "--cut is for records"),
+        ("w.yaml --policy wieghted",
+         "--policy wieghted: unknown scoring policy 'wieghted'; did you mean"),
+        ("w.yaml --hosts 0", "--hosts 0: hosts: 0 is not within 1..10000"),
+        ("w.yaml --hosts -2", "--hosts -2: hosts: -2 is not within 1..10000"),
+        ("w.yaml --until -5s", "--until: '-5s' is not greater than 0"),
+        ("w.yaml --variant [1", "--variant:1:3: unreadable YAML"),
+        ("w.yaml --plot p.gif", "has to end with .png, .svg, .pdf"),
+        ("w.yaml --plot no/p.png", "there is no directory"),
+        ("w.yaml --cut", "--cut is for records"),
+        ("r.rosrec --seed 3", "--seed is for workloads"),
+        ("map.npz", "map.npz: is neither the record of a master's run nor a workload in YAML"),
+        ("none.yaml", "none.yaml: cannot be read: No such file or directory"),
     ],
-)
-def test_a_wrong_option_is_refused(rosrm, workload, options, said):
-    result = rosrm("simulate", workload, *options)
-    assert result.code == 2
-    assert said in result.err
-    assert not result.out
-
-
-def test_a_seed_makes_no_sense_for_a_record(rosrm, record):
-    result = rosrm("simulate", record, "--seed", "3")
-    assert result.code == 2
-    assert "--seed is for workloads" in result.err
-
-
-def test_a_file_of_another_kind_is_named(rosrm, tmp_path):
+)  # fmt: skip
+def test_wrong_arguments_are_refused_before_the_run(
+    rosrm, workload, record, tmp_path, monkeypatch, words, said
+):
     (tmp_path / "map.npz").write_bytes(b"PK\3\4\0\0")
-    result = rosrm("simulate", tmp_path / "map.npz")
-    assert result.code == 2
-    assert "map.npz: is neither the record of a master's run nor a workload in YAML" in result.err
+    monkeypatch.chdir(tmp_path)
+    result = rosrm("simulate", *words.split())
+    assert (result.code, result.out) == (2, "")
+    assert said in result.err
 
 
 def test_how_closely_a_run_was_simulated_can_be_asked_for(record, workload):
-    assert agreement_of(record).same_host == 1.0
-    with pytest.raises(ConfigError, match="only the record of a run can be compared"):
-        agreement_of(workload)
-
-
-def test_a_file_that_is_not_there_is_named(rosrm, tmp_path):
-    result = rosrm("simulate", tmp_path / "none.yaml")
-    assert result.code == 2
-    assert "none.yaml: cannot be read: No such file or directory" in result.err
+    assert carry_out(Request(record)).agreement.same_host == 1.0
+    assert carry_out(Request(workload)).agreement is None

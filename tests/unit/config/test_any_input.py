@@ -22,24 +22,12 @@ from rosrm.config.ros import DiscoveryInFile, RosInFile
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
 from rosrm.errors import ConfigError
 
+KINDS = (
+    ClusterConfig, HostConfig, MigrationSettings, ScoringChoice, RosInFile, DiscoveryInFile,
+    ProcessInFile, LabelsInFile, MigrationInFile, ReadinessInFile, RestartInFile,
+)  # fmt: skip
 KEYS = sorted(
-    {
-        f.name
-        for kind in (
-            ClusterConfig,
-            HostConfig,
-            MigrationSettings,
-            ScoringChoice,
-            RosInFile,
-            DiscoveryInFile,
-            ProcessInFile,
-            LabelsInFile,
-            MigrationInFile,
-            ReadinessInFile,
-            RestartInFile,
-        )
-        for f in fields(kind)
-    }
+    {f.name for kind in KINDS for f in fields(kind)}
     | {"processes", "foreach", "memory", "cpu", "i"}
 )
 WORDS = ["", "a", "{i}", "{", "range(3)", "5s", "2GiB", "slice", "relaunch", "x 'y", "job"]
@@ -77,18 +65,9 @@ def test_any_list_of_processes_is_taken_or_refused(path, root):
 
 
 @pytest.mark.parametrize("load", [load_cluster, load_host, load_work])
-@given(text=st.text(max_size=40))
-@settings(max_examples=100, deadline=None)
-def test_any_text_is_taken_or_refused(path, load, text):
-    path.write_text(text, encoding="utf-8", newline="")
-    with suppress(ConfigError):
-        load(path)
-
-
-@pytest.mark.parametrize("load", [load_cluster, load_host, load_work])
-@given(content=st.binary(max_size=20))
-@settings(max_examples=50, deadline=None)
-def test_any_bytes_are_taken_or_refused(path, load, content):
+@given(content=st.binary(max_size=20) | st.text(max_size=40).map(str.encode))
+@settings(max_examples=150, deadline=None)
+def test_any_text_and_any_bytes_are_taken_or_refused(path, load, content):
     path.write_bytes(content)
     with suppress(ConfigError):
         load(path)

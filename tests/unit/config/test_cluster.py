@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Annotated
 
 import pytest
@@ -13,9 +12,9 @@ from annotated_types import Le
 from rosrm.config import ClusterConfig, load_cluster
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer
-from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Fraction, ResourceName, Seconds
+from tests.plugin_kit import registry_of
 
 
 @dataclass(frozen=True)
@@ -56,24 +55,13 @@ class Made:
         self.score = options
 
 
-@hookimpl
-def register_scoring_policies():
-    return [ScoringOffer("weighted", Made, Weights), ScoringOffer("curved", Made, Curves)]
-
-
-@hookimpl
-def register_migration_strategies():
-    return [MigrationOffer("relaunch", lambda options: options)]
+RELAUNCH = MigrationOffer("relaunch", lambda options: options)
 
 
 @pytest.fixture
 def registry():
-    return Registry.of(
-        ours=SimpleNamespace(
-            register_scoring_policies=register_scoring_policies,
-            register_migration_strategies=register_migration_strategies,
-        )
-    )
+    weighted = ScoringOffer("weighted", Made, Weights)
+    return registry_of(weighted, ScoringOffer("curved", Made, Curves), RELAUNCH)
 
 
 def test_an_empty_file_gives_the_defaults(file):
@@ -168,11 +156,7 @@ def test_everything_wrong_is_said_at_once_each_with_its_place(refusal):
     assert lines[0] == f"{len(expected)} errors in f.yaml"
     for line, start in zip(lines[1:], expected, strict=True):
         assert line.strip().startswith(start)
-
-
-def test_a_lease_outlasts_the_suspicion(refusal):
-    said = refusal(load_cluster, "liveness:\n  suspect: 20s\n")
-    assert said == ("f.yaml:2:12: liveness.suspect (20 s) must be less than liveness.lease (10 s)")
+    assert f"{expected[7]}\n" in said
 
 
 @pytest.mark.parametrize(
@@ -192,25 +176,15 @@ def test_a_quiet_slave_is_not_taken_for_a_silent_one(refusal, text, place, perio
     )
 
 
-def test_a_suspicion_of_just_three_beat_periods_is_taken(tmp_path):
-    file = tmp_path / "f.yaml"
-    file.write_text("liveness: {suspect: 600ms}")
-    assert load_cluster(file).liveness.suspect == 0.6
-
-
-def test_options_of_no_policy_are_refused(refusal):
-    assert "f.yaml:1:37: checkpoint.options: options of no policy" in refusal(
-        load_cluster, "checkpoint: {policy: null, options: {a: 1}}"
-    )
+def test_a_suspicion_of_just_three_beat_periods_is_taken(file):
+    assert load_cluster(file("liveness: {suspect: 600ms}")).liveness.suspect == 0.6
 
 
 def test_a_wrong_type_and_an_unknown_plugin_are_said_together(refusal, registry):
     said = refusal(load_cluster, "name: 5\nscoring: {policy: wieghted}\n", registry)
     assert "f.yaml:1:7: name: text is required, not 5" in said
-    assert (
-        "f.yaml:2:11: unknown scoring policy 'wieghted'; did you mean 'weighted'? "
-        "Installed: curved, weighted." in said
-    )
+    unknown = "f.yaml:2:11: unknown scoring policy 'wieghted'; did you mean 'weighted'?"
+    assert f"{unknown} Installed: curved, weighted." in said
 
 
 def test_options_are_checked_against_the_plugin_and_kept_in_base_units(file, registry):
@@ -243,22 +217,25 @@ def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, regi
 )
 def test_a_fault_in_an_option_of_several_types_is_reported_once(refusal, registry, curve, fault):
     """The error has its path in the file and the keys of all types."""
-    said = refusal(
-        load_cluster, f"scoring: {{policy: curved, options: {{curve: {curve}}}}}", registry
-    )
+    text = f"scoring: {{policy: curved, options: {{curve: {curve}}}}}"
+    said = refusal(load_cluster, text, registry)
     assert said.endswith(fault.format("options of scoring policy 'curved': curve"))
     assert said.count("options of") == 1
 
 
-def test_options_for_a_plugin_without_any_are_refused(refusal, registry):
-    said = refusal(load_cluster, "migration: {strategies: {relaunch: {fast: true}}}", registry)
-    assert "unknown key 'fast' in options of migration strategy 'relaunch'" in said
-    assert "Allowed: none" in said
-
-
-def test_options_that_are_no_mapping_are_refused(refusal, registry):
-    said = refusal(load_cluster, "scoring: {options: [1]}", registry)
-    assert "f.yaml:1:20: scoring.options: a mapping is required, not a list" in said
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("checkpoint: {policy: null, options: {a: 1}}",
+         "f.yaml:1:37: checkpoint.options: options of no policy"),
+        ("migration: {strategies: {relaunch: {fast: true}}}",
+         "unknown key 'fast' in options of migration strategy 'relaunch'. Allowed: none"),
+        ("scoring: {options: [1]}",
+         "f.yaml:1:20: scoring.options: a mapping is required, not a list"),
+    ],
+)  # fmt: skip
+def test_options_that_nothing_takes_are_refused(refusal, registry, text, said):
+    assert said in refusal(load_cluster, text, registry)
 
 
 def test_a_default_plugin_that_is_not_installed_is_said_too(refusal):
@@ -278,34 +255,18 @@ class ByResource:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            "scoring: {policy: w, options: {weights: {memroy: 1.0}}}",
-            "weights: unknown resource 'memroy'; did you mean 'memory'? Allowed: memory (what",
-        ),
-        (
-            "scoring: {policy: w, options: {watch: [memory, dsk]}}",
-            "f.yaml:1:48: options of scoring policy 'w': watch: unknown resource 'dsk'. Allowed",
-        ),
+        ("scoring: {policy: w, options: {weights: {memroy: 1.0}}}",
+         "weights: unknown resource 'memroy'; did you mean 'memory'? Allowed: memory (what"),
+        ("scoring: {policy: w, options: {watch: [memory, dsk]}}",
+         "f.yaml:1:48: options of scoring policy 'w': watch: unknown resource 'dsk'. Allowed"),
         ("scoring: {policy: w}\ndefaults: {needs: {memroy: 1MB}}", "2:20: defaults.needs: unknown"),
     ],
-)
+)  # fmt: skip
 def test_a_resource_that_no_probe_reads_is_refused(refusal, text, said):
     """Both options marked to name resources and assumed needs are checked."""
-
-    @hookimpl
-    def register_probes():
-        return [ProbeOffer("memory", lambda options, context: None)]
-
-    @hookimpl
-    def register_scoring_policies():
-        return [ScoringOffer("w", lambda options: options, ByResource)]
-
-    ours = SimpleNamespace(
-        register_probes=register_probes,
-        register_scoring_policies=register_scoring_policies,
-        register_migration_strategies=register_migration_strategies,
-    )
-    assert said in refusal(load_cluster, text, Registry.of(ours=ours))
+    memory = ProbeOffer("memory", lambda options, context: None)
+    scoring = ScoringOffer("w", lambda options: options, ByResource)
+    assert said in refusal(load_cluster, text, registry_of(memory, scoring, RELAUNCH))
 
 
 def test_no_text_is_among_the_allowed_words_where_it_is_one(refusal):

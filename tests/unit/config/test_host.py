@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import socket
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import pytest
 
 from rosrm.config import HostConfig, load_host
 from rosrm.errors import SkipPlugin
 from rosrm.extensions.contracts import ProbeOffer
-from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import Registry
+from tests.plugin_kit import registry_of
 
 
 @dataclass(frozen=True)
@@ -22,19 +20,11 @@ class DiskOptions:
     path: str = "/"
 
 
-@hookimpl
-def register_probes():
-    return [
-        ProbeOffer(
-            "disk", lambda options, context: options, DiskOptions, default=True,
-            resources=("disk", "memory", "cpu", "gpu"),
-        )
-    ]  # fmt: skip
-
-
 @pytest.fixture
 def registry():
-    return Registry.of(ours=SimpleNamespace(register_probes=register_probes))
+    read = ("disk", "memory", "cpu", "gpu")
+    disk = ProbeOffer("disk", lambda *_: None, DiskOptions, default=True, resources=read)
+    return registry_of(disk)
 
 
 def test_an_empty_file_gives_the_defaults(file):
@@ -90,16 +80,16 @@ def test_a_limit_outside_0_to_1_is_refused(refusal):
     assert "f.yaml:1:27: limits.cpu: -0.1 is not within 0..1" in said
 
 
-def test_a_slice_needs_a_budget_above_zero(refusal):
-    assert "f.yaml:1:8: scope: a slice needs its budget of memory and cpu" in refusal(
-        load_host, "scope: slice"
-    )
-    assert "f.yaml:2:9: scope: a slice needs its budget of cpu" in refusal(
-        load_host, "scope: slice\nbudget: {memory: 2GiB}"
-    )
-    assert "f.yaml:2:18: budget.memory: must be above 0" in refusal(
-        load_host, "scope: slice\nbudget: {memory: 0, cpu: 1}"
-    )
+@pytest.mark.parametrize(
+    ("budget", "said"),
+    [
+        ("", "f.yaml:1:8: scope: a slice needs its budget of memory and cpu"),
+        ("budget: {memory: 2GiB}", "f.yaml:2:9: scope: a slice needs its budget of cpu"),
+        ("budget: {memory: 0, cpu: 1}", "f.yaml:2:18: budget.memory: must be above 0"),
+    ],
+)
+def test_a_slice_needs_a_budget_above_zero(refusal, budget, said):
+    assert said in refusal(load_host, f"scope: slice\n{budget}")
 
 
 def test_an_unknown_probe_and_a_wrong_option_are_refused_with_their_place(refusal, registry):
@@ -133,18 +123,11 @@ def test_other_values_are_refused_with_what_is_allowed(refusal):
         assert expected in said
 
 
-FDS = ProbeOffer("fds", lambda options, context: options)
-
-
 @pytest.fixture
 def with_fds():
     """Install a probe that is not read by default."""
-
-    @hookimpl
-    def register_probes():
-        return [FDS, ProbeOffer("disk", lambda options, context: options, default=True)]
-
-    return Registry.of(ours=SimpleNamespace(register_probes=register_probes))
+    disk = ProbeOffer("disk", lambda *_: None, default=True)
+    return registry_of(ProbeOffer("fds", lambda *_: None), disk)
 
 
 @pytest.mark.parametrize("section", ["limits", "budget"])
@@ -169,11 +152,8 @@ def test_a_limit_of_a_probe_that_may_be_absent_on_the_host_is_taken(file):
     def absent(options, context):
         raise SkipPlugin("no driver")
 
-    @hookimpl
-    def register_probes():
-        return [ProbeOffer("gpu", absent, default=True, resources=("gpu", "gpu_memory"))]
-
-    registry = Registry.of(ours=SimpleNamespace(register_probes=register_probes))
+    gpu = ProbeOffer("gpu", absent, default=True, resources=("gpu", "gpu_memory"))
+    registry = registry_of(gpu)
     assert load_host(file("limits: {gpu_memory: 0.9}"), registry).limits["gpu_memory"] == 0.9
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import pytest
 
 from rosrm.config import load_work
 from rosrm.extensions.contracts import Capabilities, MigrationOffer
-from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import Kind, MigrationPolicy, Readiness, RestartPolicy, StopPolicy
+from tests.plugin_kit import registry_of
+
+RELAUNCH = MigrationOffer("relaunch", lambda options: options)
 
 
 def one(path):
@@ -45,12 +45,8 @@ def test_every_word_is_read(file):
             """
         )
     )
-    assert (spec.name, spec.namespace, spec.program) == (
-        "camera",
-        "/robot1",
-        "image_tools/cam2image",
-    )
-    assert spec.arguments == ("--rate", "5", "--verbose")
+    assert (spec.name, spec.namespace) == ("camera", "/robot1")
+    assert (spec.program, spec.arguments) == ("image_tools/cam2image", ("--rate", "5", "--verbose"))
     assert spec.parameters == {"width": 320, "frame.id": "cam", "frame.ids": [1, 2]}
     assert spec.remappings == {"image": "/front/image"}
     assert spec.environment == {"RATE": "5", "DEBUG": "true"}
@@ -130,16 +126,9 @@ def test_foreach_makes_many_alike(file):
 
 
 def test_foreach_rows_may_be_listed(file):
-    specs = load_work(
-        file(
-            """
-            processes:
-              - name: "p{i}"
-                foreach: [{i: 1, mb: 8}, {i: 7, mb: 80}]
-                command: hold {mb}
-            """
-        )
-    )
+    rows = "[{i: 1, mb: 8}, {i: 7, mb: 80}]"
+    text = f"processes: [{{name: 'p{{i}}', foreach: {rows}, command: 'hold {{mb}}'}}]"
+    specs = load_work(file(text))
     assert [(spec.name, spec.command[1]) for spec in specs] == [("p1", "8"), ("p7", "80")]
 
 
@@ -167,6 +156,7 @@ def test_braces_are_plain_without_foreach(file):
         ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is required, not a list"),
         ("[{i: 1}, {j: 1}]", "n{i}", "f.yaml:1:46: foreach: gives j, and the first of the list i"),
         ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is required"),
+        ("[1]", "n", "f.yaml:1:35: foreach: each of a list is a mapping from names to values"),
     ],
 )
 def test_a_wrong_foreach_is_refused_with_its_place(refusal, foreach, name, said):
@@ -183,7 +173,7 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
           - {name: "a{i}", foreach: {i: [0, 1]}, command: x}
         """,
     )
-    assert said == ("f.yaml:4:12: duplicate process name 'a1', first given at line 3, column 12")
+    assert said == "f.yaml:4:12: duplicate process name 'a1', first given at line 3, column 12"
 
 
 @pytest.mark.parametrize(
@@ -230,18 +220,13 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
         ("command: x, health: {topic: /scan}, prioritty: 1", "health.topic and health.rate"),
         ("command: x, isolation: {after: 1s}, priority: high", "isolation.after goes with"),
         ("command: x, migration: relunch, prioritty: 1", "unknown migration strategy 'relunch'"),
-        (
-            "command: x, migration: {strategy: relunch, overlapp: true}, prioritty: 1",
-            "unknown migration strategy 'relunch'",
-        ),
+        ("command: x, migration: {strategy: relunch, overlapp: true}, prioritty: 1",
+         "unknown migration strategy 'relunch'"),
     ],
-)
+)  # fmt: skip
 def test_what_several_keys_break_is_said_along_with_a_wrong_key(refusal, entry, said):
     """The message lists all errors at once, not one stage of the check after the other."""
-    registry = Registry.of(
-        ours=SimpleNamespace(register_migration_strategies=register_migration_strategies)
-    )
-    found = refusal(load_work, f"processes: [{{name: a, {entry}}}]", registry)
+    found = refusal(load_work, f"processes: [{{name: a, {entry}}}]", registry_of(RELAUNCH))
     assert said in found
     assert "priori" in found
 
@@ -322,15 +307,11 @@ def test_what_a_shell_would_read_is_pointed_out(refusal, text, found):
         ("[echo, a && b, $HOME, ~/state]", ("echo", "a && b", "$HOME", "~/state")),
         ("\"grep 'a|b*' log\"", ("grep", "a|b*", "log")),
         ("'find . -name \\*.py'", ("find", ".", "-name", "*.py")),
-        (
-            "ros2 topic echo /a~ [1,2] x?y a#b",
-            ("ros2", "topic", "echo", "/a~", "[1,2]", "x?y", "a#b"),
-        ),
+        ("ros2 topic /a~ [1,2] x?y a#b", ("ros2", "topic", "/a~", "[1,2]", "x?y", "a#b")),
     ],
 )
 def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
-    (spec,) = load_work(file(f"processes:\n  - name: a\n    command: {given}\n"))
-    assert spec.command == words
+    assert one(file(f"processes:\n  - name: a\n    command: {given}\n")).command == words
 
 
 # --- files ------------------------------------------------------------------------------------
@@ -344,7 +325,6 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
         ("processes: [a]", "f.yaml:1:13: processes: each of the list is a mapping"),
         ("- {name: a}", "f.yaml:1:1: a work file is a mapping, not a list; put the list under `pr"),
         ("exec python3 robot", "f.yaml:1:1: a work file is a mapping, not text; it has `proces"),
-        ("proceses: []", "f.yaml:1:1: unknown key 'proceses'; did you mean 'processes'?"),
         ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name belongs to one"),
         ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is required"),
     ],
@@ -361,25 +341,12 @@ def test_a_misspelt_section_is_one_error(refusal):
 
 
 def test_a_fault_in_defaults_is_said_once_at_its_place(refusal):
-    said = refusal(
-        load_work,
-        """
-        defaults: {needs: {memory: 64mib}}
-        processes: [{name: a, command: x}, {name: b, command: x}]
-        """,
-    )
-    assert said.startswith("f.yaml:2:28: needs.memory: unknown unit 'mib'; did you mean 'MiB'?")
-
-
-@hookimpl
-def register_migration_strategies():
-    return [MigrationOffer("relaunch", lambda options: options)]
+    processes = "processes: [{name: a, command: x}, {name: b, command: x}]"
+    said = refusal(load_work, f"defaults: {{needs: {{memory: 64mib}}}}\n{processes}")
+    assert said.startswith("f.yaml:1:28: needs.memory: unknown unit 'mib'; did you mean 'MiB'?")
 
 
 def test_with_a_registry_the_strategy_and_its_options_are_checked(refusal):
-    registry = Registry.of(
-        ours=SimpleNamespace(register_migration_strategies=register_migration_strategies)
-    )
     said = refusal(
         load_work,
         """
@@ -387,24 +354,18 @@ def test_with_a_registry_the_strategy_and_its_options_are_checked(refusal):
           - {name: a, command: x, migration: relunch}
           - {name: b, command: x, migration: {strategy: relaunch, options: {fast: 1}}}
         """,
-        registry,
+        registry_of(RELAUNCH),
     )
     assert "f.yaml:3:38: unknown migration strategy 'relunch'; did you mean 'relaunch'?" in said
     assert "f.yaml:4:69: unknown key 'fast' in options of migration strategy 'relaunch'" in said
 
 
-@hookimpl(specname="register_migration_strategies")
-def register_a_follower():
-    follows = Capabilities(shadow=True)
-    return [MigrationOffer("follow", lambda options: options, capabilities=follows)]
-
-
 def test_a_standby_needs_a_strategy_that_can_shadow(file, refusal):
     """Whatever its name is; without a registry the master refuses it."""
     text = "processes: [{name: a, command: x, standby: true, migration: STRATEGY}]"
-    ours = SimpleNamespace(register_migration_strategies=register_migration_strategies)
-    theirs = SimpleNamespace(register_migration_strategies=register_a_follower)
-    registry = Registry.of(ours=ours, theirs=theirs)
+    follows = Capabilities(shadow=True)
+    follow = MigrationOffer("follow", lambda options: options, capabilities=follows)
+    registry = registry_of(RELAUNCH, follow)
     said = refusal(load_work, text.replace("STRATEGY", "relaunch"), registry)
     assert "f.yaml:1:44: a standby follows the state of its process, and relaunch cannot" in said
     assert "say `migration: follow`" in said
@@ -422,26 +383,13 @@ class Waits:
     ready: PositiveSeconds = 10.0
 
 
-@hookimpl
-def register_patient_strategy():
-    return [MigrationOffer("patient", lambda options: options, Waits)]
-
-
 def test_only_the_options_that_a_process_gives_go_over_those_of_the_cluster(file):
     """Values are in base units.
 
     Missing options keep the cluster's values, not the plugin's defaults.
     """
-    registry = Registry.of(
-        ours=SimpleNamespace(register_migration_strategies=register_patient_strategy)
-    )
-    (spec,) = load_work(
-        file(
-            """
-            processes:
-              - {name: a, command: x, migration: {strategy: patient, options: {ready: 1 min}}}
-            """
-        ),
-        registry,
-    )
+    registry = registry_of(MigrationOffer("patient", lambda options: options, Waits))
+    migration = "{strategy: patient, options: {ready: 1 min}}"
+    text = f"processes: [{{name: a, command: x, migration: {migration}}}]"
+    (spec,) = load_work(file(text), registry)
     assert spec.migration.options == {"ready": 60.0}

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,25 +21,17 @@ import rosrm_criu.plugin
 import rosrm_migration.plugin
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
-from rosrm.core.master.commands import (
-    Assign,
-    Command,
-    Order,
-    PublishStateConfig,
-    Redeliver,
-    Reply,
-    Withdraw,
-)
+from rosrm.core.master.commands import Command, Reply, SendOrder
 from rosrm.core.master.master_state import MasterState, Process
 from rosrm.core.master.recovery.restore import restore
-from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.registry import Registry
 from rosrm.model.codec import to_plain
+from rosrm.model.orders import Order
 from rosrm.model.plan import (
     AwaitReady,
     AwaitReleased,
@@ -54,7 +46,6 @@ from rosrm.model.plan import (
 )
 from rosrm.model.values import (
     EMPTY,
-    RESOURCE_SLOTS,
     KeptState,
     Kind,
     MigrationPolicy,
@@ -62,6 +53,7 @@ from rosrm.model.values import (
     Readiness,
     RestartPolicy,
 )
+from rosrm_simulate.world import World
 from tests.unit.core.machine import GIB, MIB, Machine
 from tests.unit.core.nodes import Air, Node
 
@@ -164,6 +156,8 @@ class HandOver:
         )
 
 
+OrderT = TypeVar("OrderT", bound=Order)
+
 _REGISTRY = Registry.of(migration=rosrm_migration.plugin, criu=rosrm_criu.plugin)
 _SHIPPED = {name: _REGISTRY.offer("migration", name) for name in _REGISTRY.names("migration")}
 _CAPABILITIES, _CAPABILITIES_OF = _REGISTRY.capabilities(), _REGISTRY.capabilities_of()
@@ -188,22 +182,23 @@ def declared_by(strategies: Mapping[str, Any]) -> Declared:
 # --- the cluster ------------------------------------------------------------------------------
 
 
-class Cluster:
-    """A master's core with machines around it.
+class Cluster(World[Machine]):
+    """A master's core with machines around it, and prompt wires.
 
-    now: seconds.
+    Attributes:
         now: seconds.
         records: everything that was recorded.
         intents: durable tables, as in the journal: table -> key -> value, as JSON has it.
-        replies: replies of the master, by request number.
         carried: every command that was carried out.
+        watch: called with the commands of each step before they are carried out.
     """
+
+    now = 100.0
 
     def __init__(
         self, *machines: Machine | str, policy: Any = None, strategies: Mapping[str, Any] = EMPTY,
         fallback: Any = None, declared: Declared | None = None, **settings: Any,
     ) -> None:  # fmt: skip
-        self.now = 100.0
         self.settings = CoreSettings(**{"settle": 1e9, **settings})
         self.policy = policy or Eq1()
         self.fallback = fallback
@@ -213,14 +208,13 @@ class Cluster:
             **strategies,
         }
         self.declared = declared or declared_by(self.strategies)
-        self.state = self._new_state(epoch=1)
-        self.machines: dict[str, Machine] = {}
+        super().__init__(self._new_state(epoch=1))
         self.air = Air(self.machines.values)
+        self.publish = self.air.publish
         self.records: list[Record] = []
         self.intents: dict[str, dict[str, Any]] = defaultdict(dict)
-        self.replies: dict[int, Reply] = {}
         self.carried: list[Command] = []
-        self._requests = 0
+        self.watch: Callable[[Sequence[Command]], None] = lambda _: None
         for machine in machines:
             self.add(machine)
 
@@ -240,19 +234,13 @@ class Cluster:
     def __getitem__(self, name: str) -> Process:
         return self.state.processes[name]
 
-    # --- events --------------------------------------------------------------------------
+    # --- commands ------------------------------------------------------------------------
 
-    def decide(self, event: happened.Event) -> list[Command]:
-        """Pass an event to the reducer and return its commands, without carrying them out."""
-        self.state.wall = self.wall
-        return step(self.state, event, self.now)
-
-    def tell(self, event: happened.Event) -> list[Command]:
-        """Pass an event to the reducer, make its commands durable and carry them out."""
-        commands = self.decide(event)
+    def record(self, event: happened.Event, commands: Sequence[Command]) -> None:
+        """Make the commands durable."""
         self.journal(commands)
-        self.carry_out(commands)
-        return commands
+        self.watch(commands)
+        self.carried += commands
 
     def journal(self, commands: Iterable[Command]) -> None:
         for command in commands:
@@ -266,41 +254,8 @@ class Cluster:
                     plain = json.loads(json.dumps(command.value, default=dict))
                     self.intents[command.table][command.key] = plain
 
-    def carry_out(self, commands: Iterable[Command]) -> None:
-        for command in commands:
-            self.carried.append(command)
-            if isinstance(command, Reply):
-                self.replies[command.request] = command
-            elif isinstance(command, Assign):
-                self.by_id(command.host_id).polled.append(command.assignment)
-            elif isinstance(command, Order):
-                self.by_id(command.host_id).ordered.append(command)
-            elif isinstance(command, Withdraw):
-                self._withdraw(command)
-            elif isinstance(command, Redeliver):
-                self._redeliver(command)
-            elif isinstance(command, PublishStateConfig):
-                self.air.publish(command)
-
-    def _withdraw(self, command: Withdraw) -> None:
-        machine = self.by_id(command.host_id)
-        kept = [one for one in machine.polled if one.instance != command.instance]
-        if len(kept) < len(machine.polled):
-            machine.polled = kept
-            self.tell(happened.AssignmentWithdrawn(command.instance))
-        else:
-            machine.ordered.append(Order(command.order, command.host_id, "stop", command.instance))
-
-    def _redeliver(self, command: Redeliver) -> None:
-        machine, assignment = self.by_id(command.host_id), command.assignment
-        if all(one.instance != assignment.instance for one in machine.polled):
-            machine.ordered.append(
-                Order(command.order, command.host_id, "start", assignment.instance, assignment)
-            )
-
-    def by_id(self, host_id: int) -> Machine:
-        name = self.state.hosts.hosts[host_id - 1].name
-        return self.machines[name]
+    def send(self, sent: SendOrder) -> None:
+        self.by_id(sent.host_id).ordered.append(sent)
 
     # --- machines ------------------------------------------------------------------------
 
@@ -316,27 +271,25 @@ class Cluster:
         self, machine: Machine, kept: tuple[KeptState, ...] = (), *, journal_seen: int = 0
     ) -> Reply:
         """Register a slave; once accepted, it sends a reading and requests work."""
-        machine.begin_to_register()
-        reply = self.ask(
-            happened.HostRegistered, machine.description(), machine.slave.statuses(),
-            journal_seen, kept, settle=False,
-        )  # fmt: skip
+        reply = self.enter(machine, journal_seen, kept)
         if reply.accepted:
-            machine.host_id, machine.fresh = reply.host_id, False
-            machine.polled.clear()
-            machine.tell(reducer.Registered(self.state.epoch), self.now)
-            machine.tell(reducer.MasterHears(self.now), self.now)
             self.read(machine)
             self.ask_for_work(machine)
         self.settle()
         return reply
 
+    def enter(self, machine: Machine, journal_seen: int, kept: tuple[KeptState, ...]) -> Reply:
+        """Register a slave, which sends no reading yet."""
+        machine.begin_to_register()
+        reply = self.join(machine, self.now, machine.slave.statuses(), journal_seen, kept)
+        if reply.accepted:
+            machine.fresh = False
+            machine.polled.clear()
+        return reply
+
     def ask_for_work(self, machine: Machine) -> None:
-        if machine.connected and machine.accepts():
-            self._requests += 1
-            self.tell(
-                happened.ProcessRequested(self._requests, machine.host_id, machine.incarnation)
-            )
+        if machine.connected and machine.reading(self.now).accepts:
+            self.request(happened.ProcessRequested(0, machine.host_id, machine.incarnation))
 
     def read(self, *machines: Machine, **wrong: Any) -> None:
         """Send the readings of these (default: all connected) machines as one batch."""
@@ -345,34 +298,15 @@ class Cluster:
         if heard:
             self.tell(self.readings(heard, **wrong))
 
-    def readings(self, machines: Sequence[Machine], **wrong: Any) -> happened.ReadingsReceived:
-        n = len(machines)
-        usage, limit = np.zeros((n, RESOURCE_SLOTS)), np.ones((n, RESOURCE_SLOTS))
-        stale = np.zeros(n, np.uint32)
-        for row, machine in enumerate(machines):
-            machine.sequence += 1
-            now = machine.usage()
-            for slot, resource in enumerate(machine.resources):
-                usage[row, slot] = now.get(resource.name, 0.0)
-                limit[row, slot] = machine.limit(resource.name)
-                stale[row] |= (resource.name in machine.stale) << slot
-        columns: dict[str, Any] = {
-            "host_id": np.array([m.host_id for m in machines], np.int64),
-            "incarnation": np.array([m.incarnation for m in machines], np.uint64),
-            "sequence": np.array([m.sequence for m in machines], np.uint64),
-            "status_sequence": np.array([m.batches for m in machines], np.uint64),
-            "accepting": np.array([m.accepts() for m in machines], np.bool_),
-            "stale": stale, "usage": usage, "limit": limit,
-        }  # fmt: skip
-        return happened.ReadingsReceived(**{**columns, **wrong})
+    def readings(self, hosts: Sequence[Machine], **wrong: Any) -> happened.ReadingsReceived:
+        batches = np.array([one.batches for one in hosts], np.uint64)
+        return super().readings(hosts, **{"status_sequence": batches, **wrong})
 
     # --- requests ------------------------------------------------------------------------
 
     def ask(self, kind: Any, *fields: Any, settle: bool = True) -> Reply:
         """Send a request to the master and return the reply."""
-        self._requests += 1
-        request = self._requests
-        self.tell(kind(request, *fields))
+        request = self.request(kind(0, *fields))
         if settle:
             self.settle()
         return self.replies[request]
@@ -401,8 +335,7 @@ class Cluster:
     def leave(self, machine: Machine) -> Reply:
         """Stop a slave: it announces its departure and ends all its processes."""
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
-        for instance in list(machine.programs):
-            machine.tell(reducer.StopOrdered(instance), self.now)
+        machine.shut_down(self.now)
         self.settle()
         return reply
 
@@ -426,12 +359,13 @@ class Cluster:
     def settle(self) -> None:
         """Deliver all messages until no part sends another one."""
         for _ in range(200):
-            said = [self._deliver(machine) for machine in self.machines.values()]
-            if not any([*said, self._nodes_talk()]):
+            said = [self.deliver(machine) for machine in self.machines.values()]
+            if not any([*said, self.nodes_talk()]):
                 return
         raise AssertionError("the cluster talks without an end")
 
-    def _deliver(self, machine: Machine) -> bool:
+    def deliver(self, machine: Machine) -> bool:
+        """Deliver all messages between the master and a host; return True if there were any."""
         if not machine.connected:
             return False
         busy = bool(machine.polled or machine.ordered or machine.said)
@@ -442,15 +376,14 @@ class Cluster:
             self.tell(machine.said.popleft())
         return busy
 
-    def _nodes_talk(self) -> bool:
-        """Deliver all handoff messages that are on their way."""
-        arrivals = self.air.waiting()
+    def nodes_talk(self, *, heard: bool = True) -> bool:
+        """Deliver one message to a node, and one report to the master."""
+        arrivals, reports = self.air.waiting(), self.air.next_reports()
         for arrive in arrivals[:1]:
             arrive()
-        heard = self.air.next_reports()
-        for at in heard[:1]:
+        for at in reports[: int(heard)]:
             self.tell(self.air.to_master.pop(at)[1])
-        return bool(arrivals or heard)
+        return bool(arrivals or reports)
 
     def wait(self, seconds: float, *, tick: float = 0.1) -> None:
         """Let time pass: readings and usages arrive, and the reducer checks its deadlines."""
@@ -459,11 +392,11 @@ class Cluster:
             self.read()
             for machine in self.machines.values():
                 if machine.connected and machine.host_id:
-                    machine.tell(reducer.TimePassed(), self.now)
+                    machine.tell(events.TimePassed(), self.now)
                     if machine.host_id not in self.state.hosts.unheard():
-                        machine.tell(reducer.MasterHears(self.now), self.now)
+                        machine.tell(events.MasterHears(self.now), self.now)
                     self.ask_for_work(machine)
-                    self.tell(machine.usages())
+                    self.tell(machine.usages(self.now))
             self.tell(happened.TimePassed())
             self.settle()
 
@@ -531,5 +464,10 @@ class Cluster:
         assert story is not None
         return json.loads(json.dumps(story, default=dict))
 
-    def orders(self, action: str) -> list[Order]:
-        return [c for c in self.carried if isinstance(c, Order) and c.action == action]
+    def orders(self, kind: type[OrderT]) -> list[OrderT]:
+        return [sent.order for sent in self.sent() if isinstance(sent.order, kind)]
+
+    def sent(self, *kinds: type[Order]) -> list[SendOrder]:
+        """Return all orders of these kinds; without a kind, all orders."""
+        sent = [c for c in self.carried if isinstance(c, SendOrder)]
+        return [one for one in sent if not kinds or isinstance(one.order, kinds)]

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
+from rosrm.core.master.commands import SendOrder
+from rosrm.model.orders import RunExecutor
 from rosrm.model.values import InstanceId, InstanceState
 from rosrm_criu.engine.compatibility import FACTS
 from rosrm_criu.options import CriuOptions
@@ -61,20 +62,21 @@ class Portable(Machine):
             AWAIT_RESTORED: self._await_restored, JOIN: self._join,
         }  # fmt: skip
 
-    def obey(self, order: Order, now: float) -> happened.OrderAnswered:
+    def obey(self, sent: SendOrder, now: float) -> happened.OrderAnswered:
         """Carry out an order; a lost answer becomes a time-out."""
         self._now = now
-        self.asked += [order.executor] if order.executor else []
-        self.befalls.pop(order.executor, lambda: None)()
-        answer = super().obey(order, now)
-        if order.executor in self.slow:
+        executor = sent.order.executor if isinstance(sent.order, RunExecutor) else ""
+        self.asked += [executor] if executor else []
+        self.befalls.pop(executor, lambda: None)()
+        answer = super().obey(sent, now)
+        if executor in self.slow:
             self.answers.append(answer)
             # answer to no order: none has arrived yet
             return happened.OrderAnswered(0, accepted=True)
-        if self.connected and order.executor not in self.mute:
+        if self.connected and executor not in self.mute:
             return answer
-        self.mute.discard(order.executor)
-        return happened.OrderAnswered(order.order, accepted=False, code="timeout")
+        self.mute.discard(executor)
+        return happened.OrderAnswered(sent.order_id, accepted=False, code="timeout")
 
     def lose_power(self, now: float) -> None:
         """End everything on the host without any report; another slave starts later."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rosrm.core.master.commands import Order
+from rosrm.model.orders import StartInstance
 from rosrm.model.plan import Commit, Execute, Move, Plan, SetRestart, Start, Stop
 from rosrm.model.values import MigrationPolicy, RestartPolicy
 from tests.unit.core.cluster import Cluster, process
@@ -110,8 +110,7 @@ def test_a_process_moves_to_a_host_of_the_same_ability():
     assert here.asked[-1] == ("freeze", {"of": number})
     fetched = there.asked[-1][1]
     assert fetched["results"] == {"freeze": {"port": 4242}}
-    (start,) = (one for one in cluster.carried if isinstance(one, Order) and one.action == "start")
-    assert start.assignment is not None
+    (start,) = cluster.orders(StartInstance)
     assert start.assignment.restored
 
 

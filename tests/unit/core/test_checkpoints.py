@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Command, Order
+from rosrm.core.master.commands import Command, SendOrder
+from rosrm.model.orders import (
+    FenceInstance,
+    SetRestartPolicy,
+    StartInstance,
+    StopInstance,
+)
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, Stop, plan_fault
 from rosrm.model.values import (
     HostLossPolicy,
@@ -439,10 +445,7 @@ def test_a_former_instance_that_comes_back_beside_its_image_is_killed() -> None:
     cluster.state.drop_instance(cluster.state.instances[number.number])
     cluster.register(shelf.machine)
     cluster.wait(1.0)
-    assert any(
-        isinstance(one, Order) and one.action == "fence" and one.instance == number
-        for one in cluster.carried
-    )
+    assert FenceInstance(number) in cluster.orders(FenceInstance)
 
 
 @pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])
@@ -592,16 +595,16 @@ def test_nothing_is_lost_when_the_master_is_killed_at_any_point(asked: str, dura
 
 
 @pytest.mark.parametrize(
-    "lost", ["set_restart", "freeze", "kill", "stop", "take", "start", "await"]
+    "lost", [SetRestartPolicy, "freeze", "kill", StopInstance, "take", StartInstance, "await"]
 )
-def test_nothing_is_lost_when_an_answer_is(lost: str) -> None:
+def test_nothing_is_lost_when_an_answer_is(lost: str | type) -> None:
     """A lost answer leads to an undo or a retry; in the end the process runs or is checkpointed."""
     shelf, cluster = playing()
     first, obey, once = cluster["p"].owner, shelf.machine.obey, [lost]
 
-    def hard_of_hearing(order: Order, now: float) -> Any:
-        answer = obey(order, now)
-        if once and once[0] in (order.action, order.executor):
+    def hard_of_hearing(sent: SendOrder, now: float) -> Any:
+        answer, order = obey(sent, now), sent.order
+        if once and once[0] in (type(order), getattr(order, "executor", "")):
             once.clear()
             cluster.now += PATIENCE + 1.0
             return type(answer)(answer.order, False, "timeout")

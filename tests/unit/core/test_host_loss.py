@@ -9,7 +9,8 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
+from rosrm.model.orders import FenceInstance, SetRestartPolicy
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
@@ -103,7 +104,7 @@ def test_the_old_instance_is_fenced_when_its_host_is_heard() -> None:
     lose(cluster, "a")
     back(cluster, "a", seconds=0.2)
     assert cluster.where("p") == ["b"]
-    assert [order.instance.number for order in cluster.orders("fence") if order.instance] == [1]
+    assert [order.instance.number for order in cluster.orders(FenceInstance)] == [1]
     assert cluster.told("fenced")[0].startswith(
         "p#1 is not assigned to a: the master has it killed"
     )
@@ -135,7 +136,7 @@ def test_what_nothing_has_followed_goes_on(restarted: bool) -> None:
     back(cluster, "a")
     assert (cluster.phase("p"), cluster["p"].owner, cluster.queue()) == ("running", 1, [])
     assert cluster.where("p") == ["a"]
-    assert not cluster.orders("fence")
+    assert not cluster.orders(FenceInstance)
     cluster.set_host("b", "uncordon")
     cluster.cancel("p")
     assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
@@ -381,12 +382,14 @@ def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
     cluster.add(Machine("b", busy={"memory": 0.9}))  # a host in contact, without room
     cluster.wait(11.0)
     a = cluster.machines["a"]
-    a.tell(reducer.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
+    a.tell(events.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
     lose(cluster, "a")
     assert cluster.phase("p") == "queued"
     back(cluster, "a")
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
-    assert [one.restart for one in cluster.orders("set_restart")] == [RestartPolicy("on-failure")]
+    assert [one.restart for one in cluster.orders(SetRestartPolicy)] == [
+        RestartPolicy("on-failure")
+    ]
 
 
 def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:

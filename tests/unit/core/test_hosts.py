@@ -9,7 +9,8 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
+from rosrm.model.orders import ReportInstances, StopInstance
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Assignment,
@@ -131,7 +132,7 @@ def test_a_usage_that_makes_no_sense_is_refused() -> None:
     cluster.submit(process("p", memory=100))
     for wrong in (float("nan"), -1.0, float("inf")):
         cluster.machines["a"].shown["p"] = {"memory": wrong}
-        cluster.tell(cluster.machines["a"].usages())
+        cluster.tell(cluster.machines["a"].usages(cluster.now))
     assert cluster.state.instances[1].seen == {}
     assert cluster.told("reading_refused") == ["a usage of p#1 was refused (NaN or negative)"]
 
@@ -290,7 +291,7 @@ def test_a_lost_host_that_comes_back_brings_its_processes_along() -> None:
     machine.connected = True
     cluster.wait(0.5)
     assert (cluster.phase("p"), cluster.phase("q")) == ("running", "finished")
-    assert len(cluster.orders("report")) == 1
+    assert len(cluster.orders(ReportInstances)) == 1
 
 
 def test_a_lost_host_whose_slave_was_restarted_brings_its_processes_along() -> None:
@@ -317,7 +318,7 @@ def test_a_status_batch_that_was_missed_makes_the_master_ask_for_everything() ->
     machine.finish("q", cluster.now)
     cluster.settle()
     assert (cluster.phase("p"), cluster.phase("q")) == ("finished", "finished")
-    assert len(cluster.orders("report")) == 1
+    assert len(cluster.orders(ReportInstances)) == 1
 
 
 def test_the_last_status_batch_is_missed_by_what_the_reading_says() -> None:
@@ -435,10 +436,10 @@ def test_an_instance_that_nobody_intends_is_stopped_until_it_has_ended() -> None
     machine.stubborn.add("ghost")
     spec = process("ghost", memory=10 * MIB)
     ghost = Assignment(InstanceId("ghost", 999), spec, 1, "ghost")
-    machine.tell(reducer.AssignmentsReceived((ghost,)), cluster.now)
+    machine.tell(events.AssignmentsReceived((ghost,)), cluster.now)
     cluster.settle()
     cluster.wait(5.0)
-    assert len(cluster.orders("stop")) == 3
+    assert len(cluster.orders(StopInstance)) == 3
     reply = cluster.submit(process("ghost"))
     assert not reply.accepted
     assert "an earlier ghost#999 is still being stopped on a" in reply.message

@@ -9,6 +9,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
+from rosrm.model.orders import DropReplica, ReplicateSnapshot
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceId,
@@ -81,14 +82,16 @@ def test_the_policys_choice_is_told_once():
     host = where(cluster)
     policy.answer = CheckpointChoice((others(cluster)[0],), 2.0)
     cluster.wait(10.0)
-    orders = cluster.orders("keep")
-    assert [(one.keep_on, one.keep_every) for one in orders[-1:]] == [((others(cluster)[0],), 2.0)]
-    assert {one.host_id for one in orders} == {cluster.machines[host].host_id}
+    orders = cluster.orders(ReplicateSnapshot)
+    assert [(one.hosts, one.every) for one in orders[-1:]] == [((others(cluster)[0],), 2.0)]
+    assert {one.host_id for one in cluster.sent(ReplicateSnapshot)} == {
+        cluster.machines[host].host_id
+    }
     assert orders[-1].instance == InstanceId("p", cluster["p"].owner)
     told = len(orders)
     policy.answer = None  # as before
     cluster.wait(10.0)
-    assert len(cluster.orders("keep")) == told
+    assert len(cluster.orders(ReplicateSnapshot)) == told
 
 
 def test_the_order_of_the_hosts_that_are_chosen_makes_no_difference():
@@ -98,10 +101,10 @@ def test_the_order_of_the_hosts_that_are_chosen_makes_no_difference():
     one, two = others(cluster)
     policy.answer = CheckpointChoice((one, two))
     cluster.wait(3.0)
-    told, recorded = len(cluster.orders("keep")), cluster.told("kept_on")
+    told, recorded = len(cluster.orders(ReplicateSnapshot)), cluster.told("kept_on")
     policy.answer = CheckpointChoice((two, one))
     cluster.wait(10.0)
-    assert (len(cluster.orders("keep")), cluster.told("kept_on")) == (told, recorded)
+    assert (len(cluster.orders(ReplicateSnapshot)), cluster.told("kept_on")) == (told, recorded)
 
 
 def test_what_the_policy_sees():
@@ -157,12 +160,12 @@ def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
         cluster.migrate("p", "a")
         cluster.wait(10.0)
         keep(cluster, where(cluster), ("p", cluster["p"].owner, 5))
-    told = len(cluster.orders("keep"))
+    told = len(cluster.orders(ReplicateSnapshot))
     cluster.wait(25.0)
     (first, *_) = cluster.told("plugin_failed")
     assert first.startswith("the checkpoint policy 'asked' fails: choose: ")
     assert len(cluster.told("plugin_failed")) == 1
-    assert all(order.keep_on == () for order in cluster.orders("keep")[told:])
+    assert all(order.hosts == () for order in cluster.orders(ReplicateSnapshot)[told:])
 
 
 @pytest.mark.parametrize("answer", [None, ValueError("no idea"), TimeoutError("late")])
@@ -180,11 +183,11 @@ def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer
     cluster.wait(3.0)
     register(cluster, two, ("p", number, 7))  # registers later, with an older snapshot
     cluster.wait(5.0)
-    assert not cluster.orders("drop_kept")
-    assert cluster.orders("keep")[-1].keep_on == (one, two)
+    assert not cluster.orders(DropReplica)
+    assert cluster.orders(ReplicateSnapshot)[-1].hosts == (one, two)
     policy.answer = CheckpointChoice((one,))
     cluster.wait(3.0)
-    (dropped, *_) = cluster.orders("drop_kept")
+    (dropped, *_) = cluster.sent(DropReplica)
     assert dropped.host_id == cluster.machines[two].host_id
 
 
@@ -202,7 +205,7 @@ def test_a_slave_that_was_started_anew_is_told_again():
     cluster = running(policy, "a", "b")
     policy.answer = CheckpointChoice((others(cluster)[0],))
     cluster.wait(2.0)
-    told, machine = len(cluster.orders("keep")), cluster.machines[where(cluster)]
+    told, machine = len(cluster.orders(ReplicateSnapshot)), cluster.machines[where(cluster)]
     machine.incarnation += 100
     machine.connected = False
     cluster.wait(1.5)
@@ -210,7 +213,7 @@ def test_a_slave_that_was_started_anew_is_told_again():
     cluster.register(machine)
     keep(cluster, machine.name, ("p", cluster["p"].owner, 6))
     cluster.wait(2.0)
-    assert len(cluster.orders("keep")) == told + 1
+    assert len(cluster.orders(ReplicateSnapshot)) == told + 1
 
 
 def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
@@ -243,8 +246,8 @@ def test_a_restarted_one_is_kept_elsewhere_from_its_first_state_on():
         tuple(name for name in cluster.machines if name not in (lost, now_on))
     )
     cluster.wait(1.2)
-    newest = cluster.orders("keep")[-1]
-    assert newest.instance == InstanceId("p", cluster["p"].owner)
+    newest = cluster.sent(ReplicateSnapshot)[-1]
+    assert newest.order.instance == InstanceId("p", cluster["p"].owner)
     assert newest.host_id == cluster.machines[now_on].host_id
 
 
@@ -256,7 +259,7 @@ def test_a_failed_process_that_is_restarted_goes_on_from_its_state():
     cluster.settle()
     assert cluster.phase("p") == "failed"
     cluster.wait(3.0)
-    assert not cluster.orders("drop_kept")
+    assert not cluster.orders(DropReplica)
     cluster.restart("p")
     assignment = assigned(cluster)
     assert assignment.kept_on == (host,)
@@ -277,7 +280,7 @@ def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
     cluster.wait(2.0)
     cluster.cancel("p")
     cluster.wait(3.0)
-    dropped = {order.host_id for order in cluster.orders("drop_kept")}
+    dropped = {sent.host_id for sent in cluster.sent(DropReplica)}
     assert dropped == {cluster.machines[host].host_id}
     keep(cluster, host)
     cluster.submit(stateful())
@@ -285,8 +288,8 @@ def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
     assert assigned(cluster).kept_from > number
     cluster.machines[other].connected = True
     cluster.wait(3.0)
-    assert cluster.orders("drop_kept")[-1].host_id == cluster.machines[other].host_id
-    assert cluster.orders("drop_kept")[-1].instance == InstanceId("p", number)
+    assert cluster.sent(DropReplica)[-1].host_id == cluster.machines[other].host_id
+    assert cluster.orders(DropReplica)[-1].instance == InstanceId("p", number)
 
 
 def test_the_replicas_of_a_pruned_process_are_dropped():
@@ -299,21 +302,19 @@ def test_the_replicas_of_a_pruned_process_are_dropped():
     cluster.machines[host].finish("p", cluster.now, code=1)
     cluster.wait(2.0)
     assert cluster.phase("p") == "failed"
-    assert not cluster.orders("drop_kept")
+    assert not cluster.orders(DropReplica)
     assert cluster.ask(happened.PruneRequested, ("p",), ()).accepted
     keep(cluster, third, ("p", number + 70, 1))
     cluster.wait(2.0)
-    assert {order.host_id for order in cluster.orders("drop_kept")} == {
-        cluster.machines[host].host_id
-    }
+    assert {sent.host_id for sent in cluster.sent(DropReplica)} == {cluster.machines[host].host_id}
     keep(cluster, host)
     cluster.machines[other].connected = True
     cluster.wait(3.0)
-    last = cluster.orders("drop_kept")[-1]
-    assert (last.host_id, last.instance) == (
-        cluster.machines[other].host_id, InstanceId("p", number)
+    last = cluster.sent(DropReplica)[-1]
+    assert (last.host_id, last.order) == (
+        cluster.machines[other].host_id, DropReplica(InstanceId("p", number))
     )  # fmt: skip
-    dropped_on = {order.host_id for order in cluster.orders("drop_kept")}
+    dropped_on = {sent.host_id for sent in cluster.sent(DropReplica)}
     assert cluster.machines[third].host_id not in dropped_on
 
 
@@ -325,11 +326,11 @@ def test_what_was_pruned_is_not_forgotten_with_the_master():
     cluster.wait(2.0)
     assert cluster.ask(happened.PruneRequested, ("p",), ()).accepted
     cluster.restart_master()
-    before = len(cluster.orders("drop_kept"))
+    before = len(cluster.orders(DropReplica))
     keep(cluster, other, ("p", number, 4), ("stranger", number, 4))
     cluster.wait(2.0)
-    assert {(order.host_id, order.instance) for order in cluster.orders("drop_kept")[before:]} == {
-        (cluster.machines[other].host_id, InstanceId("p", number))
+    assert {(one.host_id, one.order) for one in cluster.sent(DropReplica)[before:]} == {
+        (cluster.machines[other].host_id, DropReplica(InstanceId("p", number)))
     }
 
 
@@ -353,12 +354,12 @@ def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer
     cluster.migrate("p", destination)
     cluster.wait(20.0)
     assert cluster.where("p") == [destination]
-    assert not cluster.orders("drop_kept")
+    assert not cluster.orders(DropReplica)
     keep(cluster, destination, ("p", cluster["p"].owner, 9))
     cluster.wait(3.0)
-    (order, *_) = cluster.orders("drop_kept")
-    assert order.host_id == cluster.machines[source].host_id
-    assert order.instance == InstanceId("p", number)
+    (sent, *_) = cluster.sent(DropReplica)
+    assert sent.host_id == cluster.machines[source].host_id
+    assert sent.order == DropReplica(InstanceId("p", number))
 
 
 def test_an_explanation_says_where_the_state_is_kept():
@@ -379,8 +380,8 @@ def test_without_a_policy_it_is_kept_on_its_own_host_alone():
     """An assignment to another host still lists where the snapshot is."""
     cluster = running(None)
     cluster.wait(3.0)
-    assert all(order.keep_on == () for order in cluster.orders("keep"))
-    assert not cluster.orders("drop_kept")
+    assert all(order.hosts == () for order in cluster.orders(ReplicateSnapshot))
+    assert not cluster.orders(DropReplica)
 
 
 def test_stateless_processes_and_strangers_are_left_alone():
@@ -389,8 +390,8 @@ def test_stateless_processes_and_strangers_are_left_alone():
     cluster.submit(process("s"), job("j"))
     keep(cluster, "a", ("unknown", 70, 3))
     cluster.wait(3.0)
-    assert not cluster.orders("keep")
-    assert not cluster.orders("drop_kept")
+    assert not cluster.orders(ReplicateSnapshot)
+    assert not cluster.orders(DropReplica)
     assert assigned(cluster).kept_on == ()
     cluster.submit(process("t"))
     assert assigned(cluster).instance.number > 70, "no number is used twice"

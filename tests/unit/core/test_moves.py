@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.extensions.declared_fields import Declared
+from rosrm.model.orders import StartInstance
 from rosrm.model.plan import AwaitReady, Commit, Execute, Move, Plan, SetRestart, Start, Stop
 from rosrm.model.values import (
     InstanceId,
@@ -150,7 +150,7 @@ def test_a_fallback_is_not_started_beside_a_source_that_has_not_ended() -> None:
     cluster.migrate("p")
     cluster.wait(25.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("stuck", ["a"])
-    assert not cluster.orders("start")
+    assert not cluster.orders(StartInstance)
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.wait(3.0)
     ready_on(cluster, "a")
@@ -168,7 +168,7 @@ def test_a_fallback_starts_as_soon_as_the_source_has_ended() -> None:
     assert cluster.told("migration_undone")
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.settle()
-    assert [order.instance.number for order in cluster.orders("start")] == [3]
+    assert [order.instance.number for order in cluster.orders(StartInstance)] == [3]
     ready_on(cluster, "a")
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 3)
 
@@ -216,7 +216,7 @@ def test_a_source_whose_host_forgot_it_returns_to_the_queue() -> None:
     machine = cluster.machines["a"]
     machine.programs.clear()
     machine.slave.held.clear()
-    machine.tell(reducer.ReportRequested(), cluster.now)
+    machine.tell(events.ReportRequested(), cluster.now)
     cluster.settle()
     assert cluster.phase("p") in {"starting", "running"}
     assert len(cluster.where("p")) == 1
@@ -388,10 +388,10 @@ def none_at_all(move: Move) -> Any:
         (never_starts, "never starts"),
         (none_at_all, "gave no plan: answered None; Plan is required"),
         (exits, "gave no plan: SystemExit: 3"),
-        (with_step(AwaitReady, settle="1s"), "'1s' is no number"),
-        (with_step(Start, node_name=7), "7 is no text"),
-        (with_step(Start, remappings={"/a": 7}), "7 is no text"),
-        (with_step(SetRestart, restart=RestartPolicy(**DELAY)), "'1s' is no number"),
+        (with_step(AwaitReady, settle="1s"), "settle: float is required, not '1s'"),
+        (with_step(Start, node_name=7), "node_name: str is required, not 7"),
+        (with_step(Start, remappings={"/a": 7}), "remappings./a: str is required, not 7"),
+        (with_step(SetRestart, restart=RestartPolicy(**DELAY)), "restart.delay: float is required"),
         (with_step(Execute, executor="x", arguments={"of": {1}}), "set is not JSON serializable"),
     ],
 )
@@ -455,14 +455,14 @@ def test_a_plan_is_refused_before_its_first_step_where_a_host_lacks_an_executor(
     Nothing was stopped, and the reply names the package to install.
     """
     cluster = sleepy("sleepy.wait")
-    orders = sum(isinstance(one, Order) for one in cluster.carried)
+    orders = len(cluster.sent())
     reply = cluster.migrate("p")
     assert not reply.accepted
     assert reply.message == (
         "b has no executor 'sleepy.wait', which sleepy needs there to move p: install "
         "rosrm-sleepy 1.0 on b and restart its slave"
     )
-    assert sum(isinstance(one, Order) for one in cluster.carried) == orders
+    assert len(cluster.sent()) == orders
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert cluster.state.hosts.processes.tolist() == [1, 0]
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.plan import (
     AwaitReady,
     AwaitReleased,
@@ -19,7 +20,6 @@ from rosrm.model.plan import (
     Start,
     Stop,
 )
-from rosrm.model.plan_json import plan_from_dict, plan_to_dict
 from rosrm.model.values import InstanceId, RestartPolicy
 
 ONE = InstanceId("p", 1)
@@ -41,27 +41,35 @@ EVERYTHING = Plan(
 
 
 def stored() -> Any:
-    return json.loads(json.dumps(plan_to_dict(EVERYTHING), default=dict))
+    return json.loads(json.dumps(to_plain(EVERYTHING), default=dict))
 
 
 def test_a_plan_survives_the_journal() -> None:
     """Each field is restored."""
-    assert plan_from_dict(stored()) == EVERYTHING
+    assert from_plain(Plan, stored()) == EVERYTHING
 
 
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        (("strange",), 1, "unknown field of Plan: strange"),
-        (("overlap",), "long", "'long' is no number"),
-        (("steps", 0, "kind"), "teleport", "teleport"),
-        (("steps", 0, "shadow"), "yes", "'yes' is neither true nor false"),
-        (("steps", 0, "colour"), 1, "unknown field of Start: colour"),
-        (("steps", 0, "undo", "timeout"), None, "None is no number"),
-        (("steps", 0, "instance", "number"), "1", "'1' is no whole number"),
-        (("steps", 2, "phase"), "JUMP", "JUMP"),
-        (("steps", 3, "restart", "colour"), 1, "unknown field of RestartPolicy: colour"),
-        (("steps", 4, "arguments"), [], "[] is no mapping"),
+        (("strange",), 1, "unknown strange; allowed: steps, "),
+        (("overlap",), "long", "overlap: float is required, not 'long'"),
+        (("steps", 0, "kind"), "teleport", "steps[0].kind 'teleport'; allowed: start, "),
+        (("steps", 0, "shadow"), "yes", "steps[0].shadow: bool is required, not 'yes'"),
+        (("steps", 0, "colour"), 1, "steps[0]: unknown colour; allowed: instance, "),
+        (
+            ("steps", 0, "undo", "timeout"),
+            None,
+            "steps[0].undo.timeout: float is required",
+        ),
+        (
+            ("steps", 0, "instance", "number"),
+            "1",
+            "steps[0].instance.number: int is required",
+        ),
+        (("steps", 2, "phase"), "JUMP", "steps[2].phase 'JUMP'; allowed: SHADOW, "),
+        (("steps", 3, "restart", "colour"), 1, "steps[3].restart: unknown colour"),
+        (("steps", 4, "arguments"), [], "steps[4].arguments: a mapping is required, not []"),
     ],
 )
 def test_what_is_not_known_is_refused(path: Any, value: Any, said: str) -> None:
@@ -72,7 +80,7 @@ def test_what_is_not_known_is_refused(path: Any, value: Any, said: str) -> None:
         inner = inner[key]
     inner[path[-1]] = value
     with pytest.raises(ValueError, match=r".") as caught:
-        plan_from_dict(plain)
+        from_plain(Plan, plain)
     assert said in str(caught.value)
 
 
@@ -80,5 +88,5 @@ def test_what_must_be_there_is_missed() -> None:
     """A step without its host is refused."""
     plain = stored()
     del plain["steps"][0]["host"]
-    with pytest.raises(ValueError, match="Start has no host"):
-        plan_from_dict(plain)
+    with pytest.raises(ValueError, match=r"steps\[0\]: host is missing"):
+        from_plain(Plan, plain)

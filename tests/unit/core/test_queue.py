@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rosrm.core.master import events as happened
 from rosrm.extensions.contracts import Record
+from rosrm.model.orders import StopInstance
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, process
 
@@ -246,7 +247,7 @@ def test_a_job_that_was_taken_back_before_it_ran_has_not_completed() -> None:
     cluster.decide(happened.SubmissionReceived(1, (job("p"),)))  # the answer is late
     machine.connected = False
     cluster.wait(5.5)
-    assert machine.ordered.pop().action == "stop"
+    assert isinstance(machine.ordered.pop().order, StopInstance)
     machine.connected = True
     never_ran = InstanceStatus(InstanceId("p", 1), InstanceState.EXITED, message="stopped")
     machine.batches += 1

@@ -124,7 +124,7 @@ def test_a_full_resource_without_a_limit_is_no_reason_to_move() -> None:
     cluster.wait(1.5)
     cluster.add(machine("b"))
     cluster.machines["a"].busy["cpu"] = 0.9
-    assert cluster.machines["a"].usage()["cpu"] == 1.0
+    assert cluster.machines["a"].usage(cluster.now)["cpu"] == 1.0
     cluster.wait(5.0)
     assert cluster.told("over_limit") == []
     assert cluster.where("p") == ["a"]

@@ -6,7 +6,8 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
+from rosrm.model.orders import StartInstance, StopInstance
 from rosrm.model.plan import Move, Plan
 from rosrm.model.values import (
     InstanceId,
@@ -175,7 +176,7 @@ def test_cancel_of_one_that_does_not_end_is_asked_again() -> None:
     cluster.cancel("p")
     cluster.wait(5.0)
     assert cluster.phase("p") == "stopping"
-    assert len(cluster.orders("stop")) == 3
+    assert len(cluster.orders(StopInstance)) == 3
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.settle()
     assert cluster.phase("p") == "cancelled"
@@ -230,7 +231,7 @@ def test_cancel_of_one_that_moves_ends_both_instances(overlap: bool) -> None:
     assert cluster.where("p") == (["a", "b"] if overlap else ["b"])
     cluster.cancel("p")
     assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
-    assert len(cluster.orders("start")) == 1
+    assert len(cluster.orders(StartInstance)) == 1
     assert not cluster.state.runs
     assert not cluster.intents["migration"]
 
@@ -315,7 +316,7 @@ def test_what_is_over_is_kept_while_something_of_it_is_being_stopped() -> None:
     machine = cluster.machines["a"]
     late = InstanceStatus(InstanceId("p", 77), InstanceState.RUNNING, pid=5)
     machine.stubborn.add("p")
-    machine.tell(reducer.SupervisorReported((late,)), cluster.now)
+    machine.tell(events.SupervisorReported((late,)), cluster.now)
     cluster.settle()
     machine.finish("q", cluster.now)
     cluster.wait(0.5)

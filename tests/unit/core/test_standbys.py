@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
+from unittest.mock import ANY
 
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.model.plan import ReportPhase
+from rosrm.model.orders import FenceInstance, SetRestartPolicy, StartInstance
+from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
 from rosrm.model.values import HostLossPolicy, InstanceState, RestartPolicy, StandbyPolicy
 from tests.unit.core.cluster import Cluster, Machine
 from tests.unit.core.test_handoffs import stateful
@@ -109,6 +112,40 @@ def test_a_standby_that_is_not_ready_does_not_go_on() -> None:
     assert (cluster.phase("p"), cluster.active()) == ("running", ["a", "b"])
     assert cluster["p"].owner == cluster.machines["b"].find("p").number
     assert not cluster.told("failed_over")
+
+
+def test_one_that_is_never_ready_is_kept() -> None:
+    """The primary may be silent for long, so the wait for its state has no time-out."""
+    cluster = Cluster("a", "b")
+    cluster.machines["b"].busy["memory"] = 0.5
+    cluster.machines["b"].quirks["p"].add("never ready")
+    cluster.wait(0.5)
+    cluster.submit(stateful(standby=STANDBY))
+    cluster.wait(200.0)
+    assert cluster.where("p") == ["a", "b"]
+    assert not cluster.told("standby_lost")
+
+
+def test_one_that_does_not_start_in_time_is_replaced() -> None:
+    """Its slave does not receive the order, which is repeated until the time-out."""
+    cluster = Cluster("a", "b")
+    cluster.machines["b"].busy["memory"] = 0.5
+    cluster.wait(0.5)
+    cluster.machines["b"].ordered = deque(maxlen=0)
+    cluster.submit(stateful(standby=STANDBY))
+    cluster.wait(60.0)
+    assert len(cluster.orders(StartInstance)) > 2
+    assert "p has no standby: p#2 did not start in time; the master starts another one in 2 s" in (
+        cluster.told("standby_lost")
+    )
+
+
+def test_a_primary_keeps_its_restarts_beside_its_standby() -> None:
+    """The plan is paused before SWITCH, and its step that suspends them is left out until then."""
+    cluster = with_standby()
+    assert not cluster.orders(SetRestartPolicy)
+    assert cluster.state.standbys["p"].step_in_hand == Configure(HandoffPhase.SWITCH, ANY, undo=ANY)
+    assert not cluster.told("migration_step")
 
 
 def test_one_that_gave_up_is_replaced_after_a_while() -> None:
@@ -228,7 +265,7 @@ def test_a_primary_that_is_heard_while_its_standby_takes_over_is_fenced() -> Non
     assert (cluster.phase("p"), cluster["p"].owner) == ("migrating", 1)
     cluster.machines["a"].connected = True
     cluster.wait(0.3)
-    assert [order.instance.number for order in cluster.orders("fence")] == [1]
+    assert [order.instance.number for order in cluster.orders(FenceInstance)] == [1]
 
 
 def test_an_ended_process_is_not_pruned_before_its_standby_is_given_up() -> None:

@@ -8,6 +8,7 @@ that really run, independently of the core's state. After every step the invaria
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 
 import numpy as np
 from hypothesis import strategies as st
@@ -19,7 +20,7 @@ from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
 from rosrm.core.master.master_state import ProcessPhase, Wanted
 from rosrm.core.master.state.hosts import HostCondition, HostTable
-from rosrm.core.slave import reducer
+from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.model.values import (
     HostLossPolicy,
@@ -134,6 +135,7 @@ class Play(RuleBasedStateMachine):
         #: For the present submission of each name: its first instance, and its newest snapshot.
         self.newest: dict[str, tuple[int, tuple[int, int]]] = {}
         self.prompt = True
+        self.cluster.watch = self.look
         # Processes that run from the beginning.
         for name, moves in (("p0", first), ("p1", second)):
             self.cluster.submit(spec(name, "node", 100, moves, False, 0, loss))
@@ -144,21 +146,17 @@ class Play(RuleBasedStateMachine):
     # --- execution -----------------------------------------------------------------------
 
     def tell(self, event: happened.Event) -> list[Command]:
-        """Take one step of the core and check its commands."""
-        commands = self.cluster.decide(event)
-        self.cluster.journal(commands)
-        self.look_at_assignments(commands)
-        self.note_given_up()
-        self.cluster.carry_out(commands)
-        return commands
+        """Take one step of the core, whose commands `look` checks."""
+        return self.cluster.tell(event)
 
     def ask(self, kind: type, *fields: object) -> bool:
-        self.cluster._requests += 1
-        request = self.cluster._requests
-        self.tell(kind(request, *fields))
-        return self.cluster.replies[request].accepted
+        return self.cluster.ask(kind, *fields, settle=False).accepted
 
-    def look_at_assignments(self, commands: list[Command]) -> None:
+    def look(self, commands: Sequence[Command]) -> None:
+        self.look_at_assignments(commands)
+        self.note_given_up()
+
+    def look_at_assignments(self, commands: Sequence[Command]) -> None:
         state = self.cluster.state
         given = [command for command in commands if isinstance(command, Assign)]
         for assign in given:
@@ -204,17 +202,10 @@ class Play(RuleBasedStateMachine):
     def register(self, machine: Machine) -> None:
         if not machine.connected:
             return
-        machine.begin_to_register()
-        statuses, kept = machine.slave.statuses(), tuple(machine.kept.values())
+        kept = tuple(machine.kept.values())
         before, self.told_kept[machine.name] = self.told_kept.get(machine.name, ()), kept
-        if not self.ask(happened.HostRegistered, machine.description(), statuses, 0, kept):
+        if not self.cluster.enter(machine, 0, kept).accepted:
             self.told_kept[machine.name] = before
-        else:
-            machine.host_id = self.cluster.replies[self.cluster._requests].host_id
-            machine.fresh = False
-            machine.polled.clear()
-            machine.tell(reducer.Registered(self.cluster.state.epoch), self.cluster.now)
-            machine.tell(reducer.MasterHears(self.cluster.now), self.cluster.now)
 
     def pick(self, things: list, which: int) -> object:
         return things[which % len(things)]
@@ -400,15 +391,9 @@ class Play(RuleBasedStateMachine):
                 return
             if "SWITCH" not in phases:
                 self.everything_arrives(nodes=False)
-            self.nodes_talk(heard="SWITCH" not in phases)
+            self.cluster.nodes_talk(heard="SWITCH" not in phases)
 
     # --- the network ---------------------------------------------------------------------
-
-    def ask_for_work(self, machine: Machine) -> None:
-        self.cluster._requests += 1
-        self.tell(
-            happened.ProcessRequested(self.cluster._requests, machine.host_id, machine.incarnation)
-        )
 
     @rule(host=hosts)
     def slave_fetches(self, host: str) -> None:
@@ -426,7 +411,7 @@ class Play(RuleBasedStateMachine):
             del machine.ordered[which]
         if fate == "lost":
             self.heard.pop(machine.name, None)
-            self.tell(happened.OrderAnswered(order.order, accepted=False, code="timeout"))
+            self.tell(happened.OrderAnswered(order.order_id, accepted=False, code="timeout"))
         else:
             self.tell(machine.obey(order, self.cluster.now))
         self.flow()
@@ -458,7 +443,7 @@ class Play(RuleBasedStateMachine):
                 self.late.append(readings)
             else:
                 self.tell(readings)
-                self.tell(machine.usages())
+                self.tell(machine.usages(self.cluster.now))
         self.flow()
 
     @precondition(lambda self: self.late)
@@ -472,7 +457,7 @@ class Play(RuleBasedStateMachine):
         """Request a full report, which arrives now and perhaps again later."""
         machine = self.machine(host)
         if self.known(machine):
-            machine.tell(reducer.ReportRequested(), self.cluster.now)
+            machine.tell(events.ReportRequested(), self.cluster.now)
             self.late.append(machine.said[-1])
 
     @rule(prompt=chance)
@@ -558,7 +543,7 @@ class Play(RuleBasedStateMachine):
         elif what == "leaves" and self.known(machine):
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
             for instance in list(machine.programs):
-                machine.tell(reducer.StopOrdered(instance), self.cluster.now)
+                machine.tell(events.StopOrdered(instance), self.cluster.now)
         elif what == "is detached" and self.known(machine):
             # No slave runs until it is killed or `all_is_well`.
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation, machine.begun())
@@ -616,12 +601,11 @@ class Play(RuleBasedStateMachine):
     def time_passes(self, seconds: float, quiet: bool) -> None:
         self.cluster.now += seconds
         for machine in self.cluster.machines.values():
-            machine.tell(reducer.TimePassed(), self.cluster.now)
+            machine.tell(events.TimePassed(), self.cluster.now)
             if self.known(machine) and not quiet:
                 self.tell(self.cluster.readings([machine]))
-                self.tell(machine.usages())
-                if machine.accepts():
-                    self.ask_for_work(machine)
+                self.tell(machine.usages(self.cluster.now))
+                self.cluster.ask_for_work(machine)
         self.tell(happened.TimePassed())
         self.flow()
 
@@ -630,27 +614,12 @@ class Play(RuleBasedStateMachine):
     def all_arrives(self) -> None:
         self.everything_arrives()
 
-    def nodes_talk(self, *, heard: bool = True) -> bool:
-        """Deliver one message to a node, and one report to the master."""
-        arrivals, reports = self.cluster.air.waiting(), self.cluster.air.next_reports()
-        for arrive in arrivals[:1]:
-            arrive()
-        for at in reports[: int(heard)]:
-            self.tell(self.cluster.air.to_master.pop(at)[1])
-        return bool(arrivals or reports)
-
     def everything_arrives(self, *, nodes: bool = True) -> None:
         for _ in range(3):
-            while nodes and self.nodes_talk():
+            while nodes and self.cluster.nodes_talk():
                 pass
             for machine in self.cluster.machines.values():
-                if not machine.connected:
-                    continue
-                machine.fetch(self.cluster.now)
-                while machine.ordered:
-                    self.tell(machine.obey(machine.ordered.popleft(), self.cluster.now))
-                while machine.said:
-                    self.tell(machine.said.popleft())
+                self.cluster.deliver(machine)
 
     @rule(registering=st.lists(hosts, unique=True, max_size=3))
     def master_is_killed(self, registering: list[str]) -> None:
@@ -921,7 +890,7 @@ class Play(RuleBasedStateMachine):
         for _ in range(times):
             for machine in self.cluster.machines.values():
                 for instance in list(machine.programs):
-                    machine.tell(reducer.SeenInGraph(instance), self.cluster.now)
+                    machine.tell(events.SeenInGraph(instance), self.cluster.now)
             self.cluster.wait(1.0, tick=0.5)
             self.no_process_is_lost()
             self.the_books_balance()

@@ -8,6 +8,7 @@ import rosrm_scoring.plugin
 from rosrm.extensions.contracts import Capabilities, CheckpointChoice, MigrationOffer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import Registry
+from rosrm.model.orders import ReplicateSnapshot
 from rosrm.model.plan import Execute
 from rosrm.model.values import (
     HostLossPolicy,
@@ -61,7 +62,7 @@ def test_snapshots_are_kept_of_a_state_on_topics():
     other = others(cluster)[0]
     policy.answer = CheckpointChoice((other,))
     cluster.wait(3.0)
-    assert cluster.orders("keep")[-1].keep_on == (other,)
+    assert cluster.orders(ReplicateSnapshot)[-1].hosts == (other,)
     keep(cluster, other, ("p", cluster["p"].owner, 4))
     cluster.machines[where(cluster)].connected = False
     cluster.wait(12.0)

@@ -156,9 +156,9 @@ def test_an_old_manifest_is_read():
         ({"format": 3}, "has format 3; this rosrm reads format 2"),
         ({"format": 2}, "damaged: manifest.json: no 'checksum'"),
         ({"format": 2, "checksum": 7}, "damaged: manifest.json: it has changed since"),
-        ({"checksum": 7}, "damaged: manifest.json: .*'checksum'"),
-        ({"pid": "one"}, "damaged: manifest.json: pid is 'one'"),
-        ({"sizes": {"criu/x": "1"}}, "sizes: not a number for each file"),
+        ({"checksum": 7}, "damaged: manifest.json: unknown checksum"),
+        ({"pid": "one"}, "damaged: manifest.json: pid: int is required, not 'one'"),
+        ({"sizes": {"criu/x": "1"}}, "sizes.criu/x: int is required, not '1'"),
         ({"sizes": {"../secret": 1}}, "'../secret' does not lie in the image"),
     ],
 )

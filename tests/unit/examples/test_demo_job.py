@@ -24,8 +24,7 @@ def value_after(spec, option):
 
 def test_the_holders_are_of_the_papers_sizes_and_the_seed_decides():
     sizes = holder_sizes(SCENARIO)
-    assert min(sizes) >= 8
-    assert max(sizes) <= 80
+    assert 8 <= min(sizes) <= max(sizes) <= 80
     assert sizes == holder_sizes(SCENARIO)
     assert sizes != holder_sizes(replace(SCENARIO, seed=7))
 
@@ -48,13 +47,15 @@ def test_the_pieces_come_first_and_everything_in_order_of_time():
     assert times == sorted(times)
 
 
-def test_names_are_unique():
-    names = [spec.name for spec in all_specs()]
-    assert len(set(names)) == len(names)
+@pytest.fixture
+def by_kind():
+    """Return one spec of each kind of process, whose names are unique."""
+    specs = all_specs()
+    assert len({spec.name for spec in specs}) == len(specs)
+    return {demo_job.kind_of(spec.name): spec for spec in specs}
 
 
-def test_pieces_are_ros_nodes_that_stay_and_holders_may_move():
-    by_kind = {demo_job.kind_of(spec.name): spec for spec in all_specs()}
+def test_pieces_are_ros_nodes_that_stay_and_holders_may_move(by_kind):
     piece, holder, recorder = (by_kind[kind] for kind in ("piece", "holder", "recorder"))
     assert piece.ros
     assert piece.environment["OMP_NUM_THREADS"] == "1"
@@ -65,17 +66,14 @@ def test_pieces_are_ros_nodes_that_stay_and_holders_may_move():
     assert recorder.migration.strategy is None
 
 
-def test_only_one_host_may_take_the_recorder():
-    recorder = next(spec for spec in all_specs() if spec.name == "recorder")
+def test_only_one_host_may_take_the_recorder(by_kind):
+    required = by_kind["recorder"].required_labels.items()
     hosts = demo_job.host_configs(SCENARIO.budget, cores=2)
-    fitting = [
-        host.host for host in hosts if recorder.required_labels.items() <= host.labels.items()
-    ]
-    assert fitting == ["host1"]
+    assert [host.host for host in hosts if required <= host.labels.items()] == ["host1"]
 
 
-def test_the_recorder_alone_reaches_the_limit_of_its_host_and_not_much_more():
-    recorder = next(spec for spec in all_specs() if spec.name == "recorder")
+def test_the_recorder_alone_reaches_the_limit_of_its_host_and_not_much_more(by_kind):
+    recorder = by_kind["recorder"]
     held = float(value_after(recorder, "--grow")) * float(value_after(recorder, "--seconds"))
     assert 0.75 * SCENARIO.budget < held * 1e6 < SCENARIO.budget
 

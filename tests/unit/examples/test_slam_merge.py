@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,29 +18,32 @@ from rosrm_examples.poses import inverse
 from rosrm_examples.slam import Slam
 
 
+def pieces_of(drive: Drive, of: int, mapped: Callable[[Drive], tuple]) -> list[MapPiece]:
+    """Return the pieces of a drive, with the poses and points that a function maps."""
+    parts = {number: drive.piece(number, of) for number in range(1, of + 1)}
+    return [
+        MapPiece(number, of, part.indices, part.times, *mapped(part))
+        for number, part in parts.items()
+    ]
+
+
+def perfectly(part: Drive) -> tuple:
+    """Map as a SLAM without any error would."""
+    assert part.truth is not None
+    poses = inverse(part.truth[0]) @ part.truth
+    return poses, poses[:, :3, 3].astype(np.float32)
+
+
+def really(part: Drive) -> tuple:
+    """Map as SLAM does."""
+    slam = Slam()
+    for points, t in zip(part.scans(), part.times, strict=True):
+        slam.add_scan(points, t)
+    return np.array(slam.poses), slam.map_points()
+
+
 def perfect_pieces(drive: Drive, of: int) -> list[MapPiece]:
-    """Return pieces as a SLAM without any error would map them."""
-    pieces = []
-    for number in range(1, of + 1):
-        part = drive.piece(number, of)
-        assert part.truth is not None
-        poses = inverse(part.truth[0]) @ part.truth
-        points = poses[:, :3, 3].astype(np.float32)
-        pieces.append(MapPiece(number, of, part.indices, part.times, poses, points))
-    return pieces
-
-
-def mapped_pieces(drive: Drive, of: int) -> list[MapPiece]:
-    """Return pieces as SLAM really maps them."""
-    pieces = []
-    for number in range(1, of + 1):
-        part = drive.piece(number, of)
-        slam = Slam()
-        for points, t in zip(part.scans(), part.times, strict=True):
-            slam.add_scan(points, t)
-        poses = np.array(slam.poses)
-        pieces.append(MapPiece(number, of, part.indices, part.times, poses, slam.map_points()))
-    return pieces
+    return pieces_of(drive, of, perfectly)
 
 
 def test_perfect_pieces_join_to_the_true_drive() -> None:
@@ -55,7 +59,7 @@ def test_perfect_pieces_join_to_the_true_drive() -> None:
 def test_kitti_0001_in_pieces_is_joined_truly(kitti0001: Drive) -> None:
     """The first half of drive 0001, mapped in 3 pieces, ends within 1.5 % of the path."""
     drive = kitti0001.part(0, 54)
-    joined = join(mapped_pieces(drive, 3))
+    joined = join(pieces_of(drive, 3, really))
     assert drive.truth is not None
     assert end_error_percent(joined.poses, drive.truth) < 1.5
 
@@ -99,16 +103,10 @@ def test_a_ply_holds_what_was_written(tmp_path: Path) -> None:
     write_ply(path, points, colours)
     header, _, body = path.read_bytes().partition(b"end_header\n")
     assert header.decode().splitlines() == [
-        "ply",
-        "format binary_little_endian 1.0",
-        "element vertex 50",
-        "property float x",
-        "property float y",
-        "property float z",
-        "property uchar red",
-        "property uchar green",
-        "property uchar blue",
-    ]
+        "ply", "format binary_little_endian 1.0", "element vertex 50",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+    ]  # fmt: skip
     vertices = np.frombuffer(body, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
     assert np.array_equal(vertices["xyz"], points)
     assert np.array_equal(vertices["rgb"], colours)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
@@ -40,17 +41,15 @@ def a_little_off() -> Pose:
     return move(np.eye(4), np.array([0.21, -0.13, 0.08, 0.01, -0.015, 0.03]))
 
 
+def score_after(room: NdtMap, pose: Pose, points: Floats, motion: Floats) -> float:
+    return derivatives(room, move(pose, motion), points).score
+
+
 def test_the_gradient_is_the_slope_of_the_score(room: NdtMap) -> None:
     """The analytic gradient equals central differences of the score."""
     points, pose, step = bumpy_room(seed=2), a_little_off(), 1e-6
-    numeric = [
-        (
-            derivatives(room, move(pose, step * axis), points).score
-            - derivatives(room, move(pose, -step * axis), points).score
-        )
-        / (2 * step)
-        for axis in np.eye(6)
-    ]
+    score = partial(score_after, room, pose, points)
+    numeric = [(score(step * axis) - score(-step * axis)) / (2 * step) for axis in np.eye(6)]
     assert derivatives(room, pose, points).gradient == pytest.approx(numeric, rel=1e-4, abs=1e-3)
 
 
@@ -59,21 +58,11 @@ def test_the_hessian_is_the_curvature_of_the_score(room: NdtMap) -> None:
     # Keep points well inside their cells: the score jumps where a point changes its cell.
     points, pose, step = bumpy_room(seed=2), a_little_off(), 1e-4
     inside = np.abs(transform(pose, points) / room.cell % 1 - 0.5).max(axis=1) < 0.49
+    score, axes = partial(score_after, room, pose, points[inside]), step * np.eye(6)
     points = points[inside]
-
-    def score(motion: Floats) -> float:
-        return derivatives(room, move(pose, motion), points).score
-
-    axes = step * np.eye(6)
-    numeric = np.array(
-        [
-            [
-                (score(i + j) - score(i - j) - score(j - i) + score(-i - j)) / (4 * step**2)
-                for j in axes
-            ]
-            for i in axes
-        ]
-    )
+    numeric = np.array([
+        [score(i + j) - score(i - j) - score(j - i) + score(-i - j) for j in axes] for i in axes
+    ]) / (4 * step**2)  # fmt: skip
     analytic = derivatives(room, pose, points).hessian
     assert analytic == pytest.approx(numeric, rel=1e-3, abs=1e-4 * np.abs(analytic).max())
 

@@ -146,14 +146,7 @@ def test_rotations_go_back_and_forth(vector: list[float]) -> None:
     rotation = rotation_from_vector(given)
     assert vector_from_rotation(rotation) == pytest.approx(given, abs=1e-12)
     x, y, z, w = quaternion(rotation)
-    assert np.array([x, y, z]) * 2 * w == pytest.approx(
-        np.array(
-            [
-                rotation[2, 1] - rotation[1, 2],
-                rotation[0, 2] - rotation[2, 0],
-                rotation[1, 0] - rotation[0, 1],
-            ]
-        )
-        / 2
-    )
+    skew = rotation - rotation.T
+    axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+    assert np.array([x, y, z]) * 2 * w == pytest.approx(axis / 2)
     assert x * x + y * y + z * z + w * w == pytest.approx(1)

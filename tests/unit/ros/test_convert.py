@@ -36,42 +36,34 @@ FORMS = st.one_of(
 )
 
 
-@st.composite
-def specs(draw) -> values.ProcessSpec:
-    return values.ProcessSpec(
-        **draw(FORMS),
-        name=draw(NAMES),
-        namespace=draw(WORDS),
-        arguments=tuple(draw(st.lists(WORDS, max_size=3))),
-        parameters=draw(st.dictionaries(NAMES, PLAIN, max_size=3)),
-        remappings=draw(TEXTS),
-        environment=draw(TEXTS),
-        working_directory=draw(st.none() | NAMES),
-        ros=draw(st.booleans()),
-        kind=draw(st.sampled_from(values.Kind)),
-        restart=values.RestartPolicy(
-            draw(st.sampled_from(["never", "on-failure", "always"])),
-            draw(SECONDS),
-            draw(SECONDS),
-            draw(st.floats(1.0, 100.0)),
-            draw(UINT32),
-            draw(SECONDS),
-        ),
-        needs=draw(st.dictionaries(NAMES, st.floats(0.0, 1e18), max_size=3)),
-        required_labels=draw(TEXTS),
-        preferred_labels=draw(TEXTS),
-        avoided_labels=draw(TEXTS),
-        priority=draw(INT32),
-        migration=values.MigrationPolicy(
-            draw(st.none() | NAMES),
-            draw(st.booleans()),
-            draw(st.dictionaries(WORDS, PLAIN, max_size=2)),
-        ),
-        readiness=values.Readiness(
-            draw(st.sampled_from(["auto", "graph", "running"])), draw(SECONDS)
-        ),
-        stop=values.StopPolicy(draw(SECONDS), draw(SECONDS)),
-    )
+SPECS = st.builds(
+    lambda form, **fields: values.ProcessSpec(**form, **fields),
+    FORMS,
+    name=NAMES,
+    namespace=WORDS,
+    arguments=st.lists(WORDS, max_size=3).map(tuple),
+    parameters=st.dictionaries(NAMES, PLAIN, max_size=3),
+    remappings=TEXTS,
+    environment=TEXTS,
+    working_directory=st.none() | NAMES,
+    ros=st.booleans(),
+    kind=st.sampled_from(values.Kind),
+    restart=st.builds(
+        values.RestartPolicy, st.sampled_from(["never", "on-failure", "always"]), SECONDS, SECONDS,
+        st.floats(1.0, 100.0), UINT32, SECONDS,
+    ),
+    needs=st.dictionaries(NAMES, st.floats(0.0, 1e18), max_size=3),
+    required_labels=TEXTS,
+    preferred_labels=TEXTS,
+    avoided_labels=TEXTS,
+    priority=INT32,
+    migration=st.builds(
+        values.MigrationPolicy, st.none() | NAMES, st.booleans(),
+        st.dictionaries(WORDS, PLAIN, max_size=2),
+    ),
+    readiness=st.builds(values.Readiness, st.sampled_from(["auto", "graph", "running"]), SECONDS),
+    stop=st.builds(values.StopPolicy, SECONDS, SECONDS),
+)  # fmt: skip
 
 
 def over_the_wire(message):
@@ -79,30 +71,24 @@ def over_the_wire(message):
     return deserialize_message(serialize_message(message), type(message))
 
 
-@given(specs())
+def survives(value, name: str) -> bool:
+    """Return True if a value is received unchanged in every field."""
+    message = getattr(convert, f"{name}_to_msg")(value)
+    return getattr(convert, f"{name}_from_msg")(over_the_wire(message)) == value
+
+
+@given(SPECS)
 @settings(max_examples=150, deadline=None)
 def test_spec_survives(spec) -> None:
-    """A submitted spec is received unchanged in every field."""
-    assert convert.spec_from_msg(over_the_wire(convert.spec_to_msg(spec))) == spec
+    """A submitted spec is received unchanged, and its restart policy also apart from it."""
+    assert survives(spec, "spec")
+    assert survives(spec.restart, "restart")
 
 
-@given(specs(), INSTANCES, UINT64, WORDS, st.booleans())
+@given(st.builds(values.Assignment, INSTANCES, SPECS, UINT64, WORDS, st.booleans()))
 @settings(max_examples=30, deadline=None)
-def test_assignment_survives(spec, instance, epoch, node_name, shadow) -> None:
-    """An assignment is received unchanged."""
-    assignment = values.Assignment(instance, spec, epoch, node_name, shadow)
-    assert (
-        convert.assignment_from_msg(over_the_wire(convert.assignment_to_msg(assignment)))
-        == assignment
-    )
-
-
-@given(specs())
-@settings(max_examples=30, deadline=None)
-def test_restart_policy_survives(spec) -> None:
-    """The policy also survives apart from its spec."""
-    message = over_the_wire(convert.restart_to_msg(spec.restart))
-    assert convert.restart_from_msg(message) == spec.restart
+def test_assignment_survives(assignment) -> None:
+    assert survives(assignment, "assignment")
 
 
 @pytest.mark.parametrize(
@@ -134,7 +120,7 @@ def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
 @settings(max_examples=60, deadline=None)
 def test_status_survives(status) -> None:
     """A status is received by the master as the slave sent it."""
-    assert convert.status_from_msg(over_the_wire(convert.status_to_msg(status))) == status
+    assert survives(status, "status")
 
 
 RESOURCES = st.lists(
@@ -160,7 +146,7 @@ HOSTS = st.builds(
 @settings(max_examples=60, deadline=None)
 def test_host_survives(host) -> None:
     """A host description is received unchanged; a resource's position is its slot."""
-    assert convert.host_from_msg(over_the_wire(convert.host_to_msg(host))) == host
+    assert survives(host, "host")
 
 
 @given(HOSTS, st.data())
@@ -177,7 +163,7 @@ def test_host_row_survives(host, data) -> None:
         ),
         3, data.draw(st.booleans()),
     )  # fmt: skip
-    assert convert.host_row_from_msg(over_the_wire(convert.host_row_to_msg(row))) == row
+    assert survives(row, "host_row")
 
 
 def test_rows_survive() -> None:
@@ -188,13 +174,17 @@ def test_rows_survive() -> None:
     plugin = PluginRow("probe", "gpu", "rosrm-resources 0.1", "absent", "no driver", "h")
     event = EventRow(2**40, 1.7e9, 12.5, "assigned", "a", "h", "a goes to h", {"n": [1, {"x": 2}]})
     for row in (process, replace(process, exit_code=None), replace(process, exit_code=0)):
-        assert convert.process_row_from_msg(over_the_wire(convert.process_row_to_msg(row))) == row
-    assert convert.plugin_row_from_msg(over_the_wire(convert.plugin_row_to_msg(plugin))) == plugin
-    assert convert.event_from_msg(over_the_wire(convert.event_to_msg(event))) == event
+        assert survives(row, "process_row")
+    assert survives(plugin, "plugin_row")
+    assert survives(event, "event")
 
 
-def good_spec() -> msg.ProcessSpec:
-    return convert.spec_to_msg(values.ProcessSpec("p", command=("true",)))
+def amount(of: float) -> list[msg.ResourceAmount]:
+    return [msg.ResourceAmount(resource="memory", amount=of)]
+
+
+def value(text: str) -> list[msg.KeyValue]:
+    return [msg.KeyValue(key="a", value=text)]
 
 
 NAN, INF = float("nan"), float("inf")
@@ -213,14 +203,10 @@ NONSENSE_IN_SPECS = {
     "a readiness without end": lambda m: setattr(m.readiness, "timeout", NAN),
     "a grace without end": lambda m: setattr(m.stop, "interrupt_grace", INF),
     "a negative grace": lambda m: setattr(m.stop, "terminate_grace", -1.0),
-    "needs": lambda m: setattr(m, "needs", [msg.ResourceAmount(resource="memory", amount=NAN)]),
-    "negative needs": lambda m: setattr(
-        m, "needs", [msg.ResourceAmount(resource="memory", amount=-1.0)]
-    ),
-    "a parameter": lambda m: setattr(m, "parameters", [msg.KeyValue(key="a", value="{")]),
-    "a parameter too deep": lambda m: setattr(
-        m, "parameters", [msg.KeyValue(key="a", value="[" * 100_000)]
-    ),
+    "needs": lambda m: setattr(m, "needs", amount(NAN)),
+    "negative needs": lambda m: setattr(m, "needs", amount(-1.0)),
+    "a parameter": lambda m: setattr(m, "parameters", value("{")),
+    "a parameter too deep": lambda m: setattr(m, "parameters", value("[" * 100_000)),
     "migration options": lambda m: setattr(m.migration, "options", "[1]"),
     "options too deep": lambda m: setattr(m.migration, "options", '{"a":' * 100_000),
 }
@@ -229,7 +215,7 @@ NONSENSE_IN_SPECS = {
 @pytest.mark.parametrize("what", NONSENSE_IN_SPECS)
 def test_spec_that_makes_no_process_is_refused(what) -> None:
     """Any client may send an invalid spec: the refusal has a reason, and nothing else is raised."""
-    message = good_spec()
+    message = convert.spec_to_msg(values.ProcessSpec("p", command=("true",)))
     convert.spec_from_msg(message)
 
     NONSENSE_IN_SPECS[what](message)

@@ -10,7 +10,30 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from rosrm.core.slave import commands as slave_commands
 from rosrm.core.slave import reducer
+from rosrm.core.slave.events import (
+    AssignmentsReceived,
+    FenceOrdered,
+    LaunchRefused,
+    LookedAt,
+    MasterHears,
+    MasterLost,
+    Registered,
+    ReportRequested,
+    RestartOrdered,
+    RestartPolicyRecorded,
+    RestartPolicySet,
+    SeenInGraph,
+    StopOrdered,
+    SupervisorReplaced,
+    SupervisorReported,
+    TimePassed,
+)
+from rosrm.core.slave.handlers import REMEMBER_END
+from rosrm.core.slave.health import LOOK_PERIOD
+from rosrm.core.slave.state import Held, SlaveState, awaits_graph, under_limits
+from rosrm.core.slave.watches import Look, Memo
 from rosrm.model.values import (
     Assignment,
     Fence,
@@ -29,27 +52,27 @@ NODE = ProcessSpec("n", module="m", ros=True, namespace="/robot", readiness=Read
 STATE = InstanceState
 
 
-def assigned(spec=PLAIN, number=1, epoch=1, fence=None) -> reducer.AssignmentsReceived:
+def assigned(spec=PLAIN, number=1, epoch=1, fence=None) -> AssignmentsReceived:
     assignment = Assignment(InstanceId(spec.name, number), spec, epoch, spec.name, fence=fence)
-    return reducer.AssignmentsReceived((assignment,))
+    return AssignmentsReceived((assignment,))
 
 
-def told(state, name="p", number=1, **more) -> reducer.SupervisorReported:
-    return reducer.SupervisorReported((InstanceStatus(InstanceId(name, number), state, **more),))
+def told(state, name="p", number=1, **more) -> SupervisorReported:
+    return SupervisorReported((InstanceStatus(InstanceId(name, number), state, **more),))
 
 
 class Slave:
     """State of a slave's reducer, with its clock."""
 
     def __init__(self) -> None:
-        self.state = reducer.SlaveState(registered=True)
+        self.state = SlaveState(registered=True)
         self.now = 100.0
 
     def step(self, event, after=0.0):
         self.now += after
         return list(reducer.step(self.state, event, self.now))
 
-    def of(self, name="p", number=1) -> reducer.Held:
+    def of(self, name="p", number=1) -> Held:
         return self.state.held[InstanceId(name, number)]
 
 
@@ -61,8 +84,8 @@ def one() -> Slave:
 def test_what_went_with_the_supervisor_cannot_be_refused_any_more(one):
     """The instance was starting when its supervisor was killed: no supervisor holds it."""
     one.step(assigned())
-    one.step(reducer.SupervisorReplaced((), {}, frozenset()))
-    assert one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package")) == []
+    one.step(SupervisorReplaced((), {}, frozenset()))
+    assert one.step(LaunchRefused(InstanceId("p", 1), "no such package")) == []
 
 
 def test_what_is_taken_back_at_once_is_not_launched(one):
@@ -71,9 +94,9 @@ def test_what_is_taken_back_at_once_is_not_launched(one):
     The next supervisor does not know the instance. The master repeats the assignment and receives
     the refusal.
     """
-    events = [assigned(), reducer.SupervisorReplaced((), {}, frozenset())]
+    events = [assigned(), SupervisorReplaced((), {}, frozenset())]
     commands = reducer.step_all(one.state, events, one.now)
-    assert [c for c in commands if isinstance(c, reducer.Launch) and c.assignments] == []
+    assert [c for c in commands if isinstance(c, slave_commands.Launch) and c.assignments] == []
     (report,) = one.step(assigned(), after=2.0)
     assert states([report]) == [STATE.REFUSED]
 
@@ -85,12 +108,12 @@ def awaited_names(one: Slave) -> list[str]:
 
 def states(commands) -> list[InstanceState]:
     """Return the reported states."""
-    return [s.state for c in commands if isinstance(c, reducer.Report) for s in c.statuses]
+    return [s.state for c in commands if isinstance(c, slave_commands.Report) for s in c.statuses]
 
 
 def test_an_assignment_is_launched_once(one) -> None:
     """A repeated order starts nothing."""
-    assert [type(c) for c in one.step(assigned())] == [reducer.Launch]
+    assert [type(c) for c in one.step(assigned())] == [slave_commands.Launch]
     assert one.step(assigned()) == []
     one.step(told(STATE.RUNNING, pid=5))
     one.step(told(STATE.EXITED))
@@ -101,9 +124,9 @@ def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None
     """The registration request had the older status, and no batch was published without a link."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
-    one.step(reducer.MasterLost())
+    one.step(MasterLost())
     one.step(told(STATE.FAILED, exit_signal=9))
-    (report,) = one.step(reducer.Registered(1))
+    (report,) = one.step(Registered(1))
     assert (states([report]), report.complete) == ([STATE.FAILED], False)
 
 
@@ -111,29 +134,29 @@ def test_a_registration_without_news_is_not_followed_by_a_report(one) -> None:
     """The request had all statuses."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
-    one.step(reducer.MasterLost())
-    assert one.step(reducer.Registered(2)) == []
+    one.step(MasterLost())
+    assert one.step(Registered(2)) == []
 
 
 def test_an_older_epoch_starts_nothing(one) -> None:
     """Orders of a replaced master have no effect; the refusal names both epochs."""
-    one.step(reducer.Registered(3))
+    one.step(Registered(3))
     assert states(one.step(assigned(epoch=2))) == [STATE.REFUSED]
     assert "epoch 2" in one.of().status.message
 
 
 def test_a_registration_sets_the_epoch(one) -> None:
     """A master with a lost journal begins at epoch 1 again, and this host works for it."""
-    one.step(reducer.Registered(7))
-    one.step(reducer.Registered(1))
-    assert [type(c) for c in one.step(assigned(epoch=1))] == [reducer.Launch]
+    one.step(Registered(7))
+    one.step(Registered(1))
+    assert [type(c) for c in one.step(assigned(epoch=1))] == [slave_commands.Launch]
 
 
 def test_stopped_before_it_was_started(one) -> None:
     """A stop that overtakes its start wins: a later start is refused for good."""
-    assert states(one.step(reducer.StopOrdered(InstanceId("p", 1)))) == [STATE.REFUSED]
+    assert states(one.step(StopOrdered(InstanceId("p", 1)))) == [STATE.REFUSED]
     assert one.step(assigned()) == []
-    one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
+    one.step(TimePassed(), after=REMEMBER_END)
     assert states(one.step(assigned())) == [STATE.REFUSED]
 
 
@@ -142,40 +165,40 @@ def test_a_dead_number_stays_dead(one, end) -> None:
     """A late order of the same instance starts nothing, even after its end was forgotten."""
     one.step(assigned())
     if end == "refused":
-        one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package"))
+        one.step(LaunchRefused(InstanceId("p", 1), "no such package"))
     else:
         one.step(told(STATE.EXITED))
-    forgotten = one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
-    assert forgotten == [reducer.Forget((InstanceId("p", 1),))]
+    forgotten = one.step(TimePassed(), after=REMEMBER_END)
+    assert forgotten == [slave_commands.Forget((InstanceId("p", 1),))]
     assert states(one.step(assigned())) == [STATE.REFUSED]
-    assert [type(c) for c in one.step(assigned(number=2))] == [reducer.Launch]
+    assert [type(c) for c in one.step(assigned(number=2))] == [slave_commands.Launch]
 
 
 def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one) -> None:
     """A master with a lost journal may reuse them; a repeated registration changes nothing."""
-    one.step(reducer.StopOrdered(InstanceId("p", 1)))
-    one.step(reducer.Registered(1))
-    one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
+    one.step(StopOrdered(InstanceId("p", 1)))
+    one.step(Registered(1))
+    one.step(TimePassed(), after=REMEMBER_END)
     assert states(one.step(assigned())) == [STATE.REFUSED]
-    one.step(reducer.Registered(1, renumbers=True))
-    one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
-    assert [type(c) for c in one.step(assigned())] == [reducer.Launch]
+    one.step(Registered(1, renumbers=True))
+    one.step(TimePassed(), after=REMEMBER_END)
+    assert [type(c) for c in one.step(assigned())] == [slave_commands.Launch]
 
 
 def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
     """The slave keeps the end of a job until a master has learned it, however long that takes."""
     one.step(assigned())
-    one.step(reducer.MasterLost())
+    one.step(MasterLost())
     one.step(told(STATE.EXITED))
-    assert one.step(reducer.TimePassed(), after=10 * reducer.REMEMBER_END) == []
-    one.step(reducer.Registered(2))
-    assert one.step(reducer.TimePassed(), after=reducer.REMEMBER_END / 2) == []
-    assert len(one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)) == 1
+    assert one.step(TimePassed(), after=10 * REMEMBER_END) == []
+    one.step(Registered(2))
+    assert one.step(TimePassed(), after=REMEMBER_END / 2) == []
+    assert len(one.step(TimePassed(), after=REMEMBER_END)) == 1
 
 
 def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
     """Only the order was too old: a newer master may still use the instance's number."""
-    one.step(reducer.Registered(3))
+    one.step(Registered(3))
     one.step(assigned(epoch=2, number=8))
     assert states(one.step(assigned(epoch=3, number=9))) == []
     assert one.of(number=9).status.state is STATE.STARTING
@@ -184,7 +207,7 @@ def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
 def test_a_launch_that_is_refused_is_said(one) -> None:
     """The reason reaches the master."""
     one.step(assigned())
-    (report,) = one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package"))
+    (report,) = one.step(LaunchRefused(InstanceId("p", 1), "no such package"))
     assert report.statuses[0].state is STATE.REFUSED
     assert report.statuses[0].message == "no such package"
 
@@ -202,37 +225,37 @@ def test_a_node_is_ready_when_it_is_seen(one) -> None:
     assert one.state.awaited_in_graph() == {}
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.RUNNING]
     assert awaited_names(one) == ["/robot/n"]
-    assert states(one.step(reducer.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
-    assert one.step(reducer.SeenInGraph(InstanceId("n", 1))) == []
+    assert states(one.step(SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
+    assert one.step(SeenInGraph(InstanceId("n", 1))) == []
     assert one.state.awaited_in_graph() == {}
 
 
 def test_a_shadow_is_awaited_under_its_alias(one) -> None:
     """The source has the node's own name; the shadow's alias shows in the graph when ready."""
     shadow = Assignment(InstanceId("n", 2), NODE, 1, "n_1700000000", shadow=True)
-    one.step(reducer.AssignmentsReceived((shadow,)))
+    one.step(AssignmentsReceived((shadow,)))
     one.step(told(STATE.RUNNING, "n", 2, pid=5))
     assert awaited_names(one) == ["/robot/n_1700000000"]
-    assert states(one.step(reducer.SeenInGraph(InstanceId("n", 2)))) == [STATE.READY]
+    assert states(one.step(SeenInGraph(InstanceId("n", 2)))) == [STATE.READY]
 
 
 def test_readiness_kinds(one) -> None:
     """`running` makes a node ready at once; with `graph` the slave awaits any process."""
     running = replace(NODE, readiness=Readiness("running"))
     graph = replace(PLAIN, readiness=Readiness("graph"))
-    assert not reducer.awaits_graph(running)
-    assert reducer.awaits_graph(graph)
-    assert reducer.awaits_graph(NODE)
-    assert not reducer.awaits_graph(PLAIN)
+    assert not awaits_graph(running)
+    assert awaits_graph(graph)
+    assert awaits_graph(NODE)
+    assert not awaits_graph(PLAIN)
 
 
 def test_never_ready_is_stopped_and_has_failed(one) -> None:
     """The time-out is the reason, whatever the exit code."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
-    assert one.step(reducer.TimePassed(), after=9.9) == []
-    assert one.step(reducer.TimePassed(), after=0.2) == [reducer.Stop(InstanceId("n", 1))]
-    assert one.step(reducer.TimePassed(), after=1.0) == []
+    assert one.step(TimePassed(), after=9.9) == []
+    assert one.step(TimePassed(), after=0.2) == [slave_commands.Stop(InstanceId("n", 1))]
+    assert one.step(TimePassed(), after=1.0) == []
     assert states(one.step(told(STATE.STOPPING, "n", pid=5))) == [STATE.STOPPING]
     (report,) = one.step(told(STATE.EXITED, "n"))
     assert report.statuses[0].state is STATE.FAILED
@@ -244,19 +267,19 @@ def test_each_run_has_its_own_time_to_become_ready(one) -> None:
     """After a crash and restart the node must appear in the graph again."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
-    one.step(reducer.SeenInGraph(InstanceId("n", 1)))
+    one.step(SeenInGraph(InstanceId("n", 1)))
     assert states(one.step(told(STATE.BACKOFF, "n"), after=60.0)) == [STATE.BACKOFF]
     assert one.state.awaited_in_graph() == {}
     assert states(one.step(told(STATE.STARTING, "n"))) == [STATE.STARTING]
     assert states(one.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
-    assert one.step(reducer.TimePassed(), after=9.0) == []
-    assert states(one.step(reducer.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
+    assert one.step(TimePassed(), after=9.0) == []
+    assert states(one.step(SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
 
 
 def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
     """Its spec is lost, but the process runs and keeps running."""
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.READY]
-    assert one.step(reducer.TimePassed(), after=1000.0) == []
+    assert one.step(TimePassed(), after=1000.0) == []
     assert one.step(assigned(NODE)) == []
 
 
@@ -265,17 +288,17 @@ def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
 NODE_1 = InstanceId("n", 1)
 
 
-def memo_of(commands) -> reducer.Memo:
+def memo_of(commands) -> Memo:
     """Return the memo for the supervisor as a later run reads it."""
-    (memo,) = [c.memo for c in commands if isinstance(c, reducer.Remember)]
+    (memo,) = [c.memo for c in commands if isinstance(c, slave_commands.Remember)]
     return from_memo(to_memo(memo))
 
 
-def taken_over(one: Slave, status: InstanceStatus, memo: reducer.Memo) -> Slave:
+def taken_over(one: Slave, status: InstanceStatus, memo: Memo) -> Slave:
     """Return a later run of the slave that re-adopts this instance from the supervisor."""
     later = Slave()
     later.now = one.now
-    later.step(reducer.SupervisorReplaced((status,), {status.instance: memo}))
+    later.step(SupervisorReplaced((status,), {status.instance: memo}))
     return later
 
 
@@ -286,18 +309,18 @@ def test_a_node_that_was_still_awaited_is_awaited_by_the_next_slave(one) -> None
     later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
     assert later.of("n").status.state is STATE.RUNNING
     assert awaited_names(later) == ["/robot/n"]
-    assert later.step(reducer.TimePassed(), after=9.9) == []
-    assert later.step(reducer.TimePassed(), after=0.2) == [reducer.Stop(NODE_1)]
+    assert later.step(TimePassed(), after=9.9) == []
+    assert later.step(TimePassed(), after=0.2) == [slave_commands.Stop(NODE_1)]
 
 
 def test_a_node_that_was_seen_is_ready_for_the_next_slave(one) -> None:
     """Readiness holds for the run that was seen; the next run must appear in the graph again."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
-    awaited = memo_of(one.step(reducer.SeenInGraph(NODE_1)))
+    awaited = memo_of(one.step(SeenInGraph(NODE_1)))
     later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
     assert later.of("n").status.state is STATE.READY
-    assert later.step(reducer.TimePassed(), after=1000.0) == []
+    assert later.step(TimePassed(), after=1000.0) == []
     later.step(told(STATE.BACKOFF, "n"))
     assert states(later.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
     assert awaited_names(later) == ["/robot/n"]
@@ -333,60 +356,60 @@ def test_a_restart_policy_is_settled_when_it_is_recorded() -> None:
     """Each repeated order is acknowledged, with the instance's status."""
     one = running()
     for _ in range(2):
-        assert one.step(reducer.RestartPolicySet(ONE, NEVER)) == [reducer.Amend(ONE, NEVER)]
-        report, settled = one.step(reducer.RestartPolicyRecorded(ONE, NEVER))
+        assert one.step(RestartPolicySet(ONE, NEVER)) == [slave_commands.Amend(ONE, NEVER)]
+        report, settled = one.step(RestartPolicyRecorded(ONE, NEVER))
         assert states([report]) == [STATE.READY]
-        assert settled == reducer.Settle(ONE, NEVER)
+        assert settled == slave_commands.Settle(ONE, NEVER)
 
 
 def test_a_restart_policy_of_what_the_slave_found_running() -> None:
     """The slave lost its spec, but the supervisor has all that is needed."""
     one = Slave()
-    one.step(reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
-    assert one.step(reducer.RestartPolicySet(ONE, NEVER)) == [reducer.Amend(ONE, NEVER)]
+    one.step(SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
+    assert one.step(RestartPolicySet(ONE, NEVER)) == [slave_commands.Amend(ONE, NEVER)]
 
 
 def test_a_restart_policy_is_ordered_again_from_another_supervisor() -> None:
     """The killed supervisor may have recorded it or not; the next one's answer counts."""
     one = running()
-    one.step(reducer.RestartPolicySet(ONE, NEVER))
-    replaced = reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
-    assert reducer.Amend(ONE, NEVER) in one.step(replaced)
-    one.step(reducer.RestartPolicyRecorded(ONE, NEVER))
-    assert [type(c) for c in one.step(replaced)] == [reducer.Report]
+    one.step(RestartPolicySet(ONE, NEVER))
+    replaced = SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
+    assert slave_commands.Amend(ONE, NEVER) in one.step(replaced)
+    one.step(RestartPolicyRecorded(ONE, NEVER))
+    assert [type(c) for c in one.step(replaced)] == [slave_commands.Report]
 
 
 def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one() -> None:
     """Both were in progress: each order has its own answer."""
     one = running()
-    one.step(reducer.RestartPolicySet(ONE, NEVER))
-    one.step(reducer.RestartPolicySet(ONE, ON_FAILURE))
-    assert one.step(reducer.RestartPolicyRecorded(ONE, NEVER))[-1] == reducer.Settle(ONE, NEVER)
-    replaced = reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
-    assert one.step(replaced)[:-1] == [reducer.Amend(ONE, ON_FAILURE)]
+    one.step(RestartPolicySet(ONE, NEVER))
+    one.step(RestartPolicySet(ONE, ON_FAILURE))
+    assert one.step(RestartPolicyRecorded(ONE, NEVER))[-1] == slave_commands.Settle(ONE, NEVER)
+    replaced = SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
+    assert one.step(replaced)[:-1] == [slave_commands.Amend(ONE, ON_FAILURE)]
 
 
 def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
     """The master receives the end, so its plan continues; the same holds for an end in between."""
     one = running()
-    one.step(reducer.RestartPolicySet(ONE, NEVER))
+    one.step(RestartPolicySet(ONE, NEVER))
     one.step(told(STATE.FAILED))
-    report, settled = one.step(reducer.RestartPolicySet(ONE, NEVER))
+    report, settled = one.step(RestartPolicySet(ONE, NEVER))
     assert states([report]) == [STATE.FAILED]
-    assert settled == reducer.Settle(ONE, NEVER)
-    replaced = reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.FAILED),))
-    assert reducer.Settle(ONE, NEVER) in one.step(replaced)
+    assert settled == slave_commands.Settle(ONE, NEVER)
+    replaced = SupervisorReplaced((InstanceStatus(ONE, STATE.FAILED),))
+    assert slave_commands.Settle(ONE, NEVER) in one.step(replaced)
 
 
 def test_a_restart_policy_of_a_stranger_is_refused() -> None:
     """The order is refused also if only a killed supervisor could have known the instance."""
     one = Slave()
-    (settled,) = one.step(reducer.RestartPolicySet(ONE, NEVER))
+    (settled,) = one.step(RestartPolicySet(ONE, NEVER))
     assert "p#1 is not known here" in settled.refusal
     one = running()
-    one.step(reducer.RestartPolicySet(ONE, NEVER))
-    settled = one.step(reducer.SupervisorReplaced(()))[0]
-    assert isinstance(settled, reducer.Settle)
+    one.step(RestartPolicySet(ONE, NEVER))
+    settled = one.step(SupervisorReplaced(()))[0]
+    assert isinstance(settled, slave_commands.Settle)
     assert settled.refusal
 
 
@@ -395,24 +418,24 @@ def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
     one = running()
     one.state.max_processes = 1
     shadow = Assignment(InstanceId("p", 2), PLAIN, 1, "p_1700000000", shadow=True)
-    one.step(reducer.AssignmentsReceived((shadow,)))
-    _, settled = one.step(reducer.RestartPolicySet(InstanceId("p", 2), ON_FAILURE))
-    assert settled == reducer.Settle(InstanceId("p", 2), ON_FAILURE)
-    (launch,) = [c for c in one.step(told(STATE.EXITED)) if isinstance(c, reducer.Launch)]
+    one.step(AssignmentsReceived((shadow,)))
+    _, settled = one.step(RestartPolicySet(InstanceId("p", 2), ON_FAILURE))
+    assert settled == slave_commands.Settle(InstanceId("p", 2), ON_FAILURE)
+    (launch,) = [c for c in one.step(told(STATE.EXITED)) if isinstance(c, slave_commands.Launch)]
     (assignment,) = launch.assignments
     assert assignment.spec.restart == ON_FAILURE
     assert not assignment.shadow
 
 
-def nodes(count: int) -> reducer.AssignmentsReceived:
+def nodes(count: int) -> AssignmentsReceived:
     specs = [replace(NODE, name=f"n{number}") for number in range(count)]
-    return reducer.AssignmentsReceived(
+    return AssignmentsReceived(
         tuple(Assignment(InstanceId(spec.name, 1), spec, 1, spec.name) for spec in specs)
     )
 
 
 def launched(commands) -> list[str]:
-    launches = [one for one in commands if isinstance(one, reducer.Launch)]
+    launches = [one for one in commands if isinstance(one, slave_commands.Launch)]
     return [one.instance.process for launch in launches for one in launch.assignments]
 
 
@@ -424,7 +447,7 @@ def test_so_many_are_started_at_a_time(one) -> None:
     assert states(commands) == [STATE.HELD, STATE.HELD]
     assert "max_starting: 2" in one.of("n2").status.message
     assert launched(one.step(told(STATE.RUNNING, "n0", pid=5))) == []
-    assert launched(one.step(reducer.SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
+    assert launched(one.step(SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
 
 
 def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
@@ -433,7 +456,7 @@ def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
     one.step(nodes(3))
     assert launched(one.step(told(STATE.FAILED, "n0", exit_code=1))) == ["n1"]
     one.step(told(STATE.RUNNING, "n1", pid=5))
-    assert one.step(reducer.TimePassed(), after=11.0) == [reducer.Stop(InstanceId("n1", 1))]
+    assert one.step(TimePassed(), after=11.0) == [slave_commands.Stop(InstanceId("n1", 1))]
     assert launched(one.step(told(STATE.STOPPING, "n1", pid=5))) == ["n2"]
 
 
@@ -448,11 +471,11 @@ def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
 def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
     """The supervisor never records it, but the master still receives an answer."""
     one = running()
-    one.step(reducer.Registered(1))
-    one.step(reducer.RestartPolicySet(ONE, NEVER))
+    one.step(Registered(1))
+    one.step(RestartPolicySet(ONE, NEVER))
     one.step(told(STATE.EXITED))
-    commands = one.step(reducer.TimePassed(), after=100.0)
-    assert reducer.Settle(ONE, NEVER) in commands
+    commands = one.step(TimePassed(), after=100.0)
+    assert slave_commands.Settle(ONE, NEVER) in commands
 
 
 def test_stop_and_restart_go_to_the_supervisor(one) -> None:
@@ -460,12 +483,12 @@ def test_stop_and_restart_go_to_the_supervisor(one) -> None:
     instance = InstanceId("p", 1)
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
-    assert one.step(reducer.RestartOrdered(instance)) == [reducer.Restart(instance)]
-    assert one.step(reducer.StopOrdered(instance)) == [reducer.Stop(instance)]
+    assert one.step(RestartOrdered(instance)) == [slave_commands.Restart(instance)]
+    assert one.step(StopOrdered(instance)) == [slave_commands.Stop(instance)]
     one.step(told(STATE.EXITED))
-    assert states(one.step(reducer.StopOrdered(instance))) == [STATE.EXITED]
-    assert states(one.step(reducer.RestartOrdered(instance))) == [STATE.EXITED]
-    assert one.step(reducer.RestartOrdered(InstanceId("q", 2))) == []
+    assert states(one.step(StopOrdered(instance))) == [STATE.EXITED]
+    assert states(one.step(RestartOrdered(instance))) == [STATE.EXITED]
+    assert one.step(RestartOrdered(InstanceId("q", 2))) == []
 
 
 def test_a_complete_report_names_everything(one) -> None:
@@ -473,7 +496,7 @@ def test_a_complete_report_names_everything(one) -> None:
     one.step(assigned())
     one.step(assigned(number=2))
     one.step(told(STATE.EXITED))
-    (report,) = one.step(reducer.ReportRequested())
+    (report,) = one.step(ReportRequested())
     assert report.complete
     assert {s.instance.number: s.state for s in report.statuses} == {
         1: STATE.EXITED, 2: STATE.STARTING,
@@ -501,7 +524,7 @@ def test_who_may_ask_for_work(usage, present, stale, under) -> None:
     values[: len(usage)] = usage
     limit = np.ones(16, np.float32)
     limit[1] = 0.5
-    assert reducer.under_limits(values, limit, present, stale) is under
+    assert under_limits(values, limit, present, stale) is under
 
 
 # --- any order of events ----------------------------------------------------------------------
@@ -519,7 +542,7 @@ class AnySlave(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.state = reducer.SlaveState()
+        self.state = SlaveState()
         self.now = 0.0
         self.launched: list[InstanceId] = []
         self.alive: dict[InstanceId, InstanceState] = {}
@@ -531,27 +554,27 @@ class AnySlave(RuleBasedStateMachine):
 
     def feed(self, event) -> None:
         for command in reducer.step(self.state, event, self.now):
-            if isinstance(command, reducer.Launch):
+            if isinstance(command, slave_commands.Launch):
                 for assignment in command.assignments:
                     self.check_fence(assignment)
                     self.launched.append(assignment.instance)
                     self.alive[assignment.instance] = STATE.STARTING
-            elif isinstance(command, reducer.Report):
+            elif isinstance(command, slave_commands.Report):
                 for status in command.statuses:
                     self.reported[status.instance] = status.state
-            elif isinstance(command, (reducer.Stop, reducer.Fence)):
+            elif isinstance(command, (slave_commands.Stop, slave_commands.Fence)):
                 assert command.instance in self.alive, "a stop of what does not run"
                 self.stopped.add(command.instance)
-            elif isinstance(command, reducer.Fail):
+            elif isinstance(command, slave_commands.Fail):
                 runs = self.alive.get(command.instance) is STATE.RUNNING
                 assert runs, "a run failed that does not run"
                 assert command.pid == 7, "another run than the one that was looked at"
-            elif isinstance(command, reducer.Amend):
+            elif isinstance(command, slave_commands.Amend):
                 assert command.instance in self.alive, "a policy for what does not run"
                 self.amending.append((command.instance, command.restart))
-            elif isinstance(command, reducer.Settle):
+            elif isinstance(command, slave_commands.Settle):
                 self.unsettled.discard((command.instance, command.restart))
-            elif isinstance(command, reducer.Forget):
+            elif isinstance(command, slave_commands.Forget):
                 assert not self.alive.keys() & set(command.instances), "a live one forgotten"
 
     def check_fence(self, assignment) -> None:
@@ -566,34 +589,34 @@ class AnySlave(RuleBasedStateMachine):
     @rule(ago=st.sampled_from([0.0, 0.0, 0.05, 3.0]))
     def hear(self, ago) -> None:
         self.heard_at = max(self.heard_at, self.now - ago)
-        self.feed(reducer.MasterHears(self.now - ago))
+        self.feed(MasterHears(self.now - ago))
 
     @rule(spec=SPECS, number=NUMBERS)
     def fence(self, spec, number) -> None:
-        self.feed(reducer.FenceOrdered(InstanceId(spec.name, number)))
+        self.feed(FenceOrdered(InstanceId(spec.name, number)))
 
     @rule(epoch=st.integers(1, 3))
     def register(self, epoch) -> None:
-        self.feed(reducer.Registered(epoch))
+        self.feed(Registered(epoch))
 
     @rule(spec=SPECS, number=NUMBERS)
     def stop(self, spec, number) -> None:
-        self.feed(reducer.StopOrdered(InstanceId(spec.name, number)))
+        self.feed(StopOrdered(InstanceId(spec.name, number)))
 
     @rule(spec=SPECS, number=NUMBERS)
     def restart(self, spec, number) -> None:
-        self.feed(reducer.RestartOrdered(InstanceId(spec.name, number)))
+        self.feed(RestartOrdered(InstanceId(spec.name, number)))
 
     @rule(spec=SPECS, number=NUMBERS, restart=st.sampled_from([NEVER, ON_FAILURE]))
     def set_restart(self, spec, number, restart) -> None:
         instance = InstanceId(spec.name, number)
         self.unsettled.add((instance, restart))
-        self.feed(reducer.RestartPolicySet(instance, restart))
+        self.feed(RestartPolicySet(instance, restart))
 
     @precondition(lambda self: self.amending)
     @rule()
     def record(self) -> None:
-        self.feed(reducer.RestartPolicyRecorded(*self.amending.pop(0)))
+        self.feed(RestartPolicyRecorded(*self.amending.pop(0)))
 
     @rule(hears=st.booleans())
     def replace_supervisor(self, hears) -> None:
@@ -602,11 +625,11 @@ class AnySlave(RuleBasedStateMachine):
             self.amending.clear()
         found = (InstanceStatus(one, state, 7) for one, state in self.alive.items())
         ended = (h.status for h in self.state.held.values() if h.status.state.ended)
-        self.feed(reducer.SupervisorReplaced((*found, *ended)))
+        self.feed(SupervisorReplaced((*found, *ended)))
 
     @rule(spec=SPECS, number=NUMBERS)
     def see(self, spec, number) -> None:
-        self.feed(reducer.SeenInGraph(InstanceId(spec.name, number)))
+        self.feed(SeenInGraph(InstanceId(spec.name, number)))
 
     @rule(number=NUMBERS, pid=st.sampled_from([7, 7, 7, 8]), runs=st.booleans())
     def look(self, number, pid, runs) -> None:
@@ -614,19 +637,19 @@ class AnySlave(RuleBasedStateMachine):
         instance = InstanceId(WATCHED.name, number)
         if runs and instance in self.alive:
             self.alive[instance] = STATE.RUNNING
-            self.feed(reducer.SupervisorReported((InstanceStatus(instance, STATE.RUNNING, 7),)))
+            self.feed(SupervisorReported((InstanceStatus(instance, STATE.RUNNING, 7),)))
         for _ in range(5):
-            self.now += reducer.LOOK_PERIOD
-            self.feed(reducer.LookedAt(instance, pid, reducer.Look(stopped=True)))
+            self.now += LOOK_PERIOD
+            self.feed(LookedAt(instance, pid, Look(stopped=True)))
 
     @rule(seconds=st.sampled_from([0.1, 5.0, 11.0, 61.0]))
     def wait(self, seconds) -> None:
         self.now += seconds
-        self.feed(reducer.TimePassed())
+        self.feed(TimePassed())
 
     @rule()
     def report(self) -> None:
-        self.feed(reducer.ReportRequested())
+        self.feed(ReportRequested())
 
     @precondition(lambda self: self.alive)
     @rule(data=st.data(), state=st.sampled_from(InstanceState))
@@ -639,7 +662,7 @@ class AnySlave(RuleBasedStateMachine):
         else:
             self.alive[instance] = state
         pid = 7 if state in (STATE.RUNNING, STATE.STOPPING) else 0
-        self.feed(reducer.SupervisorReported((InstanceStatus(instance, state, pid),)))
+        self.feed(SupervisorReported((InstanceStatus(instance, state, pid),)))
 
     @invariant()
     def nothing_is_launched_twice(self) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from types import SimpleNamespace
 
 import pytest
 
-from rosrm.core.slave import reducer as core
+from rosrm.core.slave.state import Held, SlaveState
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, ProcessSpec, StopPolicy
 from rosrm.slave import shutdown
 from rosrm.slave.shutdown import Ending
@@ -17,27 +18,30 @@ STOP = StopPolicy(interrupt_grace=1.0, terminate_grace=1.0)
 class Slave:
     """End of a slave with two processes and a supervisor controlled by the test."""
 
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.said: list[str] = []
+    def __init__(self, log) -> None:
+        self.now, self.log = 100.0, log
         self.when_stopped = lambda: None
         self.endpoint = SimpleNamespace(
             failure="", superseded=False, leave=lambda done, _kept: done(),
             wait_until_heard=lambda: None,
         )  # fmt: skip
-        self.state = core.SlaveState()
+        self.state = SlaveState()
         for name in "pq":
             self.report(name, InstanceState.RUNNING)
         self.ending = Ending(
             SimpleNamespace(host="h0", on_stop="stop"), self.state,
             SimpleNamespace(close=lambda: None, has_begun=lambda _instance: True),
             SimpleNamespace(pid=7, shut_down=self.shut_down),
-            self.endpoint, serve=self.serve, say=self.said.append,
+            self.endpoint, serve=self.serve,
         )  # fmt: skip
 
     def serve(self, goes_on) -> None:
         while goes_on():
             self.now += 1.0
+
+    @property
+    def said(self) -> list[str]:
+        return [one.getMessage() for one in self.log.records if one.levelno == logging.INFO]
 
     def shut_down(self) -> None:
         self.when_stopped()
@@ -45,15 +49,16 @@ class Slave:
     def report(self, name: str, state: InstanceState) -> None:
         instance = InstanceId(name, 1)
         spec = ProcessSpec(name, command=("sleep",), stop=STOP)
-        self.state.held[instance] = core.Held(InstanceStatus(instance, state), spec)
+        self.state.held[instance] = Held(InstanceStatus(instance, state), spec)
 
     def end(self) -> int:
         return self.ending.carry_out("SIGINT")
 
 
 @pytest.fixture
-def slave(monkeypatch) -> Slave:
-    slave = Slave()
+def slave(monkeypatch, caplog) -> Slave:
+    caplog.set_level(logging.INFO)
+    slave = Slave(caplog)
     monkeypatch.setattr(shutdown, "time", SimpleNamespace(monotonic=lambda: slave.now))
     return slave
 

@@ -16,7 +16,7 @@ from rosrm.core.master.events import BAD_RESULT
 from rosrm.errors import CriuError, Refused
 from rosrm.extensions.plugin_calls import WORKS_AFTER
 from rosrm.extensions.registry import OfferedExecutor
-from rosrm.slave.executors import UNABLE, Executors, Here
+from rosrm.slave.executors import Executors, Here
 from rosrm.testing import FakeClock
 
 HERE = Here("alpha", Path("/state"), {})
@@ -35,9 +35,7 @@ class Rig:
     def run(self, timeout=60.0) -> list[tuple[str, str, str]]:
         """Run the executor until it calls the loop back; return the settled results."""
         outcomes = []
-        self.executors.execute(
-            "wait", {}, timeout, here=HERE, done=lambda *outcome: outcomes.append(outcome)
-        )
+        self.executors.execute("wait", {}, timeout, here=HERE, done=outcomes.append)
         self.posted.get(timeout=10.0)()
         return outcomes
 
@@ -81,7 +79,7 @@ def test_an_error_of_rosrm_is_the_whole_message() -> None:
     def fails(_arguments) -> None:
         raise CriuError("no CRIU here: install it")
 
-    assert outcome(fails) == (UNABLE, "no CRIU here: install it", "")
+    assert outcome(fails) == ("unable", "no CRIU here: install it", "")
 
 
 @pytest.mark.parametrize(
@@ -137,7 +135,7 @@ def test_a_refusal_by_an_executor_is_an_answer_and_no_failure(answer) -> None:
 
     rig = Rig(refuses)
     ((code, message, _),) = rig.run()
-    assert (code, str(answer) in message) == (UNABLE, True)
+    assert (code, str(answer) in message) == ("unable", True)
     assert rig.executors.failing == {}
 
 

@@ -8,8 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.core.slave import reducer
-from rosrm.core.slave.health import Judgement, resolve, watch_of
+from rosrm.core.slave import events, reducer
+from rosrm.core.slave.commands import Command, Fail, Remember
+from rosrm.core.slave.health import LOOK_PERIOD, Judgement, resolve, watch_of
+from rosrm.core.slave.state import SlaveState
+from rosrm.core.slave.watches import Awaited, Look, Memo, Watch
 from rosrm.model.values import (
     Assignment,
     Health,
@@ -26,7 +29,7 @@ SPEC = ProcessSpec("lidar", module="m", ros=True, namespace="/robot", health=SCA
 LIDAR = InstanceId("lidar", 1)
 
 
-def watched(health: Health = SCAN, **more) -> reducer.Watch:
+def watched(health: Health = SCAN, **more) -> Watch:
     watch = watch_of(Assignment(LIDAR, replace(SPEC, health=health), 1, "lidar", **more))
     assert watch is not None
     return watch
@@ -52,7 +55,7 @@ class Node:
             if rate is not None:
                 said = int((self.now - begun) * rate + 1e-9)
                 heard, told = said - told, said
-            verdict = self.judgement.look(reducer.Look(heard=heard, **look), self.now)
+            verdict = self.judgement.look(Look(heard=heard, **look), self.now)
             if verdict:
                 return verdict
         return ""
@@ -196,7 +199,7 @@ def test_under_an_alias_names_are_those_that_others_see() -> None:
     """A node that does not know rosrm uses the alias, so names below the alias resolve, too."""
     spec = replace(SPEC, health=Health("~/scan", 5.0, "active", 4.0))
     watch = watch_of(Assignment(InstanceId("lidar", 2), spec, 1, "lidar_17", shadow=True))
-    assert watch == reducer.Watch(
+    assert watch == Watch(
         spec.health,
         ("/robot/lidar/scan", "/robot/lidar_17/scan"),
         ("/robot/lidar/get_state", "/robot/lidar_17/get_state"),
@@ -217,25 +220,25 @@ class Slave:
     """Slave that holds one plain process with a health check."""
 
     def __init__(self, shadow: bool = False) -> None:
-        self.state = reducer.SlaveState(registered=True)
+        self.state = SlaveState(registered=True)
         self.now = 0.0
         restart = RestartPolicy("always")
         spec = ProcessSpec("lidar", command=("true",), health=PLAIN, restart=restart)
-        self.step(reducer.AssignmentsReceived((Assignment(LIDAR, spec, 1, "lidar", shadow),)))
+        self.step(events.AssignmentsReceived((Assignment(LIDAR, spec, 1, "lidar", shadow),)))
 
-    def step(self, event) -> list[reducer.Command]:
+    def step(self, event) -> list[Command]:
         return list(reducer.step(self.state, event, self.now))
 
     def runs(self, pid: int) -> None:
         status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=pid)
-        self.step(reducer.SupervisorReported((status,)))
+        self.step(events.SupervisorReported((status,)))
 
-    def looks(self, seconds: float, pid: int, **look) -> list[reducer.Command]:
+    def looks(self, seconds: float, pid: int, **look) -> list[Command]:
         """Return the first orders within this time."""
         ordered, until = [], self.now + seconds
         while self.now < until and not ordered:
-            self.now += reducer.LOOK_PERIOD
-            ordered = self.step(reducer.LookedAt(LIDAR, pid, reducer.Look(**look)))
+            self.now += LOOK_PERIOD
+            ordered = self.step(events.LookedAt(LIDAR, pid, Look(**look)))
         return ordered
 
 
@@ -245,7 +248,7 @@ def test_an_unhealthy_run_is_ended_as_failed() -> None:
     one.runs(5)
     for _ in range(2):
         (fail,) = one.looks(10.0, 5, stopped=True)
-        assert isinstance(fail, reducer.Fail)
+        assert isinstance(fail, Fail)
         assert (fail.instance, fail.pid, fail.kill) == (LIDAR, 5, True)
 
 
@@ -254,7 +257,7 @@ def test_a_restart_begins_anew() -> None:
     one = Slave()
     one.runs(5)
     assert one.looks(3.0, 5, stopped=True) == []
-    one.step(reducer.SupervisorReported((InstanceStatus(LIDAR, InstanceState.BACKOFF),)))
+    one.step(events.SupervisorReported((InstanceStatus(LIDAR, InstanceState.BACKOFF),)))
     assert one.state.watched() == {}
     assert one.looks(10.0, 5, stopped=True) == []
     one.runs(6)
@@ -269,12 +272,12 @@ def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
     one.runs(5)
     assert one.state.watched() == {}
     assert one.looks(10.0, 5, stopped=True) == []
-    commands = one.step(reducer.RestartPolicySet(LIDAR, RestartPolicy("always")))
-    (memo,) = [command.memo for command in commands if isinstance(command, reducer.Remember)]
+    commands = one.step(events.RestartPolicySet(LIDAR, RestartPolicy("always")))
+    (memo,) = [command.memo for command in commands if isinstance(command, Remember)]
     assert list(one.state.watched()) == [LIDAR]
-    later = reducer.SlaveState(registered=True)
+    later = SlaveState(registered=True)
     status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=5)
-    reducer.step(later, reducer.SupervisorReplaced((status,), {LIDAR: memo}), 0.0)
+    reducer.step(later, events.SupervisorReplaced((status,), {LIDAR: memo}), 0.0)
     assert list(later.watched()) == [LIDAR]
 
 
@@ -283,21 +286,21 @@ def test_what_is_being_moved_may_be_silent() -> None:
     one = Slave()
     one.runs(5)
     one.looks(3.0, 5, stopped=True)
-    one.step(reducer.RestartPolicySet(LIDAR, RestartPolicy("never")))
+    one.step(events.RestartPolicySet(LIDAR, RestartPolicy("never")))
     assert one.looks(20.0, 5, stopped=True) == []
-    one.step(reducer.RestartPolicySet(LIDAR, RestartPolicy("always")))
+    one.step(events.RestartPolicySet(LIDAR, RestartPolicy("always")))
     assert one.looks(3.0, 5, stopped=True) == []
     assert len(one.looks(3.0, 5, stopped=True)) == 1
 
 
 def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
     """The restart policy arrived before its start."""
-    state = reducer.SlaveState(registered=True, max_processes=1)
+    state = SlaveState(registered=True, max_processes=1)
     spec = ProcessSpec("lidar", command=("true",), health=PLAIN)
     other = Assignment(InstanceId("other", 2), replace(spec, name="other"), 1, "other")
     shadow = Assignment(LIDAR, spec, 1, "lidar_1", shadow=True)
-    reducer.step(state, reducer.AssignmentsReceived((other, shadow)), 0.0)
-    reducer.step(state, reducer.RestartPolicySet(LIDAR, RestartPolicy("always")), 0.0)
+    reducer.step(state, events.AssignmentsReceived((other, shadow)), 0.0)
+    reducer.step(state, events.RestartPolicySet(LIDAR, RestartPolicy("always")), 0.0)
     watch = state.held[LIDAR].watch
     assert watch is not None
     assert not watch.paused
@@ -305,11 +308,11 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
 
 @given(
     st.builds(
-        reducer.Memo,
-        st.none() | st.builds(reducer.Awaited, st.text(), st.floats(0, 1e6), st.integers(0, 99)),
+        Memo,
+        st.none() | st.builds(Awaited, st.text(), st.floats(0, 1e6), st.integers(0, 99)),
         st.none()
         | st.builds(
-            reducer.Watch,
+            Watch,
             st.builds(Health, st.text(), st.floats(0, 1e4), st.text(), st.floats(0.1, 1e6)),
             st.lists(st.text()).map(tuple), st.lists(st.text()).map(tuple), st.booleans(),
             st.booleans(),
@@ -319,5 +322,5 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
 def test_a_memo_survives_the_way(memo) -> None:
     """A later run of the slave reads the same memo; an empty memo is not written."""
     text = to_memo(memo)
-    assert (from_memo(text) or reducer.Memo()) == memo
-    assert bool(text) == (memo != reducer.Memo())
+    assert (from_memo(text) or Memo()) == memo
+    assert bool(text) == (memo != Memo())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import stat
@@ -15,6 +16,7 @@ import pytest
 from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm.ros.slave.replication import NotStored
 from rosrm.slave.replication import fetch
 from rosrm.slave.replication.service import Keeping
 from rosrm.snapshots import Block, Part, SlotWriter
@@ -42,7 +44,7 @@ class Wire:
     def give(self, host, part, now, timeout, done) -> None:
         self.given.append(part)
         if host in self.net.silent:
-            self.net.unanswered.append(lambda: done("timeout", "no answer"))
+            self.net.unanswered.append(lambda: done(NotStored("timeout", "no answer")))
         else:
             self.net.slaves[host].take_part(part, done)
 
@@ -65,24 +67,22 @@ class Net:
     Attributes:
         hidden: hosts that discovery does not find.
         silent: hosts that do not answer.
-        said: messages to the user, by host.
         told: reports to the master, by host.
     """
 
-    def __init__(self, tmp_path) -> None:
-        self.root = tmp_path
+    def __init__(self, tmp_path, log) -> None:
+        self.root, self.log = tmp_path, log
         self.posted: queue.Queue[Callable[[], None]] = queue.Queue()
         self.slaves: dict[str, Keeping] = {}
         self.wires: dict[str, Wire] = {}
         self.hidden: set[str] = set()
         self.silent: set[str] = set()
         self.unanswered: list[Callable[[], None]] = []
-        self.said: dict[str, list[str]] = {}
         self.told: dict[str, list] = {}
         self.now = time.monotonic()
 
     def add(self, name: str, **settings) -> Keeping:
-        self.said[name], self.told[name] = [], []
+        self.told[name] = []
         wire = self.wires[name] = Wire(self, name)
 
         def publish(states) -> bool:
@@ -91,7 +91,7 @@ class Net:
 
         self.slaves[name] = Keeping(
             self.root / name, name, KeepSettings(**settings), wire,
-            post=self.posted.put, say=self.said[name].append, publish=publish,
+            post=self.posted.put, publish=publish,
         )  # fmt: skip
         return self.slaves[name]
 
@@ -133,8 +133,9 @@ class Net:
 
 
 @pytest.fixture
-def net(tmp_path):
-    return Net(tmp_path)
+def net(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    return Net(tmp_path, caplog)
 
 
 def assignment(*kept_on: str, kept_from: int = 1, number: int = 9, **fields) -> Assignment:
@@ -205,7 +206,7 @@ def test_who_does_not_answer_is_tried_again_and_named_once(net):
     net.until(lambda: net.age("c") == (7, 1), "the copy on c")
     for _ in range(100):
         net.pass_time(0.1)
-    assert net.said["a"] == ["b does not keep the state of p#7: no answer"]
+    assert net.log.messages == ["b does not keep the state of p#7: no answer"]
     net.silent.clear()
     net.until(lambda: net.age("b") == (7, 1), "the copy on b")
 
@@ -219,7 +220,7 @@ def test_a_newer_state_there_is_left_alone(net):
     for _ in range(20):
         net.pass_time(0.1)
     assert net.age("b") == (8, 1)
-    assert net.said["a"] == []
+    assert net.log.messages == []
 
 
 def test_the_state_of_a_successor_is_not_sent_back(net):
@@ -244,8 +245,8 @@ def test_room_is_bounded(net):
     net.write("a", 1, 9_000)
     net.until(lambda: net.age("b") == (7, 1), "the first state")
     net.write("a", 2, 20_000)
-    net.until(lambda: net.said["a"], "a word about it")
-    assert "keep.max_bytes" in net.said["a"][0]
+    net.until(lambda: net.log.messages, "a word about it")
+    assert "keep.max_bytes" in net.log.messages[0]
     assert net.age("b") == (7, 1)
 
 
@@ -256,9 +257,9 @@ def test_a_state_that_is_damaged_on_its_way_is_refused(net):
     good = snapshots.newest_content(net.directory("b"))[1]
     answers = []
     part = Part("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
-    taker.take_part(part, lambda *answer: answers.append(answer))
+    taker.take_part(part, answers.append)
     net.settle()
-    assert answers[0][0] == "damaged"
+    assert answers[0].code == "damaged"
     assert net.age("b") == (6, 1)
     assert not (net.directory("b") / "copy.new").exists()
 
@@ -267,9 +268,9 @@ def test_parts_out_of_order_begin_anew(net):
     """A part was lost, or two senders send at the same time."""
     taker = net.add("b")
     answers = []
-    taker.take_part(Part("p", 7, 5, 100, 200, 0, b"x" * 50), lambda *a: answers.append(a))
+    taker.take_part(Part("p", 7, 5, 100, 200, 0, b"x" * 50), answers.append)
     net.settle()
-    assert answers[0][0] == "order"
+    assert answers[0].code == "order"
 
 
 def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
@@ -359,7 +360,7 @@ def test_a_start_fetches_the_newest_state(net):
     wanted = assignment("b")
     assert prepare(net, "a", wanted) == [wanted]
     assert net.age("a") == (7, 42)
-    assert "was fetched from b for p#9" in net.said["a"][0]
+    assert "was fetched from b for p#9" in net.log.messages[0]
 
 
 def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
@@ -379,13 +380,14 @@ def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
     net.add("a")
     net.add("b")
     prepare(net, "a", assignment("b"))
-    assert net.said["a"] == [
+    assert net.log.messages == [
         "no newer state for p#9, it starts from nothing: b: there is no such snapshot here"
     ]
     net.hidden.add("b")
     net.write("a", 5)
     prepare(net, "a", assignment("b"))
-    assert "it starts from cycle 5, which is here: b: its slave was not found" in net.said["a"][1]
+    second = net.log.messages[1]
+    assert "it starts from cycle 5, which is here: b: its slave was not found" in second
 
 
 def test_what_is_here_and_as_new_is_not_fetched(net):
@@ -444,7 +446,7 @@ def test_a_start_goes_on_though_looking_for_its_state_failed(net, monkeypatch):
     slave = net.add("a")
     monkeypatch.setattr(slave, "_look_for", lambda _: 1 / 0)
     prepare(net, "a", assignment())
-    assert "ZeroDivisionError" in net.said["a"][0]
+    assert "ZeroDivisionError" in net.log.messages[0]
 
 
 def test_a_start_that_is_called_off_does_not_happen(net):

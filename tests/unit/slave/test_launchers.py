@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -56,13 +57,12 @@ class Faulty(Restorer):
     prepare = discard_images = leads = has_departed = _raise
 
 
-def launchers(log=None, unusable=None, **made: Any) -> Launchers:
+def launchers(unusable=None, **made: Any) -> Launchers:
     """The strategy of a process has the name of its launcher."""
     return Launchers(
         {name: MadeLauncher(one, ()) for name, one in made.items()},
         unusable or {},
         lambda spec: Capabilities(launcher=spec.migration.strategy or ""),
-        (log if log is not None else []).append,
     )
 
 
@@ -131,15 +131,15 @@ def test_a_launcher_that_leads_a_session_names_its_members(tmp_path):
     assert (known.has_departed(10), known.has_departed(30)) == (True, False)
 
 
-def test_a_launcher_that_fails_leaves_an_instance_as_any_other():
+def test_a_launcher_that_fails_leaves_an_instance_as_any_other(caplog):
     """Its fault is logged once."""
-    log: list[str] = []
-    known = launchers(log, ours=Faulty())
+    caplog.set_level(logging.INFO)
+    known = launchers(ours=Faulty())
     for _ in range(2):
         assert known.leads(10) is False
         assert known.members(10) == (10,)
         assert known.root(10) == 10
-    (line,) = log
+    (line,) = caplog.messages
     assert "the launcher 'ours' fails: leads: RuntimeError: out of order" in line
     known.discard_images(InstanceId("p", 7))
     assert not known.has_departed(10)

@@ -13,9 +13,9 @@ from rosrm.ros.slave.services import LogQuery
 from rosrm.slave import logs
 from rosrm.slave.logs import newest_instance, read_log
 from rosrm.supervisor import log_index
-from rosrm.supervisor.client import LogLimits, log_path
+from rosrm.supervisor.client import log_path
 from rosrm.supervisor.log_index import Mark
-from rosrm.supervisor.logs import LogKeeper, rotate
+from rosrm.supervisor.logs import LogKeeper, LogLimits, rotate
 
 P = InstanceId("robot/p", 3)
 LINES = b"".join(b"line %d\n" % number for number in range(1000))

@@ -9,25 +9,29 @@ import signal
 
 import pytest
 
-from rosrm.core.supervisor import reducer as sv
+from rosrm.core.supervisor import events
+from rosrm.core.supervisor.commands import Signal, Unspawn
+from rosrm.core.supervisor.instance import BACKOFF, EXITED, FAILED, FENCED, REFUSED
+from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 
 ONE = ("one", 7)
-FENCE = sv.FenceRule(after=10.0, grace=3.0)
-GRACES = sv.StopRule(interrupt_grace=5.0, terminate_grace=10.0)
-ALWAYS = sv.RestartRule("always", delay=1.0)
+FENCE = FenceRule(after=10.0, grace=3.0)
+GRACES = StopRule(interrupt_grace=5.0, terminate_grace=10.0)
+ALWAYS = RestartRule("always", delay=1.0)
 
 
 def ordered(fence=FENCE, restart=ALWAYS, stop=GRACES, heard=None):
     """Return a state machine with a start order at time 0, and its instance."""
-    core = sv.Supervision()
-    core.handle(sv.StartOrdered(ONE, restart, stop, fence, heard), 0.0)
+    core = Supervision()
+    core.handle(events.StartOrdered(ONE, restart, stop, fence, heard), 0.0)
     return core, core.instances[ONE]
 
 
 def running(**options):
     """Return a state machine and its instance, which runs."""
     core, instance = ordered(**options)
-    core.handle(sv.Spawned(ONE, 100), 0.0)
+    core.handle(events.Spawned(ONE, 100), 0.0)
     return core, instance
 
 
@@ -35,11 +39,11 @@ def signals(core, until):
     """Return the signals sent until this time without other events, with their times."""
     sent = []
     while (due := core.deadline()) is not None and due <= until:
-        commands = core.handle(sv.TimePassed(), due)
+        commands = core.handle(events.TimePassed(), due)
         sent += [
             (round(due, 3), signal.Signals(command.number).name)
             for command in commands
-            if isinstance(command, sv.Signal)
+            if isinstance(command, Signal)
         ]
     return sent
 
@@ -51,37 +55,37 @@ def test_it_is_stopped_when_nobody_says_that_it_is_heard():
     why = "fenced: no confirmed contact with the master for 10 s; "
     steps = "SIGINT, SIGTERM after 1.0 s, SIGKILL after 3.0 s"
     assert instance.message == why + steps
-    core.handle(sv.Exited(ONE, signal=9), 13.5)
-    assert (instance.phase, instance.message) == (sv.FENCED, f"{why}stopped by {steps}")
+    core.handle(events.Exited(ONE, signal=9), 13.5)
+    assert (instance.phase, instance.message) == (FENCED, f"{why}stopped by {steps}")
     assert core.deadline() is None
 
 
 def test_its_own_graces_stay_where_they_are_short_enough():
     """Graces that are short enough allow the instance to end without haste."""
-    core, _ = running(stop=sv.StopRule(0.5, 0.5))
+    core, _ = running(stop=StopRule(0.5, 0.5))
     assert signals(core, 11.5) == [(10.0, "SIGINT"), (10.5, "SIGTERM"), (11.0, "SIGKILL")]
 
 
 def test_without_a_grace_it_is_killed():
-    core, _ = running(fence=sv.FenceRule(10.0, 0.0))
+    core, _ = running(fence=FenceRule(10.0, 0.0))
     assert signals(core, 10.0) == [(10.0, "SIGKILL")]
 
 
 def test_a_late_look_at_the_clock_kills():
     """The supervisor itself was stopped: an instance past its deadline gets no grace."""
     core, _ = running()
-    commands = core.handle(sv.TimePassed(), 20.0)
-    assert [c.number for c in commands if isinstance(c, sv.Signal)] == [signal.SIGKILL]
+    commands = core.handle(events.TimePassed(), 20.0)
+    assert [c.number for c in commands if isinstance(c, Signal)] == [signal.SIGKILL]
 
 
 def test_every_word_puts_it_off_from_when_it_was_true():
     """The deadline counts from the contact, not from the message; older ones have no effect."""
     core, _ = running()
-    core.handle(sv.Heard(8.0), 9.5)
+    core.handle(events.Heard(8.0), 9.5)
     assert core.deadline() == 18.0
-    core.handle(sv.Heard(7.0), 9.6)
+    core.handle(events.Heard(7.0), 9.6)
     assert core.deadline() == 18.0
-    core.handle(sv.Heard(99.0), 10.0)  # no master contact is possible at this future time
+    core.handle(events.Heard(99.0), 10.0)  # no master contact is possible at this future time
     assert core.deadline() == 20.0
 
 
@@ -96,10 +100,10 @@ def test_the_clock_begins_with_what_the_start_knows():
 def test_a_word_that_comes_after_it_has_begun_is_too_late():
     """Its successor may rely on its end."""
     core, instance = running()
-    core.handle(sv.TimePassed(), 10.0)
-    core.handle(sv.Heard(10.5), 10.5)
-    core.handle(sv.Exited(ONE), 10.6)
-    assert instance.phase == sv.FENCED
+    core.handle(events.TimePassed(), 10.0)
+    core.handle(events.Heard(10.5), 10.5)
+    core.handle(events.Exited(ONE), 10.6)
+    assert instance.phase == FENCED
 
 
 def test_one_without_a_fence_is_left_alone():
@@ -111,14 +115,14 @@ def test_one_without_a_fence_is_left_alone():
 def test_a_restart_by_policy_does_not_put_it_off():
     """The fence's deadline belongs to the host, not to the run."""
     core, instance = running()
-    core.handle(sv.Exited(ONE, 1), 5.0)
-    core.handle(sv.TimePassed(), 6.0)
-    core.handle(sv.Spawned(ONE, 101), 6.0)
+    core.handle(events.Exited(ONE, 1), 5.0)
+    core.handle(events.TimePassed(), 6.0)
+    core.handle(events.Spawned(ONE, 101), 6.0)
     assert core.deadline() == 10.0
-    core.handle(sv.Exited(ONE, 1), 9.5)
-    assert instance.phase == sv.BACKOFF
-    core.handle(sv.TimePassed(), 10.0)
-    assert instance.phase == sv.FENCED
+    core.handle(events.Exited(ONE, 1), 9.5)
+    assert instance.phase == BACKOFF
+    core.handle(events.TimePassed(), 10.0)
+    assert instance.phase == FENCED
     assert instance.message.endswith("contact with the master for 10 s; "
                                      "it waited for its restart (exit code 1)")  # fmt: skip
 
@@ -126,45 +130,45 @@ def test_a_restart_by_policy_does_not_put_it_off():
 def test_a_start_that_waits_its_turn_is_given_up():
     """A start in progress is stopped as soon as it runs."""
     core, instance = ordered()
-    assert sv.Unspawn(ONE) in core.handle(sv.TimePassed(), 10.0)
-    core.handle(sv.SpawnFailed(ONE, ""), 10.0)
-    assert instance.phase == sv.FENCED
+    assert Unspawn(ONE) in core.handle(events.TimePassed(), 10.0)
+    core.handle(events.SpawnFailed(ONE, ""), 10.0)
+    assert instance.phase == FENCED
     core, instance = ordered()
-    core.handle(sv.TimePassed(), 10.0)
-    assert sv.Signal(ONE, signal.SIGINT) in core.handle(sv.Spawned(ONE, 100), 10.1)
+    core.handle(events.TimePassed(), 10.0)
+    assert Signal(ONE, signal.SIGINT) in core.handle(events.Spawned(ONE, 100), 10.1)
     core, instance = ordered()
-    core.handle(sv.TimePassed(), 10.0)
-    assert sv.Signal(ONE, signal.SIGKILL) in core.handle(sv.Spawned(ONE, 100), 13.1)
+    core.handle(events.TimePassed(), 10.0)
+    assert Signal(ONE, signal.SIGKILL) in core.handle(events.Spawned(ONE, 100), 13.1)
 
 
 def test_a_stop_under_way_becomes_as_short():
     """The user ordered the stop before the fence, so the status stays "stopped"."""
-    core, instance = running(stop=sv.StopRule(30.0, 30.0))
-    core.handle(sv.StopOrdered(ONE), 9.0)
+    core, instance = running(stop=StopRule(30.0, 30.0))
+    core.handle(events.StopOrdered(ONE), 9.0)
     assert signals(core, 13.0) == [(11.5, "SIGTERM"), (13.0, "SIGKILL")]
-    core.handle(sv.Exited(ONE, signal=9), 13.1)
-    assert (instance.phase, instance.message[:10]) == (sv.EXITED, "stopped by")
+    core.handle(events.Exited(ONE, signal=9), 13.1)
+    assert (instance.phase, instance.message[:10]) == (EXITED, "stopped by")
 
 
 def test_a_restart_under_way_becomes_an_end():
     core, instance = running()
-    core.handle(sv.RestartOrdered(ONE), 9.0)
-    core.handle(sv.TimePassed(), 10.0)
-    core.handle(sv.RestartOrdered(ONE), 10.1)
-    core.handle(sv.Exited(ONE), 10.2)
-    assert instance.phase == sv.FENCED
+    core.handle(events.RestartOrdered(ONE), 9.0)
+    core.handle(events.TimePassed(), 10.0)
+    core.handle(events.RestartOrdered(ONE), 10.1)
+    core.handle(events.Exited(ONE), 10.2)
+    assert instance.phase == FENCED
 
 
 @pytest.mark.parametrize(
     ("code", "when", "phase"),
-    [(0, "on-failure", sv.EXITED), (1, "never", sv.FAILED), (1, "always", sv.FENCED)],
+    [(0, "on-failure", EXITED), (1, "never", FAILED), (1, "always", FENCED)],
 )
 def test_what_had_ended_by_itself_keeps_its_end(code, when, phase):
     """A job that completed before the fence has completed; it is not restarted."""
-    core, instance = running(restart=sv.RestartRule(when))
-    core.handle(sv.Exited(ONE, code, leftovers=True), 9.5)
-    core.handle(sv.TimePassed(), 10.0)
-    core.handle(sv.Cleared(ONE), 10.5)
+    core, instance = running(restart=RestartRule(when))
+    core.handle(events.Exited(ONE, code, leftovers=True), 9.5)
+    core.handle(events.TimePassed(), 10.0)
+    core.handle(events.Cleared(ONE), 10.5)
     assert instance.phase == phase
 
 
@@ -174,45 +178,45 @@ def test_what_had_ended_by_itself_keeps_its_end(code, when, phase):
 def test_the_order_to_fence_kills_what_runs():
     """The order holds with and without an own fence, and prevents a restart."""
     core, instance = running(fence=None)
-    assert core.handle(sv.FenceOrdered(ONE), 1.0)[-1] == sv.Signal(ONE, signal.SIGKILL)
-    core.handle(sv.Exited(ONE, signal=9), 1.1)
-    assert instance.phase == sv.FENCED
+    assert core.handle(events.FenceOrdered(ONE), 1.0)[-1] == Signal(ONE, signal.SIGKILL)
+    core.handle(events.Exited(ONE, signal=9), 1.1)
+    assert instance.phase == FENCED
     assert instance.message == "fenced: it has a successor; stopped by SIGKILL"
 
 
 def test_the_order_to_fence_kills_what_is_being_stopped():
     """One SIGKILL is enough."""
     core, instance = running()
-    core.handle(sv.StopOrdered(ONE), 1.0)
-    assert core.handle(sv.FenceOrdered(ONE), 1.5)[-1] == sv.Signal(ONE, signal.SIGKILL)
-    assert not any(isinstance(c, sv.Signal) for c in core.handle(sv.FenceOrdered(ONE), 1.6))
-    core.handle(sv.Exited(ONE, signal=9), 1.7)
+    core.handle(events.StopOrdered(ONE), 1.0)
+    assert core.handle(events.FenceOrdered(ONE), 1.5)[-1] == Signal(ONE, signal.SIGKILL)
+    assert not any(isinstance(c, Signal) for c in core.handle(events.FenceOrdered(ONE), 1.6))
+    core.handle(events.Exited(ONE, signal=9), 1.7)
     assert instance.message == "stopped by SIGINT, SIGKILL after 0.5 s"
 
 
 def test_the_order_to_fence_ends_what_waits():
     core, instance = running()
-    core.handle(sv.Exited(ONE, 1), 1.0)
-    core.handle(sv.FenceOrdered(ONE), 1.1)
-    assert instance.phase == sv.FENCED
+    core.handle(events.Exited(ONE, 1), 1.0)
+    core.handle(events.FenceOrdered(ONE), 1.1)
+    assert instance.phase == FENCED
     core, instance = ordered()
-    assert sv.Unspawn(ONE) in core.handle(sv.FenceOrdered(ONE), 0.1)
-    assert core.handle(sv.Spawned(ONE, 100), 0.2)[-1] == sv.Signal(ONE, signal.SIGKILL)
+    assert Unspawn(ONE) in core.handle(events.FenceOrdered(ONE), 0.1)
+    assert core.handle(events.Spawned(ONE, 100), 0.2)[-1] == Signal(ONE, signal.SIGKILL)
 
 
 def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
     """A late start is refused."""
-    core = sv.Supervision()
-    core.handle(sv.FenceOrdered(ONE), 0.0)
-    core.handle(sv.StartOrdered(ONE, ALWAYS, GRACES), 1.0)
-    assert core.instances[ONE].phase == sv.REFUSED
+    core = Supervision()
+    core.handle(events.FenceOrdered(ONE), 0.0)
+    core.handle(events.StartOrdered(ONE, ALWAYS, GRACES), 1.0)
+    assert core.instances[ONE].phase == REFUSED
 
 
 def test_what_is_fenced_on_its_way_out_is_not_restarted_on_order():
     """The instance had failed, and its policy was to decide; now it has a successor."""
-    core, instance = running(restart=sv.RestartRule("always"))
-    core.handle(sv.FailOrdered(ONE, instance.pid, "hung", False), 1.0)
-    core.handle(sv.FenceOrdered(ONE), 1.5)
-    core.handle(sv.RestartOrdered(ONE), 2.0)
-    core.handle(sv.Exited(ONE, signal=9), 2.5)
-    assert instance.phase == sv.FENCED
+    core, instance = running(restart=RestartRule("always"))
+    core.handle(events.FailOrdered(ONE, instance.pid, "hung", False), 1.0)
+    core.handle(events.FenceOrdered(ONE), 1.5)
+    core.handle(events.RestartOrdered(ONE), 2.0)
+    core.handle(events.Exited(ONE, signal=9), 2.5)
+    assert instance.phase == FENCED

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core.supervisor.reducer import Heard
+from rosrm.core.supervisor.events import Heard
 from rosrm.supervisor import lease_file
 
 

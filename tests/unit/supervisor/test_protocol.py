@@ -6,19 +6,17 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from rosrm.core.supervisor.reducer import (
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,
-    FenceRule,
     Forgotten,
     Heard,
     RestartOrdered,
-    RestartRule,
     ShutdownOrdered,
     StopOrdered,
-    StopRule,
 )
+from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 from rosrm.supervisor import json_lines as ls
 from rosrm.supervisor import messages
 from rosrm.supervisor.logs import LogLimits

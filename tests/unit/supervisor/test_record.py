@@ -8,19 +8,22 @@ import os
 
 import pytest
 
-from rosrm.core.supervisor import reducer as sv
+from rosrm.core.supervisor import events
+from rosrm.core.supervisor.instance import EXITED, Instance
+from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.rules import RestartRule, StopRule
 from rosrm.supervisor import instance_record as rc
 from rosrm.supervisor.messages import Amend, Launch
 
 TALKER = ("talker", 7)
-LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, sv.RestartRule(), sv.StopRule(), "memo")
+LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, RestartRule(), StopRule(), "memo")
 
 
 @pytest.fixture
 def core():
-    core = sv.Supervision()
-    core.handle(sv.StartOrdered(TALKER, sv.RestartRule("always"), sv.StopRule(1.0, 2.0)), 0.0)
-    core.handle(sv.Spawned(TALKER, 100), 0.0)
+    core = Supervision()
+    core.handle(events.StartOrdered(TALKER, RestartRule("always"), StopRule(1.0, 2.0)), 0.0)
+    core.handle(events.Spawned(TALKER, 100), 0.0)
     return core
 
 
@@ -35,8 +38,8 @@ def test_an_instance_comes_back_as_it_was(tmp_path, core, record):
     """State, launch, environment and start time of its leader are restored in every field."""
     recorded = rc.read(str(tmp_path))
     back, instance = recorded.instances[TALKER], core.instances[TALKER]
-    assert {name: getattr(back, name) for name in sv.Instance.__slots__} == {
-        name: getattr(instance, name) for name in sv.Instance.__slots__
+    assert {name: getattr(back, name) for name in Instance.__slots__} == {
+        name: getattr(instance, name) for name in Instance.__slots__
     }
     assert recorded.launches == {TALKER: LAUNCH}
     assert recorded.environments == {"base": {"A": "1"}}
@@ -47,7 +50,7 @@ def test_an_instance_comes_back_as_it_was(tmp_path, core, record):
 
 def test_an_amendment_counts_from_then_on(tmp_path, core, record):
     """A confirmed shadow has another policy and environment, also after compaction."""
-    amend = Amend(sv.AmendOrdered(TALKER, sv.RestartRule("on-failure")), {"ROSRM_SHADOW": None})
+    amend = Amend(events.AmendOrdered(TALKER, RestartRule("on-failure")), {"ROSRM_SHADOW": None})
     amended = LAUNCH.amended(amend)
     core.handle(amend.order, 1.0)
     record.launch(amended)
@@ -81,7 +84,7 @@ def test_a_launch_without_its_environment_is_compacted(tmp_path, core, record):
 def test_a_record_of_before_protocol_2_is_read(tmp_path, core):
     """Its launches had no memo, its instances no fault."""
     instance = core.instances[TALKER]
-    state = {name: getattr(instance, name) for name in sv.Instance.__slots__ if name != "fault"}
+    state = {name: getattr(instance, name) for name in Instance.__slots__ if name != "fault"}
     lines = [
         {"record": "header", "version": 1, "boot": "another"},
         {"record": "environment", "id": "base", "variables": {"A": "1"}},
@@ -102,12 +105,12 @@ def test_a_record_of_before_protocol_2_is_read(tmp_path, core):
 
 def test_the_last_line_counts(tmp_path, core, record):
     """Later states replace earlier ones; an ended instance needs its launch no more."""
-    core.handle(sv.StopOrdered(TALKER), 1.0)
-    core.handle(sv.Exited(TALKER, signal=2), 2.0)
+    core.handle(events.StopOrdered(TALKER), 1.0)
+    core.handle(events.Exited(TALKER, signal=2), 2.0)
     record.state(core.instances[TALKER], 0)
     record.flush()
     recorded = rc.read(str(tmp_path))
-    assert recorded.instances[TALKER].phase == sv.EXITED
+    assert recorded.instances[TALKER].phase == EXITED
     assert recorded.launches == {}
 
 
@@ -118,7 +121,7 @@ def test_the_forgotten_are_gone_but_stay_dead(tmp_path, record):
     recorded = rc.read(str(tmp_path))
     assert recorded.instances == {}
     assert recorded.dead == {"talker": 7}
-    core = sv.Supervision()
+    core = Supervision()
     core.dead.update(recorded.dead)
     record.rewrite(core, {}, {}, lambda key: 0)
     assert rc.read(str(tmp_path)).dead == {"talker": 7}
@@ -143,7 +146,7 @@ def full(*_):
 
 def test_a_full_disk_delays_and_says_so(tmp_path, core, record, monkeypatch):
     """Unwritten lines wait, and are written once there is room again."""
-    core.handle(sv.Exited(TALKER, 3), 2.0)
+    core.handle(events.Exited(TALKER, 3), 2.0)
     with monkeypatch.context() as patched:
         patched.setattr(os, "write", full)
         record.state(core.instances[TALKER], 0)
@@ -156,7 +159,7 @@ def test_a_full_disk_delays_and_says_so(tmp_path, core, record, monkeypatch):
 
 def test_a_write_in_part_is_finished_later(tmp_path, core, record, monkeypatch):
     """The disk took half a line: the other half follows, and the line is whole."""
-    core.handle(sv.Exited(TALKER, 3), 2.0)
+    core.handle(events.Exited(TALKER, 3), 2.0)
     write = os.write
     with monkeypatch.context() as patched:
         patched.setattr(os, "write", lambda file, data: write(file, data[:10]))
@@ -170,7 +173,7 @@ def test_a_write_in_part_is_finished_later(tmp_path, core, record, monkeypatch):
 
 def test_a_compaction_without_room_keeps_the_old_record(tmp_path, core, record, monkeypatch):
     """The old file stays, and pending lines are still appended to it."""
-    core.handle(sv.Exited(TALKER, 3), 2.0)
+    core.handle(events.Exited(TALKER, 3), 2.0)
     record.state(core.instances[TALKER], 0)
     with monkeypatch.context() as patched:
         patched.setattr(os, "write", full)

@@ -12,8 +12,40 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rosrm.core.supervisor import events, instances
-from rosrm.core.supervisor import reducer as sv
+from rosrm.core.supervisor import events, reducer
+from rosrm.core.supervisor.commands import Leave, Signal, Spawn, Tell, Unspawn
+from rosrm.core.supervisor.events import (
+    AmendOrdered,
+    Cleared,
+    ClientLost,
+    Exited,
+    FailOrdered,
+    FenceOrdered,
+    Forgotten,
+    Heard,
+    RestartOrdered,
+    ShutdownOrdered,
+    Spawned,
+    SpawnFailed,
+    StartOrdered,
+    StopOrdered,
+    TimePassed,
+)
+from rosrm.core.supervisor.instance import (
+    BACKOFF,
+    ENDED,
+    EXITED,
+    FAILED,
+    FENCED,
+    MOST_KILLS,
+    REFUSED,
+    RUNNING,
+    STARTING,
+    STOPPING,
+    WITHDRAWN,
+)
+from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
+from rosrm.core.supervisor.transitions import TRANSITIONS, backoff
 from rosrm.model import values
 from rosrm.supervisor import messages
 
@@ -27,26 +59,26 @@ def kinds(commands):
 
 def started(**policies):
     """Return a state machine with one running instance, started at time 0."""
-    core = sv.Supervision()
+    core = reducer.Supervision()
     core.handle(
-        sv.StartOrdered(
-            TALKER, policies.get("restart", sv.RestartRule()), policies.get("stop", sv.StopRule())
+        StartOrdered(
+            TALKER, policies.get("restart", RestartRule()), policies.get("stop", StopRule())
         ),
         0.0,
     )
-    core.handle(sv.Spawned(TALKER, 100), 0.0)
+    core.handle(Spawned(TALKER, 100), 0.0)
     return core, core.instances[TALKER]
 
 
 def test_policies_are_those_of_the_model():
     """The supervisor's light policies have the fields and defaults of the model's."""
     for light, heavy in (
-        (sv.RestartRule, values.RestartPolicy),
-        (sv.StopRule, values.StopPolicy),
+        (RestartRule, values.RestartPolicy),
+        (StopRule, values.StopPolicy),
     ):
         assert light._fields == tuple(field.name for field in dataclasses.fields(heavy))
         assert tuple(light()) == dataclasses.astuple(heavy())
-    assert sv.FenceRule._fields == tuple(field.name for field in dataclasses.fields(values.Fence))
+    assert FenceRule._fields == tuple(field.name for field in dataclasses.fields(values.Fence))
 
 
 def test_status_is_that_of_the_model():
@@ -54,11 +86,11 @@ def test_status_is_that_of_the_model():
     assert messages.Status._fields == tuple(
         field.name for field in dataclasses.fields(values.InstanceStatus)
     )
-    ours = {sv.STARTING, sv.RUNNING, sv.BACKOFF, sv.STOPPING, *sv.ENDED}
+    ours = {STARTING, RUNNING, BACKOFF, STOPPING, *ENDED}
     slaves = {"ready", "held"}  # the slave decides these
     theirs = {state.value for state in values.InstanceState} - slaves
     assert ours == theirs
-    assert {state.value for state in values.InstanceState if state.ended} == sv.ENDED
+    assert {state.value for state in values.InstanceState if state.ended} == ENDED
 
 
 def test_rules_stand_in_the_table_of_the_module():
@@ -66,47 +98,47 @@ def test_rules_stand_in_the_table_of_the_module():
 
     The phase "-" has the orders that may concern an unknown instance.
     """
-    table = re.findall(r"^    (\w+|-|)  +(\w+)  +\S", sv.__doc__, re.MULTILINE)
+    table = re.findall(r"^    (\w+|-|)  +(\w+)  +\S", reducer.__doc__, re.MULTILINE)
     documented, phase = [], ""
     for first, event in table[1:]:
         phase = first or phase
         documented.append((phase, event))
-    runs = {(row, event.__name__) for row, event in sv.TRANSITIONS}
-    runs |= {("-", event.__name__) for event in get_args(instances._OrderOfStranger)}
+    runs = {(row, event.__name__) for row, event in TRANSITIONS}
+    runs |= {("-", event.__name__) for event in get_args(reducer._OrderOfStranger)}
     runs |= {("ended", "Forgotten")}
     assert sorted(documented) == sorted(runs)
-    assert all(event.__name__ in sv.__doc__ for event in get_args(events.Event))
+    assert all(event.__name__ in reducer.__doc__ for event in get_args(events.Event))
 
 
 def test_start_is_recorded_before_it_is_tried():
     """The start is reported, and so recorded, before the spawn."""
-    core = sv.Supervision()
-    commands = core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 0.0)
+    core = reducer.Supervision()
+    commands = core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 0.0)
     assert kinds(commands) == ["Tell", "Spawn"]
 
 
 def test_repeated_start_only_tells_again():
     """DDS repeats messages: a start of a known instance spawns nothing."""
     core, _ = started()
-    commands = core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 1.0)
+    commands = core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 1.0)
     assert kinds(commands) == ["Tell"]
 
 
 def test_late_start_of_a_stopped_stranger_is_refused():
     """A stop that overtakes its start wins."""
-    core = sv.Supervision()
-    core.handle(sv.StopOrdered(TALKER), 0.0)
-    core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 1.0)
-    assert core.instances[TALKER].phase == sv.REFUSED
+    core = reducer.Supervision()
+    core.handle(StopOrdered(TALKER), 0.0)
+    core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 1.0)
+    assert core.instances[TALKER].phase == REFUSED
 
 
 @pytest.mark.parametrize(("number", "starts"), [(6, False), (7, False), (8, True)])
 def test_forgotten_numbers_never_start(number, starts):
     """A forgotten instance and the older ones of its process are refused."""
     core, _ = started()
-    core.handle(sv.Exited(TALKER), 1.0)
-    core.handle(sv.Forgotten(TALKER), 2.0)
-    order = sv.StartOrdered(("talker", number), sv.RestartRule(), sv.StopRule())
+    core.handle(Exited(TALKER), 1.0)
+    core.handle(Forgotten(TALKER), 2.0)
+    order = StartOrdered(("talker", number), RestartRule(), StopRule())
     commands = core.handle(order, 3.0)
     assert ("Spawn" in kinds(commands)) is starts
 
@@ -114,41 +146,41 @@ def test_forgotten_numbers_never_start(number, starts):
 def test_what_runs_is_not_forgotten():
     """Only a final status can be forgotten."""
     core, instance = started()
-    assert kinds(core.handle(sv.Forgotten(TALKER), 1.0)) == ["Tell"]
-    assert instance.phase == sv.RUNNING
+    assert kinds(core.handle(Forgotten(TALKER), 1.0)) == ["Tell"]
+    assert instance.phase == RUNNING
 
 
 @pytest.mark.parametrize(
     ("when", "code", "phase"),
     [
-        ("never", 0, sv.EXITED),
-        ("never", 3, sv.FAILED),
-        ("on-failure", 0, sv.EXITED),
-        ("on-failure", 3, sv.BACKOFF),
-        ("always", 0, sv.BACKOFF),
-        ("always", 3, sv.BACKOFF),
+        ("never", 0, EXITED),
+        ("never", 3, FAILED),
+        ("on-failure", 0, EXITED),
+        ("on-failure", 3, BACKOFF),
+        ("always", 0, BACKOFF),
+        ("always", 3, BACKOFF),
     ],
 )
 def test_restart_policy(when, code, phase):
     """The restart policy decides the phase after an exit."""
-    core, instance = started(restart=sv.RestartRule(when=when))
-    core.handle(sv.Exited(TALKER, code), 1.0)
+    core, instance = started(restart=RestartRule(when=when))
+    core.handle(Exited(TALKER, code), 1.0)
     assert instance.phase == phase
 
 
 def test_backoff_grows_to_its_bound_and_restarts_run_out():
     """Waits are 1, 2, 4 s and so on up to the bound; the status of the failure has its reason."""
-    policy = sv.RestartRule("on-failure", 1.0, 5.0, 2.0, attempts=5, window=300.0)
+    policy = RestartRule("on-failure", 1.0, 5.0, 2.0, attempts=5, window=300.0)
     core, instance = started(restart=policy)
     now, waits = 0.0, []
     for _ in range(6):
-        core.handle(sv.Exited(TALKER, 1), now)
-        if instance.phase == sv.FAILED:
+        core.handle(Exited(TALKER, 1), now)
+        if instance.phase == FAILED:
             break
         waits.append(core.deadline() - now)
         now = core.deadline()
-        assert kinds(core.handle(sv.TimePassed(), now)) == ["Tell", "Spawn"]
-        core.handle(sv.Spawned(TALKER, 100), now)
+        assert kinds(core.handle(TimePassed(), now)) == ["Tell", "Spawn"]
+        core.handle(Spawned(TALKER, 100), now)
     assert [0.8 * most <= wait <= most for wait, most in zip(waits, (1, 2, 4, 5, 5), strict=True)]
     assert instance.message == "exit code 1; its restart policy allows 5 restarts within 300 s"
     assert instance.restarts == 5
@@ -156,36 +188,36 @@ def test_backoff_grows_to_its_bound_and_restarts_run_out():
 
 def test_a_long_run_starts_the_backoff_afresh():
     """Restarts older than the window do not count."""
-    core, instance = started(restart=sv.RestartRule("always", 1.0, 30.0, 2.0, 1, window=10.0))
-    core.handle(sv.Exited(TALKER, 1), 0.0)
-    core.handle(sv.TimePassed(), 1.0)
-    core.handle(sv.Spawned(TALKER, 101), 1.0)
-    core.handle(sv.Exited(TALKER, 1), 12.0)
-    assert instance.phase == sv.BACKOFF
+    core, instance = started(restart=RestartRule("always", 1.0, 30.0, 2.0, 1, window=10.0))
+    core.handle(Exited(TALKER, 1), 0.0)
+    core.handle(TimePassed(), 1.0)
+    core.handle(Spawned(TALKER, 101), 1.0)
+    core.handle(Exited(TALKER, 1), 12.0)
+    assert instance.phase == BACKOFF
     assert 12.8 <= core.deadline() <= 13.0
 
 
 @given(st.integers(0, 2000), st.floats(0, 1e6), st.floats(0, 1e6), st.floats(0.5, 1e3))
 def test_backoff_is_bounded(done, delay, most, factor):
     """No policy and no number of restarts gives a wait beyond its bound, or an overflow."""
-    assert 0.0 <= sv.backoff(sv.RestartRule("always", delay, most, factor), done) <= most
+    assert 0.0 <= backoff(RestartRule("always", delay, most, factor), done) <= most
 
 
 def crashed(count, rule):
     """Return this many instances that ended at once."""
-    core = sv.Supervision()
+    core = reducer.Supervision()
     keys = [(f"p{number}", number) for number in range(count)]
     for key in keys:
-        core.handle(sv.StartOrdered(key, rule, sv.StopRule()), 0.0)
-        core.handle(sv.Spawned(key, 100), 0.0)
+        core.handle(StartOrdered(key, rule, StopRule()), 0.0)
+        core.handle(Spawned(key, 100), 0.0)
     for key in keys:
-        core.handle(sv.Exited(key, 1), 10.0)
+        core.handle(Exited(key, 1), 10.0)
     return core
 
 
 def test_what_crashed_together_does_not_start_together():
     """The waits differ, by a fifth at most."""
-    core = crashed(20, sv.RestartRule("on-failure", delay=10.0))
+    core = crashed(20, RestartRule("on-failure", delay=10.0))
     waits = {one.deadline - 10.0 for one in core.instances.values()}
     assert len(waits) == 20
     assert 8.0 <= min(waits) < 8.5
@@ -194,11 +226,11 @@ def test_what_crashed_together_does_not_start_together():
 
 def test_at_most_eight_restarts_begin_within_a_second():
     """All restarts begin, eight per second."""
-    core = crashed(30, sv.RestartRule("on-failure", delay=0.0))
+    core = crashed(30, RestartRule("on-failure", delay=0.0))
     begun = []
     while core.deadline() is not None:
         now = core.deadline()
-        spawned = [one for one in core.handle(sv.TimePassed(), now) if kinds([one]) == ["Spawn"]]
+        spawned = [one for one in core.handle(TimePassed(), now) if kinds([one]) == ["Spawn"]]
         begun += [now] * len(spawned)
     assert len(begun) == 30
     assert all(later - earlier >= 1.0 for earlier, later in zip(begun, begun[8:], strict=False))
@@ -206,67 +238,67 @@ def test_at_most_eight_restarts_begin_within_a_second():
 
 def test_stop_escalates_and_says_each_step():
     """SIGTERM and SIGKILL follow SIGINT after their graces; the last message has all three."""
-    core, instance = started(stop=sv.StopRule(2.0, 3.0))
+    core, instance = started(stop=StopRule(2.0, 3.0))
     sent = []
-    commands = core.handle(sv.StopOrdered(TALKER), 10.0)
+    commands = core.handle(StopOrdered(TALKER), 10.0)
     while len(sent) < 3:
         sent += [(command.number, core.deadline()) for command in commands[1:]]
-        commands = core.handle(sv.TimePassed(), core.deadline())
+        commands = core.handle(TimePassed(), core.deadline())
     assert sent == [(signal.SIGINT, 12.0), (signal.SIGTERM, 15.0), (signal.SIGKILL, 16.0)]
-    core.handle(sv.Exited(TALKER, signal=signal.SIGKILL), 16.1)
-    assert instance.phase == sv.EXITED
+    core.handle(Exited(TALKER, signal=signal.SIGKILL), 16.1)
+    assert instance.phase == EXITED
     assert instance.message == "stopped by SIGINT, SIGTERM after 2.0 s, SIGKILL after 5.0 s"
 
 
 def test_stopped_process_is_not_restarted():
     """The user's stop overrides `always`."""
-    core, instance = started(restart=sv.RestartRule("always"))
-    core.handle(sv.StopOrdered(TALKER), 1.0)
-    core.handle(sv.Exited(TALKER, signal=signal.SIGINT), 2.0)
-    assert instance.phase == sv.EXITED
+    core, instance = started(restart=RestartRule("always"))
+    core.handle(StopOrdered(TALKER), 1.0)
+    core.handle(Exited(TALKER, signal=signal.SIGINT), 2.0)
+    assert instance.phase == EXITED
 
 
 def test_forced_restart_stops_then_starts():
     """A forced restart spawns when nothing is left, and the policy does not count it."""
     core, instance = started()
-    assert kinds(core.handle(sv.RestartOrdered(TALKER), 1.0)) == ["Tell", "Signal"]
-    assert kinds(core.handle(sv.Exited(TALKER, signal=2), 2.0)) == ["Tell", "Spawn"]
+    assert kinds(core.handle(RestartOrdered(TALKER), 1.0)) == ["Tell", "Signal"]
+    assert kinds(core.handle(Exited(TALKER, signal=2), 2.0)) == ["Tell", "Spawn"]
     assert instance.restarts == 0
 
 
 def test_stop_during_a_forced_restart_wins():
     """The instance ends instead of starting again."""
     core, instance = started()
-    core.handle(sv.RestartOrdered(TALKER), 1.0)
-    core.handle(sv.StopOrdered(TALKER), 1.5)
-    core.handle(sv.Exited(TALKER, signal=2), 2.0)
-    assert instance.phase == sv.EXITED
+    core.handle(RestartOrdered(TALKER), 1.0)
+    core.handle(StopOrdered(TALKER), 1.5)
+    core.handle(Exited(TALKER, signal=2), 2.0)
+    assert instance.phase == EXITED
 
 
 def test_a_restart_while_its_own_end_is_in_hand_is_carried_out():
     """The leader has ended, and leftovers are being stopped: then the instance restarts."""
     core, instance = started()
-    core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
-    assert kinds(core.handle(sv.RestartOrdered(TALKER), 1.1)) == ["Tell"]
+    core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
+    assert kinds(core.handle(RestartOrdered(TALKER), 1.1)) == ["Tell"]
     assert instance.message.startswith("to restart it: SIGINT")
-    assert kinds(core.handle(sv.Cleared(TALKER), 2.0)) == ["Tell", "Spawn"]
+    assert kinds(core.handle(Cleared(TALKER), 2.0)) == ["Tell", "Spawn"]
     assert instance.restarts == 0
 
 
-NEVER = sv.RestartRule("never")
-ON_FAILURE = sv.RestartRule("on-failure")
+NEVER = RestartRule("never")
+ON_FAILURE = RestartRule("on-failure")
 
 
 @pytest.mark.parametrize(
-    ("when", "phase"), [("never", sv.FAILED), ("on-failure", sv.BACKOFF), ("always", sv.BACKOFF)]
+    ("when", "phase"), [("never", FAILED), ("on-failure", BACKOFF), ("always", BACKOFF)]
 )
 def test_an_unhealthy_run_has_failed_however_it_ends(when, phase):
     """The instance exits with 0 on the stop signal, but its policy uses the health failure."""
-    core, instance = started(restart=sv.RestartRule(when))
-    commands = core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
-    assert commands[-1] == sv.Signal(TALKER, signal.SIGINT)
+    core, instance = started(restart=RestartRule(when))
+    commands = core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    assert commands[-1] == Signal(TALKER, signal.SIGINT)
     assert instance.message == "unhealthy: silent; stopping it: SIGINT"
-    core.handle(sv.Exited(TALKER, 0), 2.0)
+    core.handle(Exited(TALKER, 0), 2.0)
     assert instance.phase == phase
     assert instance.message.startswith("unhealthy: silent")
 
@@ -274,204 +306,204 @@ def test_an_unhealthy_run_has_failed_however_it_ends(when, phase):
 def test_an_unhealthy_run_that_does_not_end_is_killed():
     """The steps of the stop rule apply, as for every other stop."""
     core, _ = started()
-    core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
     sent = []
     for _ in range(2):
-        sent += core.handle(sv.TimePassed(), core.deadline())[1:]
+        sent += core.handle(TimePassed(), core.deadline())[1:]
     assert [command.number for command in sent] == [signal.SIGTERM, signal.SIGKILL]
 
 
 def test_what_is_stopped_is_killed_at_once():
     """A stopped process does not handle SIGINT; after SIGKILL no milder signal follows."""
     core, instance = started()
-    commands = core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: stopped", kill=True), 1.0)
-    assert commands[-1] == sv.Signal(TALKER, signal.SIGKILL)
+    commands = core.handle(FailOrdered(TALKER, 100, "unhealthy: stopped", kill=True), 1.0)
+    assert commands[-1] == Signal(TALKER, signal.SIGKILL)
     assert instance.message == "unhealthy: stopped; stopping it: SIGKILL"
-    again = core.handle(sv.TimePassed(), core.deadline())
-    assert again[-1] == sv.Signal(TALKER, signal.SIGKILL)
+    again = core.handle(TimePassed(), core.deadline())
+    assert again[-1] == Signal(TALKER, signal.SIGKILL)
 
 
 def test_a_run_is_not_failed_for_the_one_before():
     """The order names a pid of a former run, so it does not affect the present one."""
     core, instance = started(restart=ON_FAILURE)
-    assert kinds(core.handle(sv.FailOrdered(TALKER, 99, "late"), 1.0)) == ["Tell"]
-    assert instance.phase == sv.RUNNING
-    core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
-    core.handle(sv.Exited(TALKER, 0), 1.1)
-    core.handle(sv.TimePassed(), core.deadline())
-    core.handle(sv.Spawned(TALKER, 101), 3.0)
-    core.handle(sv.Exited(TALKER, 0), 4.0)
-    assert (instance.phase, instance.message) == (sv.EXITED, "")
+    assert kinds(core.handle(FailOrdered(TALKER, 99, "late"), 1.0)) == ["Tell"]
+    assert instance.phase == RUNNING
+    core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    core.handle(Exited(TALKER, 0), 1.1)
+    core.handle(TimePassed(), core.deadline())
+    core.handle(Spawned(TALKER, 101), 3.0)
+    core.handle(Exited(TALKER, 0), 4.0)
+    assert (instance.phase, instance.message) == (EXITED, "")
 
 
 def test_a_stop_of_what_is_failing_wins():
     """The user's stop overrides the restart policy."""
-    core, instance = started(restart=sv.RestartRule("always"))
-    core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
-    core.handle(sv.StopOrdered(TALKER), 1.5)
-    core.handle(sv.Exited(TALKER, 0), 2.0)
-    assert instance.phase == sv.EXITED
+    core, instance = started(restart=RestartRule("always"))
+    core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    core.handle(StopOrdered(TALKER), 1.5)
+    core.handle(Exited(TALKER, 0), 2.0)
+    assert instance.phase == EXITED
 
 
 def test_another_policy_counts_at_the_next_end():
     """A source with a suspended policy ends for good; a former shadow restarts."""
     core, instance = started(restart=ON_FAILURE)
-    assert kinds(core.handle(sv.AmendOrdered(TALKER, NEVER), 1.0)) == ["Tell"]
-    core.handle(sv.Exited(TALKER, signal=9), 2.0)
-    assert instance.phase == sv.FAILED
+    assert kinds(core.handle(AmendOrdered(TALKER, NEVER), 1.0)) == ["Tell"]
+    core.handle(Exited(TALKER, signal=9), 2.0)
+    assert instance.phase == FAILED
     core, instance = started(restart=NEVER)
-    core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 1.0)
-    core.handle(sv.Exited(TALKER, signal=9), 2.0)
-    assert instance.phase == sv.BACKOFF
+    core.handle(AmendOrdered(TALKER, ON_FAILURE), 1.0)
+    core.handle(Exited(TALKER, signal=9), 2.0)
+    assert instance.phase == BACKOFF
 
 
 def test_a_repeated_policy_only_tells_again():
     """DDS repeats messages, and so does a restarted master."""
     core, instance = started()
-    core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 1.0)
-    assert kinds(core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
-    assert (instance.phase, instance.restart) == (sv.RUNNING, ON_FAILURE)
+    core.handle(AmendOrdered(TALKER, ON_FAILURE), 1.0)
+    assert kinds(core.handle(AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
+    assert (instance.phase, instance.restart) == (RUNNING, ON_FAILURE)
 
 
 @pytest.mark.parametrize(
     ("restart", "phase"),
     [
-        (NEVER, sv.FAILED),
-        (sv.RestartRule("on-failure", attempts=1), sv.FAILED),
-        (sv.RestartRule("on-failure", attempts=2), sv.BACKOFF),
+        (NEVER, FAILED),
+        (RestartRule("on-failure", attempts=1), FAILED),
+        (RestartRule("on-failure", attempts=2), BACKOFF),
     ],
 )
 def test_a_policy_that_allows_no_restart_ends_the_wait_for_one(restart, phase):
     """One restart was made and another one is due: the new policy may cancel it."""
     core, instance = started(restart=ON_FAILURE)
-    core.handle(sv.Exited(TALKER, 1), 0.0)
-    core.handle(sv.TimePassed(), 1.0)
-    core.handle(sv.Spawned(TALKER, 101), 1.0)
-    core.handle(sv.Exited(TALKER, 1), 2.0)
+    core.handle(Exited(TALKER, 1), 0.0)
+    core.handle(TimePassed(), 1.0)
+    core.handle(Spawned(TALKER, 101), 1.0)
+    core.handle(Exited(TALKER, 1), 2.0)
     due = core.deadline()
     assert 3.0 < due <= 4.0
-    assert kinds(core.handle(sv.AmendOrdered(TALKER, restart), 3.0)) == ["Tell"]
+    assert kinds(core.handle(AmendOrdered(TALKER, restart), 3.0)) == ["Tell"]
     assert instance.phase == phase
-    assert core.deadline() == (due if phase == sv.BACKOFF else None)
-    if phase == sv.FAILED:
+    assert core.deadline() == (due if phase == BACKOFF else None)
+    if phase == FAILED:
         assert instance.message == "exit code 1; by its new policy it is not restarted"
 
 
 def test_a_policy_for_what_is_being_stopped_counts_afterwards():
     """The leader ended and left other processes: the policy decides once they have ended."""
     core, instance = started(restart=ON_FAILURE)
-    core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
-    core.handle(sv.AmendOrdered(TALKER, NEVER), 1.5)
-    core.handle(sv.Cleared(TALKER), 2.0)
-    assert instance.phase == sv.FAILED
+    core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
+    core.handle(AmendOrdered(TALKER, NEVER), 1.5)
+    core.handle(Cleared(TALKER), 2.0)
+    assert instance.phase == FAILED
 
 
 def test_a_policy_for_what_has_ended_tells_its_end():
     """The order starts nothing; for an unknown instance it has no effect either."""
     core, instance = started()
-    core.handle(sv.Exited(TALKER, 1), 1.0)
-    assert kinds(core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
-    assert (instance.phase, instance.restart) == (sv.FAILED, sv.RestartRule())
-    core.handle(sv.AmendOrdered(("stranger", 8), ON_FAILURE), 2.0)
-    assert core.instances["stranger", 8].phase == sv.REFUSED
+    core.handle(Exited(TALKER, 1), 1.0)
+    assert kinds(core.handle(AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
+    assert (instance.phase, instance.restart) == (FAILED, RestartRule())
+    core.handle(AmendOrdered(("stranger", 8), ON_FAILURE), 2.0)
+    assert core.instances["stranger", 8].phase == REFUSED
 
 
 def test_leftovers_are_stopped_before_it_counts_as_ended():
     """The leader exits and leaves other processes: they are stopped, then its exit code counts."""
     core, instance = started()
-    commands = core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
+    commands = core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
     assert kinds(commands) == ["Tell", "Signal"]
-    assert instance.phase == sv.STOPPING
-    core.handle(sv.Cleared(TALKER), 2.0)
-    assert (instance.phase, instance.exit_code) == (sv.FAILED, 3)
+    assert instance.phase == STOPPING
+    core.handle(Cleared(TALKER), 2.0)
+    assert (instance.phase, instance.exit_code) == (FAILED, 3)
 
 
 def test_leftovers_of_a_killed_leader_are_killed_at_once():
     """The leftovers get SIGKILL as well, because it is the last step."""
-    core, _ = started(stop=sv.StopRule(0.0, 0.0))
-    core.handle(sv.StopOrdered(TALKER), 0.0)
-    core.handle(sv.TimePassed(), 0.0)
-    core.handle(sv.TimePassed(), 0.0)
-    commands = core.handle(sv.Exited(TALKER, signal=9, leftovers=True), 0.1)
-    assert commands[-1] == sv.Signal(TALKER, signal.SIGKILL)
+    core, _ = started(stop=StopRule(0.0, 0.0))
+    core.handle(StopOrdered(TALKER), 0.0)
+    core.handle(TimePassed(), 0.0)
+    core.handle(TimePassed(), 0.0)
+    commands = core.handle(Exited(TALKER, signal=9, leftovers=True), 0.1)
+    assert commands[-1] == Signal(TALKER, signal.SIGKILL)
 
 
 def test_final_spawn_failure_is_not_repeated():
     """Waiting does not provide a missing executable, but another host may have it."""
-    core = sv.Supervision()
-    core.handle(sv.StartOrdered(TALKER, sv.RestartRule("always"), sv.StopRule()), 0.0)
-    core.handle(sv.SpawnFailed(TALKER, "no executable"), 0.0)
-    assert core.instances[TALKER].phase == sv.REFUSED
+    core = reducer.Supervision()
+    core.handle(StartOrdered(TALKER, RestartRule("always"), StopRule()), 0.0)
+    core.handle(SpawnFailed(TALKER, "no executable"), 0.0)
+    assert core.instances[TALKER].phase == REFUSED
 
 
 def test_transient_spawn_failure_follows_the_policy():
     """A lack of memory may pass."""
-    core = sv.Supervision()
-    core.handle(sv.StartOrdered(TALKER, sv.RestartRule("on-failure"), sv.StopRule()), 0.0)
-    core.handle(sv.SpawnFailed(TALKER, "no memory", transient=True), 0.0)
-    assert core.instances[TALKER].phase == sv.BACKOFF
+    core = reducer.Supervision()
+    core.handle(StartOrdered(TALKER, RestartRule("on-failure"), StopRule()), 0.0)
+    core.handle(SpawnFailed(TALKER, "no memory", transient=True), 0.0)
+    assert core.instances[TALKER].phase == BACKOFF
 
 
 def test_stop_before_the_spawn_gives_it_up():
     """A pending start is cancelled."""
-    core = sv.Supervision()
-    core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 0.0)
-    assert kinds(core.handle(sv.StopOrdered(TALKER), 0.0)) == ["Tell", "Unspawn"]
-    core.handle(sv.SpawnFailed(TALKER, ""), 0.0)
-    assert core.instances[TALKER].phase == sv.EXITED
+    core = reducer.Supervision()
+    core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 0.0)
+    assert kinds(core.handle(StopOrdered(TALKER), 0.0)) == ["Tell", "Unspawn"]
+    core.handle(SpawnFailed(TALKER, ""), 0.0)
+    assert core.instances[TALKER].phase == EXITED
 
 
 def test_shutdown_leaves_when_all_have_ended():
     """Everything is stopped, nothing is started any more, and then the supervisor exits."""
     core, _ = started()
-    assert "Leave" not in kinds(core.handle(sv.ShutdownOrdered(), 1.0))
-    core.handle(sv.StartOrdered(("late", 1), sv.RestartRule(), sv.StopRule()), 1.0)
-    assert core.instances["late", 1].phase == sv.REFUSED
-    assert kinds(core.handle(sv.Exited(TALKER, signal=2), 2.0)) == ["Tell", "Leave"]
+    assert "Leave" not in kinds(core.handle(ShutdownOrdered(), 1.0))
+    core.handle(StartOrdered(("late", 1), RestartRule(), StopRule()), 1.0)
+    assert core.instances["late", 1].phase == REFUSED
+    assert kinds(core.handle(Exited(TALKER, signal=2), 2.0)) == ["Tell", "Leave"]
 
 
-@pytest.mark.parametrize("before", [None, sv.Exited(TALKER, 1), sv.RestartOrdered(TALKER)])
+@pytest.mark.parametrize("before", [None, Exited(TALKER, 1), RestartOrdered(TALKER)])
 def test_what_a_shutdown_ends_is_withdrawn(before):
     """Neither the process nor an order ended it, whatever its exit code is."""
-    core, instance = started(restart=sv.RestartRule("on-failure"))
+    core, instance = started(restart=RestartRule("on-failure"))
     if before is not None:
         core.handle(before, 0.5)
-    core.handle(sv.ShutdownOrdered(), 1.0)
-    core.handle(sv.ShutdownOrdered(), 1.5)  # the slave repeats it to the next supervisor
-    core.handle(sv.Exited(TALKER, 0), 2.0)
-    assert instance.phase == sv.WITHDRAWN
+    core.handle(ShutdownOrdered(), 1.0)
+    core.handle(ShutdownOrdered(), 1.5)  # the slave repeats it to the next supervisor
+    core.handle(Exited(TALKER, 0), 2.0)
+    assert instance.phase == WITHDRAWN
 
 
 def test_what_was_ordered_to_stop_before_a_shutdown_is_not_withdrawn():
     """The order that came first counts: its master does not want the instance again."""
     core, instance = started()
-    core.handle(sv.StopOrdered(TALKER), 1.0)
-    core.handle(sv.ShutdownOrdered(), 1.5)
-    core.handle(sv.Exited(TALKER, signal=2), 2.0)
-    assert instance.phase == sv.EXITED
+    core.handle(StopOrdered(TALKER), 1.0)
+    core.handle(ShutdownOrdered(), 1.5)
+    core.handle(Exited(TALKER, signal=2), 2.0)
+    assert instance.phase == EXITED
 
 
 def test_a_lost_client_changes_nothing():
     """The processes of a slave that died keep running."""
     core, instance = started()
-    assert core.handle(sv.ClientLost(), 1.0) == []
-    assert instance.phase == sv.RUNNING
+    assert core.handle(ClientLost(), 1.0) == []
+    assert instance.phase == RUNNING
 
 
 def test_dead_numbers_are_bounded():
     """Thousands of jobs with different names need bounded memory."""
-    core = sv.Supervision()
-    for number in range(sv.MOST_TOMBSTONES + 10):
+    core = reducer.Supervision()
+    for number in range(reducer.MOST_TOMBSTONES + 10):
         key = (f"job{number}", number)
-        core.handle(sv.StopOrdered(key), 0.0)
-        core.handle(sv.Forgotten(key), 0.0)
-    assert len(core.dead) == sv.MOST_TOMBSTONES
+        core.handle(StopOrdered(key), 0.0)
+        core.handle(Forgotten(key), 0.0)
+    assert len(core.dead) == reducer.MOST_TOMBSTONES
 
 
 # --- invariants under random events -----------------------------------------------------------
 
 POLICIES = st.builds(
-    sv.RestartRule,
+    RestartRule,
     st.sampled_from(["never", "on-failure", "always"]),
     st.sampled_from([0.0, 0.5, 1.0]),
     st.just(2.0),
@@ -480,9 +512,9 @@ POLICIES = st.builds(
     st.sampled_from([5.0, 50.0]),
 )
 FENCES = st.none() | st.builds(
-    sv.FenceRule, st.sampled_from([0.5, 1.0, 5.0]), st.sampled_from([0.0, 0.5, 2.0]), st.booleans()
+    FenceRule, st.sampled_from([0.5, 1.0, 5.0]), st.sampled_from([0.0, 0.5, 2.0]), st.booleans()
 )
-GRACES = st.builds(sv.StopRule, st.sampled_from([0.0, 1.0]), st.sampled_from([0.0, 1.0]))
+GRACES = st.builds(StopRule, st.sampled_from([0.0, 1.0]), st.sampled_from([0.0, 1.0]))
 
 
 class Host(RuleBasedStateMachine):
@@ -493,20 +525,20 @@ class Host(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.core = sv.Supervision()
+        self.core = reducer.Supervision()
         self.now = 0.0
         self.newest = 0
-        self.queue: list[sv.Key] = []
-        self.in_hand: list[sv.Key] = []
-        self.leaders: set[sv.Key] = set()
-        self.strays: set[sv.Key] = set()
-        self.killed: set[sv.Key] = set()
-        self.final: dict[sv.Key, messages.Status] = {}
-        self.policy_restarts: dict[sv.Key, list[float]] = {}
-        self.stopped: set[sv.Key] = set()
-        self.fences: dict[sv.Key, sv.FenceRule] = {}
-        self.heard: dict[sv.Key, float] = {}
-        self.dead_by: dict[sv.Key, float] = {}
+        self.queue: list[Key] = []
+        self.in_hand: list[Key] = []
+        self.leaders: set[Key] = set()
+        self.strays: set[Key] = set()
+        self.killed: set[Key] = set()
+        self.final: dict[Key, messages.Status] = {}
+        self.policy_restarts: dict[Key, list[float]] = {}
+        self.stopped: set[Key] = set()
+        self.fences: dict[Key, FenceRule] = {}
+        self.heard: dict[Key, float] = {}
+        self.dead_by: dict[Key, float] = {}
         self.left = False
 
     def happens(self, event):
@@ -515,31 +547,31 @@ class Host(RuleBasedStateMachine):
             self.carry_out(command, event, before)
 
     def carry_out(self, command, event, before):
-        if isinstance(command, sv.Leave):
+        if isinstance(command, Leave):
             for key in self.leaders | self.strays:
                 kills = self.core.instances[key].kills
-                assert kills > sv.MOST_KILLS, f"it leaves while {key} is alive"
+                assert kills > MOST_KILLS, f"it leaves while {key} is alive"
             self.left = True
             return
         key = command.instance
-        if isinstance(command, sv.Spawn):
+        if isinstance(command, Spawn):
             assert key not in self.leaders | self.strays, "started twice"
             assert key not in self.queue + self.in_hand, "ordered twice"
             assert key not in self.final, "started after its end"
             assert key not in self.stopped, "started after the user's stop"
             assert key not in self.dead_by, "started after its fence had passed"
             self.queue.append(key)
-            if isinstance(event, sv.TimePassed) and before[key] == sv.BACKOFF:
+            if isinstance(event, TimePassed) and before[key] == BACKOFF:
                 self.policy_restarts.setdefault(key, []).append(self.now)
-        elif isinstance(command, sv.Unspawn):
+        elif isinstance(command, Unspawn):
             if key in self.queue:
                 self.queue.remove(key)
-                self.happens(sv.SpawnFailed(key, ""))
-        elif isinstance(command, sv.Signal):
+                self.happens(SpawnFailed(key, ""))
+        elif isinstance(command, Signal):
             assert key in self.leaders | self.strays, "a signal after the end"
             if command.number == signal.SIGKILL:
                 self.killed.add(key)
-        elif isinstance(command, sv.Tell):
+        elif isinstance(command, Tell):
             self.hear(key)
         else:
             assert key in self.final, "forgotten before its end"
@@ -549,7 +581,7 @@ class Host(RuleBasedStateMachine):
         status = messages.Status.of(self.core.instances[key])
         if key in self.final:
             assert status == self.final[key], "a second final status"
-        elif status.state in sv.ENDED:
+        elif status.state in ENDED:
             self.final[key] = status
 
     @precondition(lambda self: sum(not i.ended for i in self.core.instances.values()) < 2)
@@ -559,20 +591,20 @@ class Host(RuleBasedStateMachine):
         key = ("a", self.newest)
         if fence is not None:
             self.fences[key], self.heard[key] = fence, self.now - (0.0 if fence.alive else ago)
-        self.happens(sv.StartOrdered(key, restart, stop, fence, self.now - ago))
-        self.happens(sv.TimePassed())
+        self.happens(StartOrdered(key, restart, stop, fence, self.now - ago))
+        self.happens(TimePassed())
         self.look_at_fences()
 
     @rule(ago=st.sampled_from([-1.0, 0.0, 0.5, 4.0]))
     def master_hears(self, ago):
         """Report a contact with the master from this long ago; fenced instances stay fenced."""
-        self.happens(sv.Heard(self.now - ago))
+        self.happens(Heard(self.now - ago))
         self.renew(min(self.now, self.now - ago), alive=False)
 
     @rule()
     def slave_is_at_work(self):
         """Report that the slave runs, without a newer contact with the master."""
-        self.happens(sv.Heard(-99.0, self.now))
+        self.happens(Heard(-99.0, self.now))
         self.renew(self.now, alive=True)
 
     def renew(self, at, *, alive):
@@ -585,7 +617,7 @@ class Host(RuleBasedStateMachine):
     def fence(self, data):
         key = data.draw(st.sampled_from(sorted(self.core.instances)))
         self.dead_by[key] = min(self.now, self.dead_by.get(key, self.now))
-        self.happens(sv.FenceOrdered(key))
+        self.happens(FenceOrdered(key))
 
     def look_at_fences(self):
         for key, (after, grace, _) in self.fences.items():
@@ -602,16 +634,16 @@ class Host(RuleBasedStateMachine):
         key = ("a", data.draw(st.sampled_from([*known, *known, *known, 0, self.newest])))
         if kind == "stop":
             self.stopped.add(key)
-            self.happens(sv.StopOrdered(key))
+            self.happens(StopOrdered(key))
         elif kind == "restart":
             self.policy_restarts.pop(key, None)
-            self.happens(sv.RestartOrdered(key))
+            self.happens(RestartOrdered(key))
         elif kind == "fail":
-            self.happens(sv.FailOrdered(key, 100, "unhealthy", data.draw(st.booleans())))
+            self.happens(FailOrdered(key, 100, "unhealthy", data.draw(st.booleans())))
         elif kind == "forget":
-            self.happens(sv.Forgotten(key))
+            self.happens(Forgotten(key))
         else:
-            self.happens(sv.StartOrdered(key, sv.RestartRule("always"), sv.StopRule()))
+            self.happens(StartOrdered(key, RestartRule("always"), StopRule()))
 
     @precondition(lambda self: self.core.instances)
     @rule(data=st.data(), restart=POLICIES)
@@ -619,12 +651,12 @@ class Host(RuleBasedStateMachine):
         key = data.draw(st.sampled_from(sorted(self.core.instances)))
         before = self.core.instances[key].phase
         self.policy_restarts.pop(key, None)
-        self.happens(sv.AmendOrdered(key, restart))
+        self.happens(AmendOrdered(key, restart))
         instance = self.core.instances[key]
         assert instance.ended or instance.restart == restart
-        gives_up = before == sv.BACKOFF and restart.when == "never"
-        assert instance.phase == before or instance.phase == sv.FAILED
-        assert (instance.phase == sv.FAILED) >= gives_up
+        gives_up = before == BACKOFF and restart.when == "never"
+        assert instance.phase == before or instance.phase == FAILED
+        assert (instance.phase == FAILED) >= gives_up
 
     @precondition(lambda self: self.queue)
     @rule()
@@ -638,9 +670,9 @@ class Host(RuleBasedStateMachine):
         if fails is None:
             self.leaders.add(key)
             self.killed.discard(key)
-            self.happens(sv.Spawned(key, 100))
+            self.happens(Spawned(key, 100))
         else:
-            self.happens(sv.SpawnFailed(key, "no memory", transient=fails))
+            self.happens(SpawnFailed(key, "no memory", transient=fails))
 
     @precondition(lambda self: self.leaders)
     @rule(data=st.data(), code=st.sampled_from([0, 1]), leaves=st.booleans())
@@ -649,32 +681,32 @@ class Host(RuleBasedStateMachine):
         self.leaders.discard(key)
         if leaves:
             self.strays.add(key)
-        self.happens(sv.Exited(key, code, leftovers=leaves))
+        self.happens(Exited(key, code, leftovers=leaves))
 
     @precondition(lambda self: self.strays)
     @rule(data=st.data())
     def strays_end(self, data):
         key = data.draw(st.sampled_from(sorted(self.strays)))
         self.strays.discard(key)
-        self.happens(sv.Cleared(key))
+        self.happens(Cleared(key))
 
     @precondition(lambda self: self.core.deadline() is not None)
     @rule(seconds=st.sampled_from([0.0, 0.5, 1.0, 1.0, 6.0, 60.0]))
     def time_passes(self, seconds):
         self.now += seconds
         self.look_at_fences()
-        self.happens(sv.TimePassed())
+        self.happens(TimePassed())
 
     @invariant()
     def books_agree_with_the_host(self):
         for key, instance in self.core.instances.items():
             alive = key in self.leaders or key in self.strays
-            assert alive == (instance.phase in (sv.RUNNING, sv.STOPPING)), key
+            assert alive == (instance.phase in (RUNNING, STOPPING)), key
             assert (key in self.leaders) == (instance.pid > 0), key
             waits_for_spawn = key in self.queue or key in self.in_hand
-            assert waits_for_spawn == (instance.phase == sv.STARTING), key
+            assert waits_for_spawn == (instance.phase == STARTING), key
             assert instance.ended == (key in self.final), key
-            waits = instance.phase in (sv.STOPPING, sv.BACKOFF)
+            waits = instance.phase in (STOPPING, BACKOFF)
             assert (instance.deadline is not None) == waits, key
         unknown = {*self.leaders, *self.strays, *self.queue, *self.in_hand} - {*self.core.instances}
         assert not unknown
@@ -682,7 +714,7 @@ class Host(RuleBasedStateMachine):
     @invariant()
     def what_was_stopped_is_on_its_way_out(self):
         for key in self.stopped & set(self.core.instances):
-            assert self.core.instances[key].phase not in (sv.RUNNING, sv.BACKOFF), key
+            assert self.core.instances[key].phase not in (RUNNING, BACKOFF), key
 
     @invariant()
     def what_is_fenced_is_killed_in_time(self):
@@ -690,23 +722,23 @@ class Host(RuleBasedStateMachine):
         for key in self.leaders | self.strays:
             by = self.dead_by.get(key)
             if by is not None:
-                assert self.core.instances[key].phase == sv.STOPPING, key
+                assert self.core.instances[key].phase == STOPPING, key
                 assert key in self.killed or (self.now < by and self.core.deadline() <= by), key
             elif key in self.fences:
                 assert self.core.deadline() <= self.heard[key] + self.fences[key].after, key
         for key in self.dead_by.keys() & self.core.instances.keys():
-            assert self.core.instances[key].phase not in (sv.RUNNING, sv.BACKOFF), key
+            assert self.core.instances[key].phase not in (RUNNING, BACKOFF), key
 
     @invariant()
     def what_was_fenced_says_so(self):
         for key, status in self.final.items():
             fenced = status.message.startswith("fenced: ")
-            assert fenced == (status.state == sv.FENCED) <= (key in self.dead_by), key
+            assert fenced == (status.state == FENCED) <= (key in self.dead_by), key
 
     @invariant()
     def what_is_never_restarted_does_not_wait_for_it(self):
         for key, instance in self.core.instances.items():
-            assert instance.phase != sv.BACKOFF or instance.restart.when != "never", key
+            assert instance.phase != BACKOFF or instance.restart.when != "never", key
 
     @invariant()
     def restarts_stay_within_the_policy(self):
@@ -718,21 +750,21 @@ class Host(RuleBasedStateMachine):
 
     def teardown(self):
         """Check that a shutdown ends in bounded time from any state, if SIGKILL works."""
-        self.happens(sv.ShutdownOrdered())
+        self.happens(ShutdownOrdered())
         for _ in range(100):
             if self.left:
                 break
             for key in list(self.in_hand):
                 self.in_hand.remove(key)
-                self.happens(sv.SpawnFailed(key, "no memory", transient=True))
+                self.happens(SpawnFailed(key, "no memory", transient=True))
             for key in sorted(self.leaders & self.killed):
                 self.leaders.discard(key)
-                self.happens(sv.Exited(key, signal=signal.SIGKILL))
+                self.happens(Exited(key, signal=signal.SIGKILL))
             for key in sorted(self.strays & self.killed):
                 self.strays.discard(key)
-                self.happens(sv.Cleared(key))
+                self.happens(Cleared(key))
             self.now = self.core.deadline() or self.now
-            self.happens(sv.TimePassed())
+            self.happens(TimePassed())
         assert self.left
 
 

@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from ipaddress import IPv4Network
 from pathlib import Path
-from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final
 
 from rosrm.errors import ConfigError, LabError
@@ -116,12 +115,7 @@ class Lab:
         self.up(owner=Birth.of(os.getpid()))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         _to_the_end(self.down)
 
     # --- queries ------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 from typing import Any, Final
@@ -136,7 +136,7 @@ class LabPlan:
         return {
             "name": self.name,
             "subnet": str(self.subnet),
-            "hosts": [[host.name, host.memory, host.cpu, host.disk] for host in self.hosts],
+            "hosts": [astuple(host) for host in self.hosts],
         }
 
     @classmethod

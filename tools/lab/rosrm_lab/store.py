@@ -12,7 +12,7 @@ import shutil
 import socket
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -91,8 +91,8 @@ class Record:
             "plan": self.plan.to_plain(),
             "complete": self.complete,
             "boot": self.boot,
-            "owner": _born(self.owner),
-            "inits": {name: _born(birth) for name, birth in self.inits.items()},
+            "owner": self.owner and astuple(self.owner),
+            "inits": {name: astuple(birth) for name, birth in self.inits.items()},
             "links": wires.to_plain(self.links),
         }
 
@@ -181,7 +181,3 @@ def lock(name: str, timeout: float = 30.0) -> Iterator[None]:
                     ) from None
                 time.sleep(_LOOK)  # there is no event when a name becomes free
         yield
-
-
-def _born(birth: Birth | None) -> list[int] | None:
-    return None if birth is None else [birth.pid, birth.started]

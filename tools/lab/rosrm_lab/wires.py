@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any, Final, Literal
 
 from rosrm.errors import ConfigError
@@ -130,10 +130,7 @@ def _words(wire: Wire) -> str:
 
 def to_plain(links: Mapping[str, Link]) -> dict[str, Any]:
     """Return the content of the lab's state file."""
-    return {
-        name: [[wire.cut, wire.loss, wire.delay] for wire in (link.incoming, link.outgoing)]
-        for name, link in links.items()
-    }
+    return {name: astuple(link) for name, link in links.items()}
 
 
 def from_plain(plain: Mapping[str, Any]) -> dict[str, Link]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 
-Action = Callable[[], None]
+Action = Callable[[], object]
 
 
 @dataclass(order=True, slots=True)

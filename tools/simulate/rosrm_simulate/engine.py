@@ -6,11 +6,11 @@ Its commands reach the hosts after the time that a message takes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,26 +18,23 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
     Assign,
     Command,
-    Order,
-    PublishStateConfig,
-    Redeliver,
     Reply,
-    Withdraw,
+    SendOrder,
 )
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.reducer import step
 from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.slave import reducer
+from rosrm.core.slave.events import AssignmentsReceived, TimePassed
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record
 from rosrm.extensions.declared_fields import Declared
-from rosrm.model.values import EMPTY, InstanceId
+from rosrm.model.orders import seconds_of
+from rosrm.model.values import EMPTY, Assignment
 from rosrm_simulate.agenda import Agenda
-from rosrm_simulate.hosting import Hosting
 from rosrm_simulate.machine import Machine
 from rosrm_simulate.meter import Meter, Outcome
 from rosrm_simulate.nodes import Nodes
 from rosrm_simulate.workload import HostPlan, Workload
+from rosrm_simulate.world import World
 
 #: Events between two calls of `progress`.
 _TELL_EVERY: Final = 2000
@@ -58,7 +55,7 @@ class Progress:
     events: int
 
 
-class Simulation:
+class Simulation(World[Machine]):
     """One run of a workload.
 
     Args:
@@ -77,21 +74,17 @@ class Simulation:
         strategies: Mapping[str, MigrationStrategy],
         declared: Declared | None = None,
     ) -> None:
+        super().__init__(
+            MasterState(
+                settings, policy[0], policy[1], strategies, epoch=1,
+                declared=replace(declared or Declared(), executors=EMPTY),
+            )
+        )  # fmt: skip
         self.workload = workload
         self.meter = Meter(workload.until)
         self.agenda = Agenda()
-        self.state = MasterState(
-            settings, policy[0], policy[1], strategies, epoch=1,
-            declared=replace(declared or Declared(), executors=EMPTY),
-        )  # fmt: skip
-        self.machines: dict[str, Machine] = {}
-        plans = {plan.name: plan for plan in workload.processes}
-        self._hosting = Hosting(self.agenda, workload.model, plans, self._tell)
-        self._nodes = Nodes(self.agenda, workload.model, self._hosting, self._tell)
-        self._by_id: dict[int, Machine] = {}
-        self._undelivered: set[InstanceId] = set()
-        self._requests = 0
-        self._taken_in: Reply | None = None
+        self._plans = {plan.name: plan for plan in workload.processes}
+        self.publish = Nodes(self.agenda, workload.model, self.machines, self.tell).hear
         self._active = 0.0
         self._usage_told = -1
         # After this long without any event, the passing of time alone has no further effect.
@@ -140,41 +133,31 @@ class Simulation:
             if host.leaves < inf:
                 self.agenda.at(host.leaves, partial(self._leave, host))
         together: dict[float, list[str]] = {}
-        specs = {plan.name: plan.spec for plan in self.workload.processes}
         for plan in self.workload.processes:
             together.setdefault(plan.arrives, []).append(plan.name)
         for time, names in together.items():
-            submitted = happened.SubmissionReceived(0, tuple(specs[name] for name in names))
-            self.agenda.at(time, partial(self._ask, submitted))
+            submitted = happened.SubmissionReceived(
+                0, tuple(self._plans[name].spec for name in names)
+            )
+            self.agenda.at(time, partial(self.request, submitted))
         for time, event in self.workload.requests:
-            self.agenda.at(time, partial(self._ask, event))
-
-    def _ask(self, request: Any) -> None:
-        """Send a user's request to the master: an event with a request number."""
-        self._requests += 1
-        self._tell(replace(request, request=self._requests))
+            self.agenda.at(time, partial(self.request, event))
 
     def _join(self, plan: HostPlan) -> None:
-        incarnation = len(self.machines) + 1
-        machine = Machine(plan, incarnation, self.workload.model.period)
+        machine = Machine(
+            plan, len(self.machines) + 1, self.agenda, self.workload.model, self._plans, self.tell
+        )
         self.machines[plan.name] = machine
-        self._taken_in = None
-        self._ask(happened.HostRegistered(0, machine.description()))
-        reply: Reply | None = self._taken_in
-        assert reply is not None  # _tell has set it
-        machine.host_id = reply.host_id
-        self._by_id[machine.host_id] = machine
-        self._hosting.hear(machine, reducer.Registered(self.state.epoch))
-        self._hosting.hear(machine, reducer.MasterHears(inf))  # no simulated host is cut off
+        self.join(machine, inf)  # no simulated host is cut off
         self._read([machine])
 
     def _leave(self, plan: HostPlan) -> None:
         machine = self.machines[plan.name]
         if plan.lost:
-            self._hosting.lose(machine)
+            machine.lose()
             return
-        self._ask(happened.HostLeft(0, machine.host_id, machine.incarnation))
-        self._hosting.stop_all(machine)
+        self.request(happened.HostLeft(0, machine.host_id, machine.incarnation))
+        machine.shut_down(self.now)
 
     # --- time ----------------------------------------------------------------------------
 
@@ -191,111 +174,62 @@ class Simulation:
             self._usage_told = turn
             for machine in there:
                 self._tell_usages(machine)
-                self._hosting.hear(machine, reducer.TimePassed())
-        self._tell(happened.TimePassed())
+                machine.tell(TimePassed(), now)
+        self.tell(happened.TimePassed())
 
     def _read(self, machines: list[Machine]) -> None:
         """Deliver readings of hosts to the master; hosts under their limits ask for work."""
-        readings = [machine.reading(self.agenda.now) for machine in machines]
-        for machine in machines:
-            machine.sequence += 1
-        accepting = [
-            reading.accepts and not machine.stopping
-            for machine, reading in zip(machines, readings, strict=True)
-        ]
-        self._tell(
-            happened.ReadingsReceived(
-                host_id=np.array([one.host_id for one in machines], np.int64),
-                incarnation=np.array([one.incarnation for one in machines], np.uint64),
-                sequence=np.array([one.sequence for one in machines], np.uint64),
-                status_sequence=np.zeros(len(machines), np.uint64),
-                accepting=np.array(accepting, np.bool_), stale=np.zeros(len(machines), np.uint32),
-                usage=np.array([reading.usage for reading in readings]),
-                limit=np.array([machine.limit for machine in machines]),
-            )
-        )  # fmt: skip
-        for machine, accepts in zip(machines, accepting, strict=True):
+        # 0: a reading is never ahead of the statuses, which take their time.
+        event = self.readings(machines, status_sequence=np.zeros(len(machines), np.uint64))
+        self.tell(event)
+        for machine, accepts in zip(machines, event.accepting, strict=True):
             if accepts and not machine.asked:
                 machine.asked = True
-                self._ask(happened.ProcessRequested(0, machine.host_id, machine.incarnation))
+                self.request(happened.ProcessRequested(0, machine.host_id, machine.incarnation))
 
     def _tell_usages(self, machine: Machine) -> None:
         """Deliver the usage of each instance, if it has changed since the last time."""
-        usages = machine.usages(self.agenda.now)
-        if usages == machine.told_usage:
+        used = machine.used(self.now)
+        if used != machine.told_usage:
+            machine.told_usage = used
+            self.tell(machine.usages(self.now))
+
+    # --- the world, on virtual time ------------------------------------------------------
+
+    @property
+    def now(self) -> float:
+        """Return the virtual time, seconds."""
+        return self.agenda.now
+
+    def after(self, seconds: float, action: Callable[[], object]) -> None:
+        """Plan an action."""
+        self.agenda.after(seconds, action)
+
+    def record(self, event: happened.Event, commands: Sequence[Command]) -> None:
+        """Measure a step of the master's core."""
+        self.meter.take(self.state, event, commands, self.now)
+        if any(not isinstance(command, (Record, Intent, Reply)) for command in commands):
+            self._active = self.now
+
+    def assign(self, host: Machine, command: Assign) -> None:
+        """Hand an assignment to a host, which receives it later."""
+        super().assign(host, command)
+        self.after(self.workload.model.wire, partial(self._fetch, host, command.assignment))
+
+    def _fetch(self, host: Machine, assignment: Assignment) -> None:
+        if host.up and not host.stopping and assignment in host.polled:
+            host.polled.remove(assignment)
+            host.tell(AssignmentsReceived((assignment,)), self.now)
+
+    def send(self, sent: SendOrder) -> None:
+        """Send an order to a slave, which receives it later; a lost host lets it time out."""
+        self.after(self.workload.model.wire, partial(self._arrive, sent))
+
+    def _arrive(self, sent: SendOrder) -> None:
+        machine = self.by_id(sent.host_id)
+        if machine.up:
+            machine.receive(sent)
             return
-        machine.told_usage = usages
-        numbers, cpu, memory = zip(*usages, strict=True) if usages else ((), (), ())
-        self._tell(
-            happened.UsagesReceived(
-                machine.host_id, machine.incarnation, np.array(numbers, np.uint64),
-                np.array(cpu, np.float64), np.array(memory, np.float64),
-            )
-        )  # fmt: skip
-
-    # --- the master ----------------------------------------------------------------------
-
-    def _tell(self, event: happened.Event) -> None:
-        """Process an event in the master's core, and carry out its commands."""
-        now = self.agenda.now
-        self.state.wall = now
-        commands = step(self.state, event, now)
-        self.meter.take(self.state, event, commands, now)
-        for command in commands:
-            if not isinstance(command, (Record, Intent)):
-                self._carry_out(command)
-
-    def _carry_out(self, command: Command) -> None:
-        if isinstance(command, Reply):
-            self._taken_in = command if command.host_id else self._taken_in
-            return
-        self._active = self.agenda.now
-        if isinstance(command, Assign):
-            self._assign(command)
-        elif isinstance(command, Order):
-            self._order(command)
-        elif isinstance(command, Withdraw):
-            self._withdraw(command)
-        elif isinstance(command, Redeliver):
-            self._redeliver(command)
-        elif isinstance(command, PublishStateConfig):
-            self._nodes.hear(command)
-
-    def _assign(self, command: Assign) -> None:
-        machine, assignment = self._by_id[command.host_id], command.assignment
-        self._undelivered.add(assignment.instance)
-
-        def arrive() -> None:
-            if machine.up and not machine.stopping and assignment.instance in self._undelivered:
-                self._undelivered.discard(assignment.instance)
-                self._hosting.hear(machine, reducer.AssignmentsReceived((assignment,)))
-
-        self.agenda.after(self.workload.model.wire, arrive)
-
-    def _withdraw(self, command: Withdraw) -> None:
-        if command.instance in self._undelivered:
-            self._undelivered.discard(command.instance)
-            withdrawn = happened.AssignmentWithdrawn(command.instance)
-            self.agenda.after(0.0, partial(self._tell, withdrawn))
-            return
-        self._order(Order(command.order, command.host_id, "stop", command.instance))
-
-    def _redeliver(self, command: Redeliver) -> None:
-        assignment = command.assignment
-        if assignment.instance not in self._undelivered:
-            self._order(
-                Order(command.order, command.host_id, "start", assignment.instance, assignment)
-            )
-
-    def _order(self, order: Order) -> None:
-        machine = self._by_id[order.host_id]
-
-        def arrive() -> None:
-            if machine.up:
-                self._hosting.obey(machine, order)
-                return
-            timeout = happened.OrderAnswered(order.order, False, "timeout", "no answer in time")
-            seconds = order.timeout + self.state.settings.order_retry
-            self.agenda.after(seconds, partial(self._tell, timeout))
-
-        self.agenda.after(self.workload.model.wire, arrive)
+        timeout = happened.OrderAnswered(sent.order_id, False, "timeout", "no answer in time")
+        seconds = seconds_of(sent.order) + self.state.settings.order_retry
+        self.after(seconds, partial(self.tell, timeout))

@@ -19,10 +19,10 @@ from rosrm.core.master.commands import Assign, Command, PublishStateConfig
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
-from rosrm.core.slave.reducer import awaits_graph
+from rosrm.core.slave.state import awaits_graph
 from rosrm.extensions.contracts import Record
+from rosrm.model.codec import from_plain
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.spec_json import spec_from_dict
 from rosrm.model.values import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Recording
@@ -83,7 +83,7 @@ class Extraction:
         self._stops_since: dict[int, float] = {}
         for name, item in recording.header.intents.get("process", {}).items():
             if not ProcessPhase(item["phase"]).over:  # the master restored it at its start
-                self._processes[name] = _Process(spec_from_dict(item["spec"]), 0.0)
+                self._processes[name] = _Process(from_plain(ProcessSpec, item["spec"]), 0.0)
 
     def watch(self, state: MasterState, one: Happened, commands: Sequence[Command]) -> None:
         """Process one event of the record, and the commands that followed from it."""

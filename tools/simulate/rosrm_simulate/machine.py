@@ -1,4 +1,4 @@
-"""The model of one host: the slave's core, and the programs on the host.
+"""The model of one host: usage and CPU time of its programs, on virtual time.
 
 A host has CPU time to share: while its processes want more cores than there are, each gets the same
 part of its demand, and one with work to do takes so much longer. Memory is the sum over the
@@ -7,223 +7,244 @@ processes; there is no out-of-memory kill, so that overload shows in the limits 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from math import inf
-from typing import NamedTuple
 
-import numpy as np
-
-from rosrm.core.master.state.host_arrays import FloatArray
-from rosrm.core.slave import reducer
-from rosrm.model.values import (
-    RESOURCE_SLOTS,
-    Assignment,
-    HostDescription,
-    InstanceId,
-    InstanceState,
-    InstanceStatus,
-    RestartPolicy,
-)
-from rosrm_simulate.workload import HostPlan, ProcessPlan
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import SendOrder
+from rosrm.core.slave.events import SeenInGraph
+from rosrm.core.slave.state import awaits_graph
+from rosrm.model.values import EMPTY, Assignment, InstanceId, InstanceState, RestartPolicy
+from rosrm_simulate.agenda import Agenda, Entry
+from rosrm_simulate.host import Host, Program, Reading
+from rosrm_simulate.workload import HostPlan, Model, ProcessPlan
 
 #: Seconds of work left that count as none, because sums of fractions are not exact.
 _NONE_LEFT = 1e-9
 
 
-@dataclass(slots=True)
-class Program:
+@dataclass(slots=True, kw_only=True)
+class Work(Program):
     """One instance on a host.
 
     Attributes:
         begun: time at which it began to run; None: it is starting.
         work: seconds of its duration that it has done.
-        stopping: it was ordered to end.
-        run: counts its starts: plans for an earlier one are void.
     """
 
     plan: ProcessPlan
-    assignment: Assignment
-    restart: RestartPolicy
     begun: float | None = None
     work: float = 0.0
-    stopping: bool = False
-    run: int = 0
     peak: float = 0.0
 
 
-class Reading(NamedTuple):
-    """A slave's reading; `usage` (RESOURCE_SLOTS,), fractions; `accepts`: under all limits."""
-
-    at: float
-    usage: FloatArray
-    accepts: bool
-
-
-@dataclass(slots=True)
-class Machine:
+class Machine(Host[Work]):
     """One host of a simulation.
 
-    Attributes:
+    Args:
+        plan: of the host.
         incarnation: of its slave.
-        host_id: assigned by the master; 0: it is not registered.
+        agenda: time.
+        model: of the hosts.
+        processes: plans by process name.
+        deliver: sends an event to the master.
+
+    Attributes:
         up: it runs; a host that is down neither receives nor sends anything.
         stopping: its slave is shutting down, and the host goes with its last process.
         asked: it has asked for work.
-        limit: (RESOURCE_SLOTS,) as in its readings.
+        told_usage: usages that the master knows.
     """
 
-    plan: HostPlan
-    incarnation: int
-    period: float
-    slave: reducer.SlaveState = field(default_factory=reducer.SlaveState)
-    programs: dict[InstanceId, Program] = field(default_factory=dict)
-    host_id: int = 0
-    up: bool = True
-    stopping: bool = False
-    asked: bool = False
-    sequence: int = 0
-    batches: int = 0
-    told_usage: tuple[tuple[int, float, float], ...] = ()
-    limit: FloatArray = field(init=False)
-    _worked_until: float = 0.0
-    _rate: float = 1.0
-    _level_from: float = 0.0
-    _reading: Reading | None = None
-
-    def __post_init__(self) -> None:
-        self.slave.max_processes = self.plan.max_processes
-        names = [one.name for one in self.plan.resources]
-        self.limit = np.ones(RESOURCE_SLOTS)
-        self.limit[: len(names)] = [self.plan.limits.get(name, 1.0) for name in names]
-
-    def description(self) -> HostDescription:
-        """Return the description with which its slave registers."""
-        plan = self.plan
-        return HostDescription(
-            plan.name, self.incarnation, labels=plan.labels, resources=plan.resources,
-            max_processes=plan.max_processes, period=self.period,
+    def __init__(
+        self, plan: HostPlan, incarnation: int, agenda: Agenda, model: Model,
+        processes: Mapping[str, ProcessPlan], deliver: Callable[[happened.Event], object],
+    ) -> None:  # fmt: skip
+        super().__init__(
+            plan.name, resources=plan.resources, limits=plan.limits, labels=plan.labels,
+            max_processes=plan.max_processes, busy=plan.busy, period=model.period,
+            start_time=model.start, stop_time=model.stop, incarnation=incarnation,
         )  # fmt: skip
+        self.up = True
+        self.stopping = False
+        self.asked = False
+        self.told_usage: tuple[tuple[int, float, float], ...] = ()
+        self._agenda = agenda
+        self._model = model
+        self._processes = processes
+        self._deliver = deliver
+        self._capacity = plan.capacity("cpu")
+        self._cores = self._capacity * (1.0 - plan.busy.get("cpu", 0.0))
+        self._worked_until = 0.0
+        self._rate = 1.0
+        self._level_from = 0.0
+        self._reading: Reading | None = None
+        self._end_of_work: Entry | None = None
+
+    # --- messages, on virtual time ---------------------------------------------------------
+
+    def later(self, seconds: float, _now: float, action: Callable[[float], None]) -> None:
+        """Plan an action."""
+        self._agenda.after(seconds, lambda: action(self._agenda.now))
+
+    def say(self, event: happened.Event) -> None:
+        """Send an event to the master, unless the host is gone at the time of its arrival."""
+
+        def arrive() -> None:
+            if self.up or self.stopping:
+                self._deliver(event)
+
+        self._agenda.after(self._model.wire, arrive)
+
+    def receive(self, sent: SendOrder) -> None:
+        """Carry out an order, and send the answer to the master."""
+        self.say(self.obey(sent, self._agenda.now))
+
+    def lose(self) -> None:
+        """Drop the host at once, with everything on it; it sends no message."""
+        self.up = False
+        self.programs.clear()
+        self._agenda.call_off(self._end_of_work)
+
+    def shut_down(self, now: float) -> None:
+        """Shut down the slave, with all its processes."""
+        self.stopping = True
+        super().shut_down(now)
+        self._close()
+
+    def _close(self) -> None:
+        if self.stopping and not self.programs:
+            self.up = False
 
     # --- programs --------------------------------------------------------------------------
 
-    def begin(self, instance: InstanceId, now: float) -> None:
-        """Let a starting instance run from now on."""
-        program = self.programs[instance]
-        if program.begun is None:
-            program.begun = now
+    def make_program(self, assignment: Assignment, restart: RestartPolicy) -> Work:
+        """Return the program of a new instance."""
+        instance = assignment.instance
+        return Work(
+            plan=self._processes[instance.process], assignment=assignment, restart=restart,
+            pid=instance.number,
+        )  # fmt: skip
+
+    def run_begins(self, program: Work, now: float) -> None:
+        """Begin with the work of an instance; a ROS node is seen in the graph later."""
+        program.begun = now
+        self.changed(now)
+        if awaits_graph(program.assignment.spec):
+            seen = partial(self._seen, program.assignment.instance, program.run)
+            self.later(self._model.ready, now, seen)
+
+    def run_begins_again(self, program: Work, now: float) -> None:
+        """Drop the work of the earlier run."""
+        self._account(now)
+        program.begun, program.work = None, 0.0
         self.changed(now)
 
-    def remove(self, instance: InstanceId, now: float) -> Program:
-        """Remove an instance that has ended; return its program."""
+    def _seen(self, instance: InstanceId, run: int, now: float) -> None:
+        program = self.programs.get(instance)
+        if program is not None and program.run == run:
+            self.tell(SeenInGraph(instance), now)
+
+    def _stop(self, instance: InstanceId, now: float) -> None:
+        super()._stop(instance, now)
+        self._plan_end()
+
+    def spent(self, program: Work, now: float) -> tuple[float, float, float]:
+        """Return run time, peak memory and CPU time of an instance that ends."""
+        self._account(now)
+        run_time = 0.0 if program.begun is None else now - program.begun
+        peak = max(program.peak, self.memory_of(program, now))
+        return run_time, peak, program.plan.cpu * program.work
+
+    def run_ended(self, now: float) -> None:
+        """Share the CPU time among the rest; a host that shuts down goes with its last program."""
         self.changed(now)
-        program = self.programs.pop(instance)
-        self.changed(now)
-        return program
+        self._close()
+
+    # --- work ------------------------------------------------------------------------------
 
     def changed(self, now: float) -> None:
-        """Apply a change of the programs: past work at the old CPU rate, further at the new."""
+        """Apply a change of the programs, and plan the next end of work again."""
+        self._account(now)
+        self._plan_end()
+
+    def _account(self, now: float) -> None:
+        """Account past work at the old CPU rate; further work is at the new one."""
         self._work_until(now)
-        wanted = sum(one.plan.cpu for one in self.programs.values() if one.begun is not None)
-        cores = self.plan.capacity("cpu") * (1.0 - self.plan.busy.get("cpu", 0.0))
-        self._rate = 1.0 if wanted <= cores or not self.plan.capacity("cpu") else cores / wanted
-        running = [one for one in self.programs.values() if one.begun is not None]
+        running = self._running()
+        wanted = sum(one.plan.cpu for one in running)
+        self._rate = 1.0 if wanted <= self._cores or not self._capacity else self._cores / wanted
         self._level_from = max((_level_from(one) for one in running), default=0.0)
         self._reading = None
 
+    def _running(self) -> list[Work]:
+        return [one for one in self.programs.values() if one.begun is not None]
+
     def _work_until(self, now: float) -> None:
-        for program in self.programs.values():
-            if program.begun is not None:
-                since = max(self._worked_until, program.begun)
-                program.work += max(0.0, now - since) * self._rate_of(program)
-                program.peak = max(program.peak, self.memory_of(program, now))
+        for program in self._running():
+            assert program.begun is not None
+            since = max(self._worked_until, program.begun)
+            program.work += max(0.0, now - since) * self._rate_of(program)
+            program.peak = max(program.peak, self.memory_of(program, now))
         self._worked_until = now
 
-    def _rate_of(self, program: Program) -> float:
+    def _rate_of(self, program: Work) -> float:
         return self._rate if program.plan.cpu > 0.0 else 1.0
 
-    def next_end(self) -> float:
-        """Return the time of the next end of work at the present rate; inf: there is none."""
-        return min(
-            (self._end_of(one) for one in self.programs.values() if one.begun is not None),
-            default=inf,
-        )
+    def _plan_end(self) -> None:
+        """Plan the next end of work."""
+        self._agenda.call_off(self._end_of_work)
+        time = min((self._end_of(one) for one in self._running()), default=inf)
+        self._end_of_work = self._agenda.at(time, self._work_done) if time < inf else None
 
-    def _end_of(self, program: Program) -> float:
+    def _end_of(self, program: Work) -> float:
         rate = self._rate_of(program)
-        if program.plan.duration == inf or program.stopping or rate <= 0.0:
+        stopping = program.state is InstanceState.STOPPING
+        if program.plan.duration == inf or stopping or rate <= 0.0:
             return inf
         return self._worked_until + max(0.0, program.plan.duration - program.work) / rate
 
-    def done(self, now: float) -> list[InstanceId]:
-        """Return the instances whose work is done."""
+    def _work_done(self) -> None:
+        now = self._agenda.now
         self._work_until(now)
-        return [
+        done = [
             instance
             for instance, one in self.programs.items()
-            if one.begun is not None and not one.stopping
+            if one.begun is not None and one.state is not InstanceState.STOPPING
             and one.work >= one.plan.duration - _NONE_LEFT
         ]  # fmt: skip
+        for instance in done:
+            self._end(instance, InstanceState.EXITED, now)
+        self._plan_end()
 
     # --- readings and usages ---------------------------------------------------------------
 
-    def memory_of(self, program: Program, now: float) -> float:
+    def memory_of(self, program: Work, now: float) -> float:
         """Return the bytes that an instance holds."""
         return 0.0 if program.begun is None else program.plan.memory.at(now - program.begun)
 
-    def cpu_of(self, program: Program) -> float:
-        """Return the cores that an instance gets."""
-        return 0.0 if program.begun is None else program.plan.cpu * self._rate
+    def used_by(self, program: Work, now: float) -> Mapping[str, float]:
+        """Return the base units of each resource that an instance uses."""
+        if program.begun is None:
+            return EMPTY
+        plan = program.plan
+        memory = self.memory_of(program, now)
+        return {"memory": memory, "cpu": plan.cpu * self._rate, "disk": plan.disk}
 
     def grows(self, now: float) -> bool:
         """Return True if the memory of a process is still changing."""
         return now < self._level_from
 
     def reading(self, now: float) -> Reading:
-        """Return the slave's reading for `resource_info`."""
+        """Return the slave's reading, which changes only with its programs."""
         if self._reading is None or self.grows(self._reading.at):
-            used = self.usage(now)
-            usage = np.zeros(RESOURCE_SLOTS)
-            usage[: len(used)] = [used[one.name] for one in self.plan.resources]
-            present = (1 << len(used)) - 1
-            accepts = reducer.under_limits(
-                usage.astype(np.float32), self.limit.astype(np.float32), present, 0
-            )
-            self._reading = Reading(now, usage, accepts)
-        return self._reading
-
-    def usage(self, now: float) -> Mapping[str, float]:
-        """Return the fraction of each resource that is used."""
-        held = sum(self.memory_of(one, now) for one in self.programs.values())
-        used = {"memory": held}
-        running = [one for one in self.programs.values() if one.begun is not None]
-        used["cpu"] = sum(self.cpu_of(one) for one in running)
-        used["disk"] = sum(one.plan.disk for one in running)
-        return {
-            one.name: self.plan.busy.get(one.name, 0.0) + used.get(one.name, 0.0) / one.capacity
-            for one in self.plan.resources
-        }
-
-    def usages(self, now: float) -> tuple[tuple[int, float, float], ...]:
-        """Return number, cores and bytes of each instance."""
-        return tuple(
-            (instance.number, self.cpu_of(one), self.memory_of(one, now))
-            for instance, one in self.programs.items()
-        )
-
-    def end_status(
-        self, instance: InstanceId, program: Program, now: float, *, signal: int = 0
-    ) -> InstanceStatus:
-        """Return the supervisor's status for an instance that has ended."""
-        run_time = 0.0 if program.begun is None else now - program.begun
-        cpu_time = program.plan.cpu * program.work
-        return InstanceStatus(
-            instance, InstanceState.EXITED, exit_signal=signal, run_time=run_time,
-            peak_memory=max(program.peak, self.memory_of(program, now)), cpu_time=cpu_time,
-        )  # fmt: skip
+            self._reading = super().reading(now)
+        return self._reading._replace(accepts=False) if self.stopping else self._reading
 
 
-def _level_from(program: Program) -> float:
+def _level_from(program: Work) -> float:
     """Return the time from which the memory of an instance stays constant."""
     assert program.begun is not None
     return program.begun + program.plan.memory.level_from

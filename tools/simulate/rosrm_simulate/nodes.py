@@ -6,7 +6,7 @@ and that the destination then continues the source's work.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from rosrm.core.master.commands import PublishStateConfig
@@ -14,7 +14,7 @@ from rosrm.core.master.events import Event, HandoffReported
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.model.values import InstanceId
 from rosrm_simulate.agenda import Agenda
-from rosrm_simulate.hosting import Hosting
+from rosrm_simulate.machine import Machine
 from rosrm_simulate.workload import Model
 
 
@@ -22,12 +22,13 @@ class Nodes:
     """All nodes of the cluster, as far as handoffs are concerned."""
 
     def __init__(
-        self, agenda: Agenda, model: Model, hosting: Hosting, tell: Callable[[Event], None]
-    ) -> None:
+        self, agenda: Agenda, model: Model, machines: Mapping[str, Machine],
+        deliver: Callable[[Event], object],
+    ) -> None:  # fmt: skip
         self._agenda = agenda
         self._model = model
-        self._hosting = hosting
-        self._tell = tell
+        self._machines = machines
+        self._deliver = deliver
 
     def hear(self, config: PublishStateConfig) -> None:
         """Process a phase of a handoff; the named node answers."""
@@ -48,13 +49,17 @@ class Nodes:
         self._agenda.after(seconds + 2 * self._model.wire, report)
 
     def _report(self, config: PublishStateConfig, number: int, phase: ReportPhase) -> None:
-        if number in self._hosting.where:
-            self._tell(HandoffReported(config.process, config.destination, number, phase))
+        if self._host_of(config, number) is not None:
+            self._deliver(HandoffReported(config.process, config.destination, number, phase))
+
+    def _host_of(self, config: PublishStateConfig, number: int) -> Machine | None:
+        instance = InstanceId(config.process, number)
+        return next((one for one in self._machines.values() if instance in one.programs), None)
 
     def _switch(self, config: PublishStateConfig) -> None:
         """Let the source end its output, and the destination continue its work."""
-        there = self._hosting.where.get(config.destination)
-        here = self._hosting.where.get(config.source)
+        there = self._host_of(config, config.destination)
+        here = self._host_of(config, config.source)
         if there is None:
             return
         if here is not None:
@@ -64,6 +69,6 @@ class Nodes:
             source = here.programs[InstanceId(config.process, config.source)]
             destination = there.programs[InstanceId(config.process, config.destination)]
             destination.work, destination.begun = source.work, source.begun
-            self._hosting.take_over(there)
+            there.changed(now)
             self._report(config, config.source, ReportPhase.RELEASED)
         self._report(config, config.destination, ReportPhase.ACTIVE)

@@ -165,14 +165,6 @@ def _of_record(request: Request, changes: Sequence[Node], registry: Registry) ->
     )
 
 
-def agreement_of(path: Path) -> Agreement:
-    """Return the agreement of a recorded run with its simulation; raises as `carry_out`."""
-    agreement = carry_out(Request(path)).agreement
-    if agreement is None:
-        raise ConfigError(f"{path}: is a workload; only the record of a run can be compared")
-    return agreement
-
-
 def load_record(path: Path, *, cut: bool = False) -> Recording:
     """Read a record; raises `RecordError` or `ConfigError`.
 

@@ -15,12 +15,13 @@ import json
 import os
 import signal
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TypeVar
 
 from rosrm.errors import PortableError
+from rosrm.model.codec import from_plain, to_plain
 from rosrm_criu.control.directory import opened
 
 #: Environment variable that names the control directory of a process.
@@ -90,9 +91,12 @@ class Status:
     missing: tuple[str, ...] = ()
 
 
+_Content = TypeVar("_Content", Request, Status)
+
+
 def write_request(directory: Path, request: Request) -> None:
     """Write a request; raise `OSError`."""
-    _write(directory, _REQUEST, {"id": request.id, "want": request.want.value})
+    _write(directory, _REQUEST, request)
 
 
 def read_request(directory: Path) -> Request | None:
@@ -101,13 +105,7 @@ def read_request(directory: Path) -> Request | None:
     Raises:
         PortableError: the file holds no valid request.
     """
-    found = _read(directory, _REQUEST)
-    if found is None:
-        return None
-    try:
-        return Request(_text(found["id"]), Want(found["want"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise PortableError(f"{directory / _REQUEST} is no request: {error!r}") from None
+    return _read(directory, _REQUEST, Request)
 
 
 def edition_of_request(directory: Path) -> tuple[int, ...]:
@@ -121,14 +119,7 @@ def edition_of_request(directory: Path) -> tuple[int, ...]:
 
 def write_status(directory: Path, status: Status) -> None:
     """Write the status of a node; raise `OSError`."""
-    content = {
-        "state": status.state.value,
-        "request": status.request,
-        "fault": status.fault,
-        "seconds": dict(status.seconds),
-        "missing": list(status.missing),
-    }
-    _write(directory, _STATUS, content)
+    _write(directory, _STATUS, status)
 
 
 def read_status(directory: Path) -> Status | None:
@@ -137,17 +128,7 @@ def read_status(directory: Path) -> Status | None:
     Raises:
         PortableError: the file holds no valid status.
     """
-    found = _read(directory, _STATUS)
-    if found is None:
-        return None
-    try:
-        seconds = {_text(name): float(value) for name, value in found["seconds"].items()}
-        return Status(
-            State(found["state"]), _text(found["request"]), _text(found["fault"]), seconds,
-            tuple(_text(one) for one in found["missing"]),
-        )  # fmt: skip
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise PortableError(f"{directory / _STATUS} is no status: {error!r}") from None
+    return _read(directory, _STATUS, Status)
 
 
 def remove_status(directory: Path) -> None:
@@ -165,24 +146,18 @@ def _remove(directory: Path, name: str) -> None:
         os.unlink(name, dir_fd=place)
 
 
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
-    return value
-
-
-def _write(directory: Path, name: str, content: Mapping[str, Any]) -> None:
+def _write(directory: Path, name: str, content: Request | Status) -> None:
     """Replace a file atomically: a reader finds the old content or the new one."""
     beside = f".{name}.new"
     with opened(directory) as place:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(beside, dir_fd=place)  # a link left there must not be written through
         with os.fdopen(os.open(beside, _NEW, 0o666, dir_fd=place), "w", encoding="utf-8") as file:
-            json.dump({"format": FORMAT, **content}, file)
+            json.dump({"format": FORMAT, **to_plain(content)}, file)
         os.replace(beside, name, src_dir_fd=place, dst_dir_fd=place)
 
 
-def _read(directory: Path, name: str) -> dict[str, Any] | None:
+def _read(directory: Path, name: str, wanted: type[_Content]) -> _Content | None:
     path = directory / name
     try:
         # The flags keep a FIFO from blocking, and the size limit keeps a large file out of memory.
@@ -200,4 +175,8 @@ def _read(directory: Path, name: str) -> dict[str, Any] | None:
         raise PortableError(f"{path} holds no JSON") from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise PortableError(f"{path} is not of format {FORMAT}, which this rosrm speaks")
-    return found
+    known = {one.name: found[one.name] for one in fields(wanted) if one.name in found}
+    try:
+        return from_plain(wanted, known)
+    except ValueError as error:
+        raise PortableError(f"{path} is no {name}: {error}") from None

@@ -13,11 +13,12 @@ import json
 import shutil
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import CriuError
+from rosrm.model.codec import from_plain, to_plain
 
 #: The format that is written. Only this one and its predecessor can be read.
 FORMAT: Final = 2
@@ -170,7 +171,7 @@ def _checksum_of_file(path: Path) -> int:
 
 def write(directory: Path, manifest: Manifest) -> None:
     """Write the manifest, which makes the image complete."""
-    values = asdict(manifest)
+    values = to_plain(manifest)
     own = _checksum_of_values(values)
     text = json.dumps({"format": FORMAT, "checksum": own, **values}, indent=1)
     new = directory / f"{MANIFEST}.new"
@@ -275,8 +276,6 @@ def remove(directory: Path, *, logs: bool = True) -> None:
 
 # --- reading strictly ---------------------------------------------------------------------------
 
-_KINDS: Final[Mapping[str, type]] = {"str": str, "int": int, "float": float, "bool": bool}
-
 
 def _whole(values: dict[str, Any], written: int) -> dict[str, Any]:
     """Return the manifest's values after a check of its checksum, which the old format lacks."""
@@ -294,40 +293,8 @@ def _checksum_of_values(values: dict[str, Any]) -> int:
 
 
 def _manifest(values: dict[str, Any]) -> Manifest:
-    values["ids"] = tuple(_all(int, values, "ids"))
-    values["logs"] = tuple(_all(str, values, "logs"))
-    values["files"] = tuple(_plain(HeldFile, one) for one in _all(dict, values, "files"))
-    values["mapped"] = tuple(_plain(MappedFile, one) for one in _all(dict, values, "mapped"))
-    sizes, checksums = _numbers(values, "sizes"), _numbers(values, "checksums")
-    manifest: Manifest = _plain(Manifest, values)
-    names = [*sizes, *checksums, *(one.copy for one in manifest.files)]
-    for name in names:
+    manifest = from_plain(Manifest, values)
+    for name in (*manifest.sizes, *manifest.checksums, *(one.copy for one in manifest.files)):
         if name.startswith("/") or ".." in name.split("/"):
             raise ValueError(f"{name!r} does not lie in the image")
     return manifest
-
-
-def _all(kind: type, values: dict[str, Any], name: str) -> list[Any]:
-    found = values[name]
-    if not isinstance(found, list) or not all(type(one) is kind for one in found):
-        raise TypeError(f"{name}: not a list of {kind.__name__}")
-    return found
-
-
-def _numbers(values: dict[str, Any], name: str) -> dict[str, int]:
-    found = values[name]
-    if not isinstance(found, dict) or not all(type(one) is int for one in found.values()):
-        raise TypeError(f"{name}: not a number for each file")
-    return found
-
-
-def _plain(kind: type[Any], values: dict[str, Any]) -> Any:
-    """Return a dataclass from an object with exactly its fields and types."""
-    for one in fields(kind):
-        wanted = _KINDS.get(str(one.type))
-        found = values[one.name]
-        if wanted is float and type(found) is int:
-            continue
-        if wanted is not None and type(found) is not wanted:
-            raise TypeError(f"{one.name} is {found!r}, which is no {one.type}")
-    return kind(**values)

@@ -15,6 +15,7 @@ from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.start import destination_node, proposed, why_busy, why_no_executor
 from rosrm.core.master.migration.steps import nobody_there, title
+from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.scheduling.decision import verdict_of
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.hosts import Host
@@ -37,21 +38,23 @@ _BEGUN: Final = {
 # --- checkpoint -------------------------------------------------------------------------------
 
 
-def begin_checkpoint(state: MasterState, process: Process, cause: str, now: float) -> str:
+def begin_checkpoint(
+    state: MasterState, process: Process, cause: str, now: float
+) -> Rejected | None:
     """Begin to dump a running process into an image.
 
     Returns:
-        "", or the reason for the refusal; then nothing has changed.
+        None, or why the process cannot be checkpointed; then nothing has changed.
     """
     refusal = _why_no_checkpoint(state, process)
     if refusal:
-        return refusal
+        return Rejected(refusal)
     owner, name = state.instances[process.owner], _strategy_of(state, process)
     if not name:
-        return _why_no_strategy(state, process)
+        return Rejected(_why_no_strategy(state, process))
     refusal = capabilities.fault(state, name, owner.host, owner.host)
     if refusal:
-        return f"{process.name} cannot be checkpointed: {refusal}"
+        return Rejected(f"{process.name} cannot be checkpointed: {refusal}")
     move = _planned(state, process, owner.id, owner.host, owner.node_name or process.name)
     return _begin(state, process, move, name, Aim.CHECKPOINT, now, cause=cause)
 
@@ -101,21 +104,21 @@ def _why_no_strategy(state: MasterState, process: Process) -> str:
 # --- restore ----------------------------------------------------------------------------------
 
 
-def begin_restore(state: MasterState, process: Process, cause: str, now: float) -> str:
+def begin_restore(state: MasterState, process: Process, cause: str, now: float) -> Rejected | None:
     """Begin to restore a process from its image, on the host of the image.
 
     Returns:
-        "", or the reason for the refusal; then nothing has changed.
+        None, or why the process cannot be restored; then nothing has changed.
     """
     image = process.image
     refusal = _why_no_restore(state, process)
     if refusal or image is None:
-        return refusal
+        return Rejected(refusal)
     host = state.hosts.by_name[image.host]
     ranking = ranking_of(state, demand_to_restore(state, process, image.needs))
     if not ranking.fits(host.column):
         why = verdict_of(ranking, host.column).reason
-        return (
+        return Rejected(
             f"{process.name} can be restored on {host.name} alone, where its image is, and does "
             f"not fit there now: {why or 'no room'}"
         )
@@ -165,13 +168,13 @@ def _planned(
 def _begin(
     state: MasterState, process: Process, move: Move, strategy: str, aim: Aim, now: float,
     *, cause: str, ranking: Ranking | None = None,
-) -> str:  # fmt: skip
-    """Let the strategy plan, and begin the plan; return "", or the reason for the refusal.
+) -> Rejected | None:  # fmt: skip
+    """Let the strategy plan, and begin the plan; return None, or why there is no plan.
 
     `ranking`: the reservation at the destination follows it.
     """
     plan = proposed(state, strategy, move, aim)
-    if isinstance(plan, str):
+    if isinstance(plan, Rejected):
         return plan
     host = state.hosts.by_name[move.source_host]
     run = Run(
@@ -180,7 +183,7 @@ def _begin(
     )  # fmt: skip
     lacking = why_no_executor(state, run)
     if lacking:
-        return lacking
+        return Rejected(lacking)
     state.runs[process.name] = run
     if ranking is not None:
         state.charge_ranked(run.destination, host, now, ranking)
@@ -195,7 +198,7 @@ def _begin(
     )  # fmt: skip
     state.save(process)
     state.save_run(run)
-    return ""
+    return None
 
 
 def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit) -> None:

@@ -15,12 +15,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.images import Unwanted
+from rosrm.core.master.state.pending_orders import ImageRemoval
 from rosrm.core.master.state.process import Image, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
+from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RunExecutor
 
 if TYPE_CHECKING:
     from rosrm.core.master.master_state import MasterState
@@ -30,6 +32,8 @@ _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 60.0
 #: Key of the unwanted images in the journal's table "cluster".
 _KEY: Final = "unwanted_images"
+#: Fields of an unwanted image that the journal has.
+_JOURNALED: Final = ("process", "host", "drop", "numbers")
 
 
 # --- of a process -----------------------------------------------------------------------------
@@ -93,35 +97,24 @@ def remove(
 
 def review(state: MasterState, now: float) -> None:
     """Order hosts that are up to remove unwanted images."""
-    for one in state.images.unwanted.values():
+    for number, one in state.images.unwanted.items():
         host = state.hosts.by_name.get(one.host)
         if host is None or now < one.ask_at:
             continue
         if state.hosts.condition_of(host) is not HostCondition.UP:
             continue
-        one.order, one.ask_at = state.order_id(), now + _PATIENCE + _ASK_AGAIN
         arguments = {"process": one.process, "numbers": list(one.numbers)}
-        state.emit(
-            Order(
-                one.order, host.host_id, "execute", executor=one.drop, arguments=arguments,
-                timeout=_PATIENCE,
-            )
-        )  # fmt: skip
+        removal = RunExecutor(one.drop, arguments, _PATIENCE)
+        one.order = state.send(host, removal, ImageRemoval(number))
+        one.ask_at = now + _PATIENCE + _ASK_AGAIN
 
 
-def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
-    """Handle the answer to a removal; return True if it was one."""
-    for number, one in state.images.unwanted.items():
-        if one.order == event.order:
-            _note_answer(state, number, one, event, now)
-            return True
-    return False
-
-
-def _note_answer(
-    state: MasterState, number: int, one: Unwanted, event: happened.OrderAnswered, now: float
-) -> None:
-    one.order = 0
+def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
+    """Note that a host has removed an image, or why not."""
+    one = state.images.unwanted.get(number)
+    if one is None or one.order != event.order:
+        return
+    one.order = None
     if event.accepted or event.code == happened.BAD_RESULT:  # it ran without a result
         del state.images.unwanted[number]
         state.record(
@@ -141,10 +134,9 @@ def _note_answer(
 
 def _save(state: MasterState) -> None:
     unwanted = {
-        str(number): {"process": one.process, "host": one.host, "drop": one.drop,
-                      "numbers": list(one.numbers)}
+        str(number): fields_to_plain(one, _JOURNALED)
         for number, one in state.images.unwanted.items()
-    }  # fmt: skip
+    }
     state.emit(Intent("cluster", _KEY, unwanted or None))
 
 
@@ -155,6 +147,5 @@ def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> Non
         cluster: the journal's table of that name.
     """
     for number, one in cluster.get(_KEY, {}).items():
-        state.images.unwanted[int(number)] = Unwanted(
-            one["process"], one["host"], one["drop"], tuple(map(int, one["numbers"]))
-        )
+        known = fields_from_plain(Unwanted, one, _JOURNALED)
+        state.images.unwanted[int(number)] = Unwanted(**known)

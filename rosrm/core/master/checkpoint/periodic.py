@@ -19,17 +19,19 @@ from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
 from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.hosts import Host, HostCondition
-from rosrm.core.master.state.periodic import BEFORE_FIRST, Dumped
+from rosrm.core.master.state.pending_orders import PeriodicCheckpoint
+from rosrm.core.master.state.periodic import Dumped
 from rosrm.core.master.state.process import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import MemoryPacing, MemoryView, PeriodicImaging
 from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RunExecutor
 from rosrm.model.plan import Execute
-from rosrm.model.plan_json import checked_step
 from rosrm.wording import size
 
 if TYPE_CHECKING:
@@ -48,7 +50,7 @@ def review(state: MasterState, now: float) -> None:
         return
     known.looked = now
     for number in [number for number in known.of if number not in state.instances]:
-        if _remove(state, known.of[number]):
+        if _remove(state, number, known.of[number]):
             del known.of[number]
     if any(implements(one, PeriodicImaging) for one in state.strategies.values()):
         for process in state.processes.values():
@@ -56,14 +58,11 @@ def review(state: MasterState, now: float) -> None:
                 _review(state, process, now)
 
 
-def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
-    """Handle the answer to an order of this module; return True if it was one."""
-    if event.order <= BEFORE_FIRST:
-        return False
-    for dumped in state.periodic.of.values():
-        if dumped.order == event.order:
-            _note(state, dumped, event, now)
-    return True
+def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
+    """Note the result of the dump under way of an instance."""
+    dumped = state.periodic.of.get(number)
+    if dumped is not None and dumped.order == event.order:
+        _note(state, dumped, event, now)
 
 
 def of_process(state: MasterState, process: Process, now: float) -> Mapping[str, Any] | None:
@@ -91,31 +90,31 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         name = process.spec.migration.strategy or ""
         discard = _discard_of(state, name)
         dumped = state.periodic.of[number] = Dumped(process.name, host.name, name, discard, now)
-    if dumped.order and dumped.asked != host.description.incarnation:
-        dumped.order, dumped.since = 0, now  # the dump ended with the slave that made it
-    if dumped.order or not _may_be_dumped(state, process, owner):
+    if dumped.order is not None and dumped.asked != host.description.incarnation:
+        dumped.order, dumped.since = None, now  # the dump ended with the slave that made it
+    if dumped.order is not None or not _may_be_dumped(state, process, owner):
         return
-    pace, trouble = _pace(state, process, strategy, host, dumped)
-    if pace is not None:
-        if now < dumped.since + pace:
-            return
+    pace = _pace(state, process, strategy, host, dumped)
+    if isinstance(pace, Rejected):
+        _say_trouble(state, dumped, pace.reason, now)
+    elif pace is not None and now >= dumped.since + pace:
         trouble = capabilities.fault(state, process.spec.migration.strategy or "", host, host)
-    if pace is None or trouble:
-        _say_trouble(state, dumped, trouble, now)
-    else:
-        _order(state, process, strategy, owner, dumped, now)
+        if trouble:
+            _say_trouble(state, dumped, trouble, now)
+        else:
+            _order(state, process, strategy, owner, dumped, now)
 
 
-def _discard_of(state: MasterState, name: str) -> str | None:
-    """Return the executor by which a strategy removes images; "": none; None: the call failed."""
+def _discard_of(state: MasterState, name: str) -> str | Rejected | None:
+    """Return the executor by which a strategy removes images; None: it has none."""
     strategy: object = state.strategies.get(name)
     if not implements(strategy, PeriodicImaging):
-        return ""
+        return None
     asked = strategy
     try:
         return state.plugins.ask("migration", name, "discard", lambda: required(asked.discard, str))
-    except PluginError:
-        return None
+    except PluginError as error:
+        return Rejected(str(error))
 
 
 def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
@@ -131,13 +130,13 @@ def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> boo
 
 def _pace(
     state: MasterState, process: Process, strategy: PeriodicImaging, host: Host, dumped: Dumped
-) -> tuple[float | None, str]:
-    """Return the seconds between two dumps (None: no dump), and the error if there is one."""
+) -> float | Rejected | None:
+    """Return the seconds between two dumps; None: no dump is wanted."""
     policy, name = state.keeping.policy, state.keeping.policy_name
     if policy is None:
-        return None, "no checkpoint policy is selected: name one in the cluster's file"
+        return Rejected("no checkpoint policy is selected: name one in the cluster's file")
     if not implements(policy, MemoryPacing):
-        return None, f"the checkpoint policy {name!r} makes none of memory"
+        return Rejected(f"the checkpoint policy {name!r} makes none of memory")
     pacing = policy
     asked_of = process.spec.migration.strategy or ""
     try:
@@ -146,14 +145,12 @@ def _pace(
             lambda: float(strategy.checkpoint_every(process.spec)),
         )  # fmt: skip
         if not asked > 0.0:
-            return None, ""
+            return None
         view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
         asked_of = name
-        return state.plugins.ask(
-            "checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view))
-        ), ""  # fmt: skip
+        return state.plugins.ask("checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view)))
     except PluginError as error:
-        return None, f"{asked_of!r} sets no pace: {error}"
+        return Rejected(f"{asked_of!r} sets no pace: {error}")
 
 
 def sound_pace(pace: float | None) -> float | None:
@@ -171,28 +168,23 @@ def _order(
 
     def ask() -> Execute:
         step = required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute)
-        return required(checked_step(step), Execute)
+        return checked(step, "step")
 
     try:
         step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask)
     except PluginError as error:
         _say_trouble(state, dumped, str(error), now)
         return
-    state.periodic.last_order += 1
-    dumped.order, dumped.asked = state.periodic.last_order, owner.host.description.incarnation
-    state.emit(
-        Order(
-            dumped.order, owner.host.host_id, "execute", executor=step.executor,
-            arguments=step.arguments, timeout=step.timeout,
-        )
-    )  # fmt: skip
+    dump = RunExecutor(step.executor, step.arguments, step.timeout)
+    dumped.order = state.send(owner.host, dump, PeriodicCheckpoint(owner.id.number))
+    dumped.asked = owner.host.description.incarnation
 
 
 # --- results ----------------------------------------------------------------------------------
 
 
 def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
-    dumped.order, dumped.since = 0, now
+    dumped.order, dumped.since = None, now
     if not event.accepted:
         _say_trouble(state, dumped, event.message or event.code, now)
         return
@@ -218,7 +210,7 @@ def _number(value: Any) -> float:
 
 def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
     """Record a failure of periodic checkpoints, once until the reason changes."""
-    if not trouble or trouble == dumped.trouble:
+    if trouble == dumped.trouble:
         return
     dumped.trouble = trouble
     state.record(
@@ -228,7 +220,7 @@ def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -
     )  # fmt: skip
 
 
-def _remove(state: MasterState, dumped: Dumped) -> bool:
+def _remove(state: MasterState, number: int, dumped: Dumped) -> bool:
     """Order the removal of images; return False if the strategy must be asked again first.
 
     A host that is not up removes them when it registers.
@@ -236,15 +228,11 @@ def _remove(state: MasterState, dumped: Dumped) -> bool:
     host = state.hosts.by_name.get(dumped.host)
     if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
         return True
-    if dumped.discard is None:
+    if isinstance(dumped.discard, Rejected):
         dumped.discard = _discard_of(state, dumped.strategy)
-    if not dumped.discard:
-        return dumped.discard is not None
-    state.periodic.last_order += 1
-    state.emit(
-        Order(
-            state.periodic.last_order, host.host_id, "execute", executor=dumped.discard,
-            timeout=_PATIENCE,
-        )
-    )  # fmt: skip
+    if isinstance(dumped.discard, Rejected):
+        return False
+    if dumped.discard:
+        remove = RunExecutor(dumped.discard, timeout=_PATIENCE)
+        state.send(host, remove, PeriodicCheckpoint(number))
     return True

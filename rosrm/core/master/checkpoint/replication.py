@@ -30,14 +30,15 @@ from collections.abc import Mapping
 from typing import Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.pending_orders import Replication
 from rosrm.core.master.state.replicas import Holding, Told
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.extensions.plugin_calls import required
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import DropReplica, ReplicateSnapshot
 from rosrm.model.values import InstanceId, KeptState
 
 #: Seconds between two reviews of the same process.
@@ -98,15 +99,11 @@ def _was_left_on(process: Process, host: str) -> bool:
     return process.left_behind is not None and process.left_behind.host == host
 
 
-def order_answered(state: MasterState, event: happened.OrderAnswered) -> bool:
-    """Handle the answer to an order of this module; return True if it was one."""
-    name = state.keeping.orders.pop(event.order, None)
-    if name is None:
-        return False
-    told = state.keeping.told.get(name)
+def note_answer(state: MasterState, process: str, event: happened.OrderAnswered) -> None:
+    """Note that a slave has accepted or refused the newest choice for a process."""
+    told = state.keeping.told.get(process)
     if told is not None and told.order == event.order:
         told.taken = event.accepted
-    return True
 
 
 # --- requests -------------------------------------------------------------------------------
@@ -182,15 +179,10 @@ def _choose(
         told.chosen = chosen
     if told is not None and known and (told.taken or now - told.at < state.settings.order_retry):
         return
-    order = state.keeping.order_id()
-    state.keeping.orders[order] = process.name
+    instance = InstanceId(process.name, process.owner)
+    replicate = ReplicateSnapshot(instance, choice.hosts, choice.every)
+    order = state.send(host, replicate, Replication(process.name))
     state.keeping.told[process.name] = Told(process.owner, incarnation, choice, order, now, chosen)
-    state.emit(
-        Order(
-            order, host.host_id, "keep", InstanceId(process.name, process.owner),
-            keep_on=choice.hosts, keep_every=choice.every,
-        )
-    )  # fmt: skip
     if not known and (told is None or set(told.choice.hosts) != set(choice.hosts)):
         where = ", ".join(choice.hosts) or "no other host"
         state.record(
@@ -305,5 +297,4 @@ def _drop(state: MasterState, process: str, name: str, holding: Holding, now: fl
     if now - at < state.settings.order_retry:
         return
     state.keeping.dropped_at[process, name] = now
-    instance = InstanceId(process, holding.number)
-    state.emit(Order(state.keeping.order_id(), host.host_id, "drop_kept", instance))
+    state.send(host, DropReplica(InstanceId(process, holding.number)), Replication(process))

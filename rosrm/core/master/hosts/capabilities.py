@@ -19,14 +19,15 @@ from math import inf
 from typing import TYPE_CHECKING, Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Order
 from rosrm.core.master.plugin_failures import why_broken
-from rosrm.core.master.state.capabilities import BEFORE_FIRST, Answer
+from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.pending_orders import CapabilityQuery
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostChecking
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RunExecutor
 from rosrm.wording import listed
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
         )
     except PluginError as error:
         answer = Answer(
-            incarnation, 0, reason=f"its ability is not known: {error}", ask_at=now + _ASK_AGAIN
+            incarnation, reason=f"its ability is not known: {error}", ask_at=now + _ASK_AGAIN
         )
         state.abilities.answers[name, host.name] = answer
         return
@@ -70,36 +71,24 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
         reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
         # Asked again, because the slave reports broken plugins only after its registration.
         state.abilities.answers[name, host.name] = Answer(
-            incarnation, 0, reason=reason, ask_at=now + _ASK_AGAIN
+            incarnation, reason=reason, ask_at=now + _ASK_AGAIN
         )
         return
-    state.abilities.last_order += 1
-    order = state.abilities.last_order
+    query = CapabilityQuery(name, host.name)
+    order = state.send(host, RunExecutor(ability, timeout=_PATIENCE), query)
     state.abilities.answers[name, host.name] = Answer(
         incarnation, order, ask_at=now + _PATIENCE + _ASK_AGAIN
     )
-    state.emit(Order(order, host.host_id, "execute", executor=ability, timeout=_PATIENCE))
 
 
-def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
-    """Handle the answer to a question of this module; return True if it was one."""
-    if event.order <= BEFORE_FIRST:
-        return False
-    for (strategy, host), answer in state.abilities.answers.items():
-        if answer.order == event.order:
-            _note(state, strategy, host, answer, event, now)
-            return True
-    return False
-
-
-def _note(
-    state: MasterState,
-    strategy: str,
-    host: str,
-    answer: Answer,
-    event: happened.OrderAnswered,
-    now: float,
+def note_answer(
+    state: MasterState, query: CapabilityQuery, event: happened.OrderAnswered, now: float
 ) -> None:
+    """Note the answer of a host about a strategy, unless the host was asked again since."""
+    strategy, host = query.strategy, query.host
+    answer = state.abilities.answers[strategy, host]
+    if answer.order != event.order:
+        return
     if event.accepted:
         answer.facts = {key: str(value) for key, value in (event.result or {}).items()}
         answer.reason, answer.ask_at = "", inf

@@ -15,12 +15,12 @@ from typing import Final
 import numpy as np
 
 from rosrm.core.master.assignment.assign import reconsider_set_aside
-from rosrm.core.master.commands import Order
 from rosrm.core.master.hosts import loss
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import ReportInstances
 
 #: Reports that a host may owe before it is suspect, however seldom it reports.
 _REPORTS_MISSED: Final = 3
@@ -102,5 +102,5 @@ def welcome_back(state: MasterState, host: Host, now: float) -> None:
     if was_lost:
         loss.regain_sight(state, host, now)
         state.hosts.set_untold(host, untold=True)
-        state.emit(Order(state.order_id(), host.host_id, "report"))
+        state.send(host, ReportInstances())
     reconsider_set_aside(state, now)

@@ -6,11 +6,11 @@ job that has completed in between is complete. If a successor has started, the i
 
 from __future__ import annotations
 
-from rosrm.core.master.commands import Order
 from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import LeftBehind
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import SetRestartPolicy
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
 
@@ -53,8 +53,7 @@ def _take_back(
     )  # fmt: skip
     state.save(process)
     # A migration under way at the loss may have ordered the slave not to restart it.
-    restart = process.spec.restart
-    state.emit(Order(state.order_id(), host.host_id, "set_restart", instance.id, restart=restart))
+    state.send(host, SetRestartPolicy(instance.id, process.spec.restart))
 
 
 def has_successor(state: MasterState, status: InstanceStatus) -> bool:

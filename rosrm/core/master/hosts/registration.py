@@ -11,7 +11,7 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.reservations import settle_charge
 from rosrm.core.master.checkpoint import replication
-from rosrm.core.master.commands import Order, Reply
+from rosrm.core.master.commands import Reply
 from rosrm.core.master.hosts import loss
 from rosrm.core.master.hosts.liveness import lease_end, welcome_back
 from rosrm.core.master.hosts.readings import take_readings
@@ -21,6 +21,7 @@ from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.extensions.contracts import Intent
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import ReportInstances
 from rosrm.model.plan import Execute
 from rosrm.model.values import InstanceStatus
 from rosrm.wording import counted
@@ -115,7 +116,7 @@ def _registered_again(
     if condition in (HostCondition.LOST, HostCondition.SUSPECT):
         welcome_back(state, host, now)
     if condition is not HostCondition.LOST:
-        state.emit(Order(state.order_id(), host.host_id, "report"))
+        state.send(host, ReportInstances())
     state.emit(Reply(event.request, host_id=host.host_id))
 
 

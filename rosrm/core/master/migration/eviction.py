@@ -23,6 +23,7 @@ from rosrm.core.master.migration.start import (
     why_no_executor,
     without_executor,
 )
+from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.scheduling.decision import decide, verdict_of
 from rosrm.core.master.scheduling.feasibility import may_ever_take
 from rosrm.core.master.scheduling.ranking import Ranking
@@ -106,12 +107,14 @@ def _relieve_resource(state: MasterState, host: Host, resource: str, now: float)
     for instance in _largest_first(state, host, resource):
         process = state.processes[instance.id.process]
         reason = _why_not_now(state, process, instance, resource, now)
-        reason = reason or try_move(
-            state, process, f"{host.name} is over its limit of {resource}", now,
-            headroom=state.settings.headroom,
-        )  # fmt: skip
         if not reason:
-            return
+            rejected = try_move(
+                state, process, f"{host.name} is over its limit of {resource}", now,
+                headroom=state.settings.headroom,
+            )  # fmt: skip
+            if rejected is None:
+                return
+            reason = rejected.reason
         reasons.append((process.name, reason))
     _tell_nothing_moves(state, host, resource, reasons, now)
 
@@ -146,57 +149,58 @@ def _why_not_now(
 def try_move(
     state: MasterState, process: Process, cause: str, now: float, *, headroom: float = 0.0,
     host: Host | None = None,
-) -> str:  # fmt: skip
+) -> Rejected | None:  # fmt: skip
     """Move a process to the host with the largest margin, or to a given one.
 
     A host that lacks an executor of the plan is passed over, unless it was given.
 
     Returns:
-        "", or the reason for the refusal; then nothing has changed.
+        None, or why the process cannot be moved; then nothing has changed.
     """
     refusal = why_immovable(state, process)
     if refusal:
-        return refusal
+        return Rejected(refusal)
     source, lacking = state.instances[process.owner], dict[str, str]()
     measured = source.measured
     while True:
         demand = demand_to_move(state, process, measured, source.host.name, headroom, lacking)
         ranking = ranking_of(state, demand)
         destination = _destination(state, process, ranking, source.host, host)
-        if isinstance(destination, str):
-            return "; ".join(dict.fromkeys(lacking.values())) or destination
+        if isinstance(destination, Rejected):
+            return Rejected("; ".join(dict.fromkeys(lacking.values()))) if lacking else destination
         run = plan_move(state, process, destination, cause, now)
-        if isinstance(run, str):
+        if isinstance(run, Rejected):
             return run
         refusal = why_no_executor(state, run)
         if not refusal:
             break
         hosts, shared = without_executor(state, run)
         if host is not None or not hosts:
-            return refusal
+            return Rejected(refusal)
         lacking.update(dict.fromkeys(hosts, shared))
     decision = decide(ranking, chosen=destination.column)
     begin_move(state, process, run, ranking, now)
     state.note_decision(process, decision, "migrated", now)
-    return ""
+    return None
 
 
 def _destination(
     state: MasterState, process: Process, ranking: Ranking, source: Host, host: Host | None
-) -> Host | str:
+) -> Host | Rejected:
     """Return the best host of a ranking, or the given one if it fits; else why there is none."""
     if host is None:
         column = ranking.best()
         if column < 0:
             if _is_alone(state, source):
-                return _ALONE
-            return f"no host has room for {process.name}{_and_why(state, process, source)}"
+                return Rejected(_ALONE)
+            why = _and_why(state, process, source)
+            return Rejected(f"no host has room for {process.name}{why}")
         return state.hosts.hosts[column]
     if host is source:
-        return f"{process.name} runs on {host.name} already"
+        return Rejected(f"{process.name} runs on {host.name} already")
     if not ranking.fits(host.column):
         why = verdict_of(ranking, host.column).reason
-        return f"{process.name} does not fit on {host.name}: {why or 'no room'}"
+        return Rejected(f"{process.name} does not fit on {host.name}: {why or 'no room'}")
     return host
 
 
@@ -292,9 +296,9 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
             return
         if process.name in state.runs:
             continue
-        reason = try_move(state, process, f"{host.name} is being drained", now)
-        if reason:
-            reasons.append((process.name, reason))
+        rejected = try_move(state, process, f"{host.name} is being drained", now)
+        if rejected is not None:
+            reasons.append((process.name, rejected.reason))
     reasons += _images_on(state, host)
     if reasons:
         _tell_nothing_moves(state, host, "drain", reasons, now)

@@ -13,6 +13,7 @@ any       cannot be done      it is left out: an instance that has ended never s
                               An executor that ran and returned no object counts as done
 back      destination active  forward to the commit: in a handoff the destination itself decides;
                               in a restore an executor has found that the process runs
+standby   comes to SWITCH     it is paused, and goes forward once the source has ended
 ========  ==================  ==============================================================
 
 Cancelling a process turns its migration back; a stuck one is given up, and all its instances are
@@ -22,28 +23,32 @@ stopped. When neither source nor destination is left, the process returns to the
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 from typing import Any, Final
 
-from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
-from rosrm.core.master.checkpoint import image_requests, images, periodic, replication
-from rosrm.core.master.events import BAD_RESULT
-from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
-from rosrm.core.master.migration import handoff
+from rosrm.core.master.migration import failover, handoff
 from rosrm.core.master.migration.steps import (
-    DONE,
-    give_order,
-    give_order_again,
-    note_result,
+    begin,
     outcome_of,
-    timed_out,
     title,
 )
-from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
 from rosrm.core.master.state.migration import End
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.plan import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
+from rosrm.model.plan import (
+    Aim,
+    AwaitReady,
+    Commit,
+    Configure,
+    Execute,
+    HandoffPhase,
+    Start,
+    Step,
+    Stop,
+)
 from rosrm.model.values import InstanceId, InstanceState
 
 #: Message of the record of a commit.
@@ -63,22 +68,28 @@ def advance_all(state: MasterState, now: float) -> None:
             pass
 
 
-def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
-    """Handle the answer of a slave to an order: accepted, refused, or none in time."""
-    if (
-        periodic.order_answered(state, event, now)
-        or replication.order_answered(state, event)
-        or capabilities.order_answered(state, event, now)
-        or images.order_answered(state, event, now)
-    ):
-        return
-    name = state.runs_by_order.pop(event.order, None)
-    run = state.runs.get(name) if name is not None else None
-    if run is not None and run.order == event.order and event.code != "timeout":
-        run.answer = (event.accepted, event.message or event.code)
-        run.bad_result = event.code == BAD_RESULT
-        if event.accepted and event.result:
-            note_result(run, event.result)
+def advance_standby(state: MasterState, run: Run, now: float) -> StepOutcome:
+    """Advance the migration of a standby up to its SWITCH step, where it is paused.
+
+    Only the standby is started and configured: the primary keeps running as before, with its
+    restarts. So the other steps before SWITCH are left out.
+
+    Returns:
+        The outcome of the current step; DONE: the migration is paused.
+    """
+    pause = failover.index_of(HandoffPhase.SWITCH, run.plan.steps)
+    while run.index < pause:
+        step = run.plan.steps[run.index]
+        if isinstance(step, Start) or (isinstance(step, Configure) and step.awaited):
+            if not begin(state, run, step, now):
+                return StepProgress.PENDING
+            if isinstance(step, Configure):
+                run.deadline = inf  # a primary that is silent for long is no fault of its standby
+            outcome = outcome_of(state, run, step, now)
+            if outcome is not StepProgress.DONE:
+                return outcome
+        _go_on(state, run, now)
+    return StepProgress.DONE
 
 
 def _advance(state: MasterState, run: Run, now: float) -> bool:
@@ -91,19 +102,15 @@ def _advance(state: MasterState, run: Run, now: float) -> bool:
     if isinstance(step, Start) and run.undo is not None and not _goes_on(state, run):
         _go_on(state, run, now)
         return True
-    if not run.begun:
-        if now < run.retry_at or _is_expected(state, run, step):
-            return False
-        run.begun, run.answer, run.bad_result = True, None, False
-        run.deadline = now + max(step.timeout, 0.0)
-        give_order(state, run, step, now)
-    outcome = _outcome(state, run, step, now)
-    if outcome is None:
+    if not begin(state, run, step, now):
         return False
-    if outcome == DONE:
-        _next(state, run, step, now)
+    outcome = outcome_of(state, run, step, now)
+    if outcome is StepProgress.PENDING:
+        return False
+    if isinstance(outcome, StepFailed):
+        _failed(state, run, step, outcome.reason, now)
     else:
-        _failed(state, run, step, outcome, now)
+        _next(state, run, step, now)
     return run.begun or not run.stuck
 
 
@@ -121,31 +128,6 @@ def _choose_way(state: MasterState, run: Run, now: float) -> None:
         reason = _why_turn_back(state, run)
         if reason:
             _turn_back(state, run, reason, now)
-
-
-def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
-    """Return True if a host that the step needs has not returned since the master started.
-
-    The step waits for it until its lease ends; then the step begins, and its own time-out decides.
-    """
-    if isinstance(step, Commit):
-        return False
-    if not isinstance(step, Configure):
-        concerned = [state.hosts.by_name[step.host]]
-    else:
-        both = (run.source.number, run.destination.number) if step.awaited else ()
-        concerned = [state.instances[one].host for one in both if one in state.instances]
-    return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
-
-
-def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None:
-    """Return the outcome of the current step; repeat its order or end it at its time-out."""
-    outcome = outcome_of(step, state, run, now)
-    if outcome is None:
-        give_order_again(state, run, step, now)
-        if now >= run.deadline:
-            outcome = timed_out(state, run, step, now)
-    return outcome
 
 
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:

@@ -1,8 +1,8 @@
 """Failover: a standby replaces its primary.
 
-A standby is the first half of a handoff: its plan was begun, and waits before the step in which the
-destination becomes active. When the primary has ended, that step is carried out: the destination
-receives the order to take over, and the plan continues as usual, forward or back.
+A standby is the destination of a migration that is paused before the step in which the destination
+becomes active. When the primary has ended, `take_over` resumes the migration: that step orders the
+destination to take over, and the plan continues as usual, forward or back.
 """
 
 from __future__ import annotations

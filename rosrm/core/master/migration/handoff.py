@@ -14,12 +14,12 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress, done_if
 from rosrm.core.master.state.migration import Heard, Run
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
 from rosrm.model.values import InstanceId, ProcessSpec
 
-DONE: Final = ""
 #: Reports of a destination that follows the source, or is further still.
 _READY: Final = frozenset({ReportPhase.READY, ReportPhase.SWITCHING, ReportPhase.ACTIVE})
 
@@ -166,55 +166,56 @@ def is_switching(run: Run) -> bool:
 # --- outcome of a phase -----------------------------------------------------------------------
 
 
-def outcome(step: Configure, state: MasterState, run: Run) -> str | None:
-    """Return the outcome of the current phase: None: pending; "": done; else the failure."""
-    return _OUTCOMES[step.phase](state, run) if step.awaited else DONE
+def outcome(step: Configure, state: MasterState, run: Run) -> StepOutcome:
+    """Return the outcome of the current phase."""
+    return _OUTCOMES[step.phase](state, run) if step.awaited else StepProgress.DONE
 
 
-def _shadowing(state: MasterState, run: Run) -> str | None:
-    fault = _fault(state, run)
-    if fault:
-        return fault
-    return DONE if _READY & run.phases_of(run.destination).keys() else None
+def _shadowing(state: MasterState, run: Run) -> StepOutcome:
+    is_ready = bool(_READY & run.phases_of(run.destination).keys())
+    return _fault(state, run) or done_if(is_ready)
 
 
-def _switching(state: MasterState, run: Run) -> str | None:
-    return DONE if is_active(state, run) else _fault(state, run) or None
+def _switching(state: MasterState, run: Run) -> StepOutcome:
+    if is_active(state, run):
+        return StepProgress.DONE
+    return _fault(state, run) or StepProgress.PENDING
 
 
-def _fault(state: MasterState, run: Run) -> str:
-    """Return why the destination can no longer become active; "" if it can."""
+def _fault(state: MasterState, run: Run) -> StepFailed | None:
+    """Return why the destination can no longer become active; None: it can."""
     if run.destination.number not in state.instances:
         how = run.how_ended(run.destination)
-        return f"{run.destination} ended on {run.destination_host.name}: {how}"
+        return StepFailed(f"{run.destination} ended on {run.destination_host.name}: {how}")
     for instance in (run.destination, run.source):
         said = run.phases_of(instance)
         if ReportPhase.FAILED in said:
-            return f"{instance} {_REPORTS[ReportPhase.FAILED]}: {said[ReportPhase.FAILED]}"
+            how = f"{_REPORTS[ReportPhase.FAILED]}: {said[ReportPhase.FAILED]}"
+            return StepFailed(f"{instance} {how}")
     if ReportPhase.ABORTED in run.phases_of(run.destination):
-        return f"{run.destination} {_REPORTS[ReportPhase.ABORTED]}"
-    return ""
+        return StepFailed(f"{run.destination} {_REPORTS[ReportPhase.ABORTED]}")
+    return None
 
 
-def _aborting(state: MasterState, run: Run) -> str | None:
+def _aborting(state: MasterState, run: Run) -> StepOutcome:
     said = run.phases_of(run.destination)
     aborted = ReportPhase.ABORTED in said or ReportPhase.FAILED in said
-    return DONE if aborted or run.destination.number not in state.instances else None
+    return done_if(aborted or run.destination.number not in state.instances)
 
 
-def _resuming(state: MasterState, run: Run) -> str | None:
+def _resuming(state: MasterState, run: Run) -> StepOutcome:
     resumed = ReportPhase.RESUMED in run.phases_of(run.source)
     ended = run.source.number not in state.instances
     # A source without the protocol reports nothing, and never stopped publishing.
     deaf = not was_switched(run) and not run.phases_of(run.source)
-    return DONE if resumed or ended or deaf else None
+    return done_if(resumed or ended or deaf)
 
 
-def _at_once(state: MasterState, run: Run) -> str | None:
-    return DONE
+def _at_once(state: MasterState, run: Run) -> StepOutcome:
+    return StepProgress.DONE
 
 
-_OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Run], str | None]]] = {
+_OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Run], StepOutcome]]] = {
     HandoffPhase.SHADOW: _shadowing,
     HandoffPhase.SWITCH: _switching,
     HandoffPhase.ABORT: _aborting,
@@ -233,16 +234,17 @@ def was_switched(run: Run) -> bool:
 # --- time-outs --------------------------------------------------------------------------------
 
 
-def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> str | None:
+def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> StepOutcome:
     """Return the outcome of a phase after its time-out, as `outcome` does."""
     if step.phase is HandoffPhase.RESUME and not was_switched(run):
-        return DONE  # it was never ordered to be silent
+        return StepProgress.DONE  # it was never ordered to be silent
     if step.phase is HandoffPhase.ABORT:
         instance = state.instances[run.destination.number]
         if not instance.stopping:
             _stop_unheard(state, run, now)
-            return None
-    return f"{TITLES[step.phase]} took longer than {step.timeout:g} s: {_waited(run)}"
+            return StepProgress.PENDING
+    what = f"{TITLES[step.phase]} took longer than {step.timeout:g} s"
+    return StepFailed(f"{what}: {_waited(run)}")
 
 
 def _stop_unheard(state: MasterState, run: Run, now: float) -> None:

@@ -1,5 +1,8 @@
 """Standbys: a second instance on another host follows the state of a process.
 
+A standby is the destination of a migration that `executor` carries out up to the SWITCH step, where
+it is paused. `failover` resumes the migration when the primary has ended.
+
 ======================  =====================================================================
 the process             action on its standby
 ======================  =====================================================================
@@ -10,8 +13,6 @@ waits for its restart   the primary is stopped for good, and its end hands over 
 moves                   it is kept until the migration is committed, because that may fail
 has ended               the standby is stopped
 ======================  =====================================================================
-
-`failover` handles the end of the primary.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from typing import Final
 from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import demand_of, ranking_of
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration import failover, handoff
+from rosrm.core.master.migration import executor, failover, handoff
 from rosrm.core.master.migration.start import plan_move, why_no_executor
-from rosrm.core.master.migration.steps import give_order
+from rosrm.core.master.outcomes import Rejected, StepFailed, StepProgress
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.migration import Run
@@ -67,8 +68,8 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         return False
     host = state.hosts.hosts[column]
     run = plan_move(state, process, host, "standby", now)
-    why = run if isinstance(run, str) else why_no_executor(state, run)
-    if isinstance(run, str) or why or not _can_wait(run):
+    why = run.reason if isinstance(run, Rejected) else why_no_executor(state, run)
+    if isinstance(run, Rejected) or why or not _can_wait(run):
         why = why or "its migration strategy keeps no standby ready"
         _wait(state, process, f"it can have no standby: {why}", now)
         return False
@@ -79,7 +80,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         process=process.name, host=host.name, facts={"number": run.destination.number},
     )  # fmt: skip
     process.standby_reason = f"its standby starts on {host.name}"
-    _order_start(state, run, now)
+    executor.advance_standby(state, run, now)
     state.save(process)
     return True
 
@@ -122,13 +123,6 @@ def _wait(state: MasterState, process: Process, why: str, now: float) -> None:
         state.record(now, EventKind.STANDBY_WAITS, f"{process.name}: {why}", process=process.name)
 
 
-def _order_start(state: MasterState, run: Run, now: float) -> None:
-    start = next(step for step in run.plan.steps if isinstance(step, Start))
-    if not run.begun:
-        run.deadline, run.begun = now + start.timeout, True
-    give_order(state, run, start, now)
-
-
 # --- review of a standby ----------------------------------------------------------------------
 
 
@@ -146,27 +140,28 @@ def _review(state: MasterState, run: Run, now: float) -> None:
         end_standby(state, process, now)
     elif instance.host.draining:
         _lost(state, process, run, f"{instance.host.name} is being drained", now)
-    elif not instance.runs:
-        _see_it_start(state, process, run, now)
+    elif (gave_up := _why_given_up(run)) is not None:
+        _lost(state, process, run, gave_up, now)
     else:
-        _see_it_follow(state, process, run, now)
+        _advance(state, process, run, now)
 
 
-def _see_it_start(state: MasterState, process: Process, run: Run, now: float) -> None:
-    if run.begun and now >= run.deadline:
-        _lost(state, process, run, f"{run.destination} did not start in time", now)
-    elif not run.begun or now - run.order_at >= state.settings.order_retry:
-        _order_start(state, run, now)
-
-
-def _see_it_follow(state: MasterState, process: Process, run: Run, now: float) -> None:
+def _why_given_up(run: Run) -> str | None:
+    """Return why the standby has called the handoff off; None: it has not."""
     said = run.phases_of(run.destination)
-    gave_up = said.get(ReportPhase.FAILED) or said.get(ReportPhase.ABORTED)
-    if gave_up is not None:
-        _lost(state, process, run, gave_up or f"{run.destination} has called the handoff off", now)
-    elif ReportPhase.READY not in said:
-        _say_shadow(state, run, now)
-    else:
+    if said.keys().isdisjoint({ReportPhase.FAILED, ReportPhase.ABORTED}):
+        return None
+    why = said.get(ReportPhase.FAILED) or said.get(ReportPhase.ABORTED)
+    return why or f"{run.destination} has called the handoff off"
+
+
+def _advance(state: MasterState, process: Process, run: Run, now: float) -> None:
+    outcome = executor.advance_standby(state, run, now)
+    if isinstance(outcome, StepFailed):
+        late = now >= run.deadline
+        why = f"{run.destination} did not start in time" if late else outcome.reason
+        _lost(state, process, run, why, now)
+    elif outcome is StepProgress.DONE:
         _note_ready(state, process, run, now)
 
 
@@ -179,15 +174,6 @@ def _note_ready(state: MasterState, process: Process, run: Run, now: float) -> N
             now, EventKind.STANDBY_READY, f"the standby of {process.name} is ready on {host}",
             process=process.name, host=host,
         )  # fmt: skip
-
-
-def _say_shadow(state: MasterState, run: Run, now: float) -> None:
-    shadow = failover.index_of(HandoffPhase.SHADOW, run.plan.steps)
-    if run.index != shadow:
-        run.index, run.begun = shadow, False
-    if not run.begun or now - run.order_at >= state.settings.order_retry:
-        run.begun, run.order_at = True, now
-        handoff.publish(state, run, HandoffPhase.SHADOW)
 
 
 def _lost(state: MasterState, process: Process, run: Run, why: str, now: float) -> None:

@@ -8,14 +8,15 @@ from typing import Final
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.master.migration.steps import title
+from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.plugin_failures import why_broken
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError, describe_fault
 from rosrm.extensions.plugin_calls import required
+from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
-from rosrm.model.plan_json import checked_plan
 from rosrm.wording import listed, standing
 
 #: Method of a strategy that plans for each aim.
@@ -48,7 +49,7 @@ def begin_move(
 
 def plan_move(
     state: MasterState, process: Process, destination: Host, cause: str, now: float
-) -> Run | str:
+) -> Run | Rejected:
     """Return the planned migration of a running process, or why there is no plan."""
     source = state.instances[process.owner]
     name = process.spec.migration.strategy or ""
@@ -58,7 +59,7 @@ def plan_move(
         source.node_name or process.name,
     )  # fmt: skip
     plan = proposed(state, name, move)
-    if isinstance(plan, str):
+    if isinstance(plan, Rejected):
         return plan
     return Run(
         process.name, plan, name, source.id, source.host, move.destination, destination, cause,
@@ -165,7 +166,7 @@ def _lacks(state: MasterState, run: Run, executor: str, hosts: list[str]) -> str
     )
 
 
-def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | str:
+def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | Rejected:
     """Return the plan of a strategy, or why there is none, with the name of a strategy that raises.
 
     Args:
@@ -175,21 +176,25 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
         aim: of the plan.
     """
 
-    def ask() -> Plan | str:
+    def ask() -> Plan | Rejected:
         try:
             given = replace(move, options=state.declared.options_of(name, move.spec))
             plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
         except ValueError as reason:  # by its contract: the strategy cannot move this process
-            return f"the migration strategy {name!r} gave no plan: {describe_fault(reason)}"
+            return _no_plan(name, describe_fault(reason))
         fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
         if fault:
             raise PluginError(f"an unsound plan: {fault}")
-        return checked_plan(plan)  # it goes into the journal
+        return checked(plan, "plan")  # it goes into the journal
 
     try:
         return state.plugins.ask("migration", name, _HOOKS[aim], ask)
     except PluginError as fault:
-        return f"the migration strategy {name!r} gave no plan: {fault}"
+        return _no_plan(name, str(fault))
+
+
+def _no_plan(strategy: str, reason: str) -> Rejected:
+    return Rejected(f"the migration strategy {strategy!r} gave no plan: {reason}")
 
 
 def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:

@@ -8,11 +8,13 @@ from functools import singledispatch
 from typing import Any, Final
 
 from rosrm.core.master import lifecycle
-from rosrm.core.master.commands import Order
+from rosrm.core.master.events import BAD_RESULT, OrderAnswered
 from rosrm.core.master.master_state import MasterState, Run
 from rosrm.core.master.migration import handoff
-from rosrm.core.master.migration.handoff import DONE
+from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress, done_if
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.pending_orders import MigrationStep
+from rosrm.model.orders import Order, RunExecutor, SetRestartPolicy, StartInstance, StopInstance
 from rosrm.model.plan import (
     Aim,
     AwaitReady,
@@ -27,17 +29,6 @@ from rosrm.model.plan import (
 )
 from rosrm.model.values import InstanceState
 
-__all__ = [
-    "DONE",
-    "give_order",
-    "give_order_again",
-    "nobody_there",
-    "note_result",
-    "outcome_of",
-    "timed_out",
-    "title",
-]
-
 _TITLES: Final[Mapping[type[Step], str]] = {
     Commit: "the commit",
     Start: "starting {0.instance} on {0.host}",
@@ -50,54 +41,102 @@ _TITLES: Final[Mapping[type[Step], str]] = {
 _AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
 
 
-def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
+# --- execution --------------------------------------------------------------------------------
+
+
+def begin(state: MasterState, run: Run, step: Step, now: float) -> bool:
+    """Begin the current step, unless it has begun; return False if it must wait."""
+    if run.begun:
+        return True
+    if now < run.retry_at or _is_expected(state, run, step):
+        return False
+    run.begun, run.answer, run.bad_result = True, None, False
+    run.deadline = now + max(step.timeout, 0.0)
+    _give_order(state, run, step, now)
+    return True
+
+
+def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
+    """Return True if a host that the step needs has not returned since the master started.
+
+    The step waits for it until its lease ends; then the step begins, and its own time-out decides.
+    """
+    if isinstance(step, Commit):
+        return False
+    if not isinstance(step, Configure):
+        concerned = [state.hosts.by_name[step.host]]
+    else:
+        both = (run.source.number, run.destination.number) if step.awaited else ()
+        concerned = [state.instances[one].host for one in both if one in state.instances]
+    return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
+
+
+def outcome_of(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
+    """Return the outcome of the current step; repeat its order or end it at its time-out."""
+    outcome = _outcome(step, state, run, now)
+    if outcome is StepProgress.PENDING:
+        _give_order_again(state, run, step, now)
+        if now >= run.deadline:
+            outcome = _timed_out(state, run, step, now)
+    return outcome
+
+
+def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
+    """Note the answer to the order of the current step of a migration.
+
+    The result of an executor is kept for those of later steps. The start of a standby is repeated
+    whatever the answer.
+    """
+    run = state.runs.get(process)
+    if run is None or run.order != event.order or event.code == "timeout":
+        return
+    run.answer = (event.accepted, event.message or event.code)
+    run.bad_result = event.code == BAD_RESULT
+    step = run.step_in_hand
+    if event.accepted and event.result and isinstance(step, Execute):
+        run.results[step.executor] = event.result
+
+
+# --- orders -----------------------------------------------------------------------------------
+
+
+def _give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
     """Send the order of a step to its slave, or in a handoff to the nodes themselves."""
+    run.order = None
     if isinstance(step, Commit | AwaitReady | AwaitReleased):
         return
     if isinstance(step, Configure):
-        run.order, run.order_at = 0, now
+        run.order_at = now
         handoff.publish(state, run, step.phase)
         return
     if isinstance(step, Start) and _in_the_way(state, run, step, now):
-        run.order = 0
         return
     host = state.hosts.by_name[step.host]
-    run.order, run.order_at = state.order_id(), now
-    state.runs_by_order[run.order] = run.process
+    order = _order_of(state, run, step, host, now)
+    run.order, run.order_at = state.send(host, order, MigrationStep(run.process)), now
+
+
+def _order_of(
+    state: MasterState, run: Run, step: Start | Stop | Execute | SetRestart, host: Host, now: float
+) -> Order:
+    """Return the order of a step; note in its migration what the order changes."""
     if isinstance(step, Stop):
-        state.emit(Order(run.order, host.host_id, "stop", step.instance))
-    elif isinstance(step, Execute):
-        state.emit(
-            Order(
-                run.order, host.host_id, "execute", executor=step.executor,
-                arguments=_arguments(run, step), timeout=step.timeout,
-            )
-        )  # fmt: skip
-    elif isinstance(step, SetRestart):
-        _order_restart_policy(state, run, step, host)
-    else:
-        _order_start(state, run, step, host, now)
+        return StopInstance(step.instance)
+    if isinstance(step, Execute):
+        return RunExecutor(step.executor, _arguments(run, step), step.timeout)
+    if isinstance(step, SetRestart):
+        if step.restart != state.processes[run.process].spec.restart:
+            run.suspended.add(step.instance.number)
+            state.save_run(run)
+        return SetRestartPolicy(step.instance, step.restart)
+    return _start(state, run, step, host, now)
 
 
 def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
     return {**step.arguments, "results": run.results} if run.results else step.arguments
 
 
-def note_result(run: Run, result: Mapping[str, Any]) -> None:
-    """Keep the result of an executor for those of later steps."""
-    step = run.step_in_hand
-    if isinstance(step, Execute):
-        run.results[step.executor] = result
-
-
-def _order_restart_policy(state: MasterState, run: Run, step: SetRestart, host: Host) -> None:
-    if step.restart != state.processes[run.process].spec.restart:
-        run.suspended.add(step.instance.number)
-        state.save_run(run)
-    state.emit(Order(run.order, host.host_id, "set_restart", step.instance, restart=step.restart))
-
-
-def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> None:
+def _start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> StartInstance:
     process = state.processes[run.process]
     spec, number = process.spec, step.instance.number
     run.launched.add(number)
@@ -112,10 +151,11 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
         instance.node_name = step.node_name
         state.save(process)
     remapped = replace(spec, remappings={**spec.remappings, **step.remappings})
-    assignment = state.assignment(
-        step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
+    return StartInstance(
+        state.assignment(
+            step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
+        )
     )
-    state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
 
 
 def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
@@ -136,7 +176,7 @@ def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
     return bool(others)
 
 
-def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
+def _give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
     """Repeat the order for a start, a stop or a restart policy, because orders may be lost.
 
     A second order does no harm. A start that another instance delayed is ordered as soon as that
@@ -147,7 +187,7 @@ def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> No
     elif isinstance(step, Execute | AwaitReady | AwaitReleased | Commit):
         return
     elif _has_waited(run, step) or now - run.order_at >= state.settings.order_retry:
-        give_order(state, run, step, now)
+        _give_order(state, run, step, now)
 
 
 def _has_waited(run: Run, step: Step) -> bool:
@@ -155,86 +195,92 @@ def _has_waited(run: Run, step: Step) -> bool:
     return isinstance(step, Start) and step.instance.number not in run.launched
 
 
-def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | None:
-    """Return the outcome of a step after its time-out, as `outcome_of` does."""
+# --- outcomes ---------------------------------------------------------------------------------
+
+
+def _timed_out(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
+    """Return the outcome of a step after its time-out, as `_outcome` does."""
     if isinstance(step, Configure):
         return handoff.timed_out(state, run, step, now)
     if isinstance(step, AwaitReleased):
-        return DONE
-    return f"{title(step)} took longer than {step.timeout:g} s"
+        return StepProgress.DONE
+    return StepFailed(f"{title(step)} took longer than {step.timeout:g} s")
 
 
 @singledispatch
-def outcome_of(step: Any, state: MasterState, run: Run, now: float) -> str | None:
-    """Return the outcome of the current step: None: pending; "": done; else the failure."""
+def _outcome(step: Any, state: MasterState, run: Run, now: float) -> StepOutcome:
+    """Return the outcome of the current step."""
     raise TypeError(step)
 
 
-@outcome_of.register
-def _(step: Start, state: MasterState, run: Run, now: float) -> str | None:
+@_outcome.register
+def _(step: Start, state: MasterState, run: Run, now: float) -> StepOutcome:
     if step.instance.number in run.ended:
-        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
+        return StepFailed(f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}")
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return None  # another instance has to end first
+        return StepProgress.PENDING  # another instance has to end first
     if run.answer is not None and not run.answer[0]:
-        return f"{step.host} refused to start {step.instance}: {run.answer[1]}"
-    return DONE if instance.runs else None
+        return StepFailed(f"{step.host} refused to start {step.instance}: {run.answer[1]}")
+    return done_if(instance.runs)
 
 
-@outcome_of.register
-def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> str | None:
+@_outcome.register
+def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> StepOutcome:
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
+        return StepFailed(f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}")
     settled = instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
-    return DONE if settled else None
+    return done_if(settled)
 
 
-@outcome_of.register
-def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> str | None:
-    return DONE if handoff.is_released(state, run, step.instance) else None
+@_outcome.register
+def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> StepOutcome:
+    return done_if(handoff.is_released(state, run, step.instance))
 
 
-@outcome_of.register
-def _(step: Stop, state: MasterState, run: Run, now: float) -> str | None:
-    return DONE if step.instance.number not in state.instances else None
+@_outcome.register
+def _(step: Stop, state: MasterState, run: Run, now: float) -> StepOutcome:
+    return done_if(step.instance.number not in state.instances)
 
 
-@outcome_of.register
-def _(step: Configure, state: MasterState, run: Run, now: float) -> str | None:
+@_outcome.register
+def _(step: Configure, state: MasterState, run: Run, now: float) -> StepOutcome:
     return handoff.outcome(step, state, run)
 
 
-@outcome_of.register
-def _(step: SetRestart, state: MasterState, run: Run, now: float) -> str | None:
+@_outcome.register
+def _(step: SetRestart, state: MasterState, run: Run, now: float) -> StepOutcome:
     if step.instance.number not in state.instances:
-        return DONE  # it has ended: there is nothing to restart
+        return StepProgress.DONE  # it has ended: there is nothing to restart
     if run.answer is None:
-        return None
+        return StepProgress.PENDING
     accepted, message = run.answer
-    return (
-        DONE
-        if accepted
-        else f"{step.host} did not change the restart policy of {step.instance}: {message}"
-    )
+    if accepted:
+        return StepProgress.DONE
+    what = f"the restart policy of {step.instance}"
+    return StepFailed(f"{step.host} did not change {what}: {message}")
 
 
-@outcome_of.register
-def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
-    return DONE
+@_outcome.register
+def _(step: Commit, state: MasterState, run: Run, now: float) -> StepOutcome:
+    return StepProgress.DONE
 
 
-@outcome_of.register
-def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
+@_outcome.register
+def _(step: Execute, state: MasterState, run: Run, now: float) -> StepOutcome:
     if run.answer is None:
         away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
         # A frozen instance must not wait for a long time-out. A plan that may not stop waits for
         # the host as long as an instance of it may be there.
         turns = run.undo is None and not run.committed
-        return f"{step.host} {away}" if away and (turns or nobody_there(state, run, step)) else None
+        if away and (turns or nobody_there(state, run, step)):
+            return StepFailed(f"{step.host} {away}")
+        return StepProgress.PENDING
     accepted, message = run.answer
-    return DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
+    if accepted:
+        return StepProgress.DONE
+    return StepFailed(f"{step.executor} failed on {step.host}: {message}")
 
 
 def nobody_there(state: MasterState, run: Run, step: Execute) -> bool:

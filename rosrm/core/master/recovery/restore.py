@@ -9,14 +9,15 @@ from rosrm.core.master.checkpoint import images
 from rosrm.core.master.lifecycle import adopt_to_stop, note_awaited_ends, note_phase
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
 from rosrm.core.master.recovery import journal_gap
+from rosrm.core.master.state import migration
+from rosrm.core.master.state import process as processes
 from rosrm.core.master.state.migration import end_from_dict, way_back
 from rosrm.core.master.state.process import Image, LeftBehind
 from rosrm.extensions.contracts import Intent
+from rosrm.model.codec import fields_from_plain, from_plain
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.plan import Aim
-from rosrm.model.plan_json import plan_from_dict
-from rosrm.model.spec_json import spec_from_dict
-from rosrm.model.values import InstanceId
+from rosrm.model.plan import Aim, Plan
+from rosrm.model.values import InstanceId, ProcessSpec
 
 _Table = Mapping[str, Mapping[str, Any]]
 
@@ -57,20 +58,20 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
 
 
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
-    phase, exit_code = ProcessPhase(item["phase"]), item["exit_code"]
+    phase = ProcessPhase(item["phase"])
     wall = float(item.get("since", state.wall))  # older journals lack it
+    left, image = item.get("left_behind"), item.get("image")  # older journals have none
     process = Process(
-        spec_from_dict(item["spec"]), int(item["order"]), phase,
-        now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
-        wanted=Wanted(item["wanted"]), reason=item["reason"], excluded=dict(item["excluded"]),
-        migrations=int(item["migrations"]), exit_code=exit_code if phase.over else None,
+        spec=from_plain(ProcessSpec, item["spec"]), phase=phase,
+        since=now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
         ended_on=item["host"] if phase.over else "",
-        restarts=int(item["restarts"]), born=int(item.get("born", 0)),
-        left_behind=LeftBehind(*left) if (left := item.get("left_behind")) else None,
+        left_behind=from_plain(LeftBehind, left) if left else None,
+        **fields_from_plain(Process, item, processes.JOURNALED),
     )  # fmt: skip
+    if not phase.over:
+        process.exit_code = None
     state.add_process(process)
-    image = item.get("image")  # older journals have none
-    images.set_image(state, process, None if image is None else Image(**image))
+    images.set_image(state, process, None if image is None else from_plain(Image, image))
     return process
 
 
@@ -176,18 +177,16 @@ def _restore_move(
 
 def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: float) -> Run:
     hosts = state.hosts.by_name
-    plan = plan_from_dict(move["plan"])
+    plan = from_plain(Plan, move["plan"])
     wall = float(move.get("wall", state.wall))  # older journals lack it
     started = now - max(0.0, state.wall - wall)  # the clock may have been set back
     run = Run(
-        process.name, plan, move["strategy"], InstanceId(process.name, int(move["source"])),
-        hosts[move["source_host"]], InstanceId(process.name, int(move["destination"])),
-        hosts[move["destination_host"]], move["cause"], started, move["source_node"],
-        move["destination_node"], wall, index=int(move["index"]), turned_at=int(move["turned_at"]),
-        committed=bool(move["committed"]), failure=move["failure"],
-        launched=set(move["launched"]), suspended=set(move["suspended"]),
-        results=dict(move.get("results", {})),  # older journals have none
-        aim=Aim(move.get("aim", Aim.MOVE)),
+        process.name, plan, started=started,
+        source=InstanceId(process.name, int(move["source"])),
+        source_host=hosts[move["source_host"]],
+        destination=InstanceId(process.name, int(move["destination"])),
+        destination_host=hosts[move["destination_host"]],
+        **fields_from_plain(Run, {"wall": wall, **move}, migration.JOURNALED),
     )  # fmt: skip
     if move["back"]:
         run.undo = way_back(plan, run.turned_at)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -28,17 +28,20 @@ from rosrm.wording import one_line
 _NAMED_HOSTS: Final = 16
 
 
+#: Kind of a decision; "": it has none yet.
+DecisionKind = Literal["", "assigned", "set_aside", "waits", "migrated"]
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """The verdict on one host.
 
     Attributes:
-        verdict: "chosen", "fits", "full", "vetoed" or "excluded".
         score: where it fits.
     """
 
     host: str
-    verdict: str
+    verdict: Literal["chosen", "fits", "full", "vetoed", "excluded"]
     score: float | None
     reason: str
 
@@ -102,7 +105,7 @@ class Decision(Lazy):
         self, column: int, policy: str, moment: Moment, omitted: Mapping[str, int]
     ) -> None:
         super().__init__()
-        self.kind = ""
+        self.kind: DecisionKind = ""
         self.column = column
         self.policy = policy
         self.omitted = omitted

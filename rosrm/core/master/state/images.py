@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rosrm.core.master.commands import OrderId
+
 
 @dataclass(slots=True)
 class Unwanted:
@@ -14,7 +16,7 @@ class Unwanted:
         host: name of the host that stores it.
         drop: the executor that removes it.
         numbers: of the instance that was dumped, and of those that were to be restored from it.
-        order: of the removal; 0: none is under way.
+        order: of the removal; None: none is under way.
         ask_at: time of the next order to remove it.
     """
 
@@ -22,7 +24,7 @@ class Unwanted:
     host: str
     drop: str
     numbers: tuple[int, ...]
-    order: int = 0
+    order: OrderId | None = None
     ask_at: float = float("-inf")
 
 

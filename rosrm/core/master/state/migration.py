@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
+from rosrm.core.master.commands import OrderId
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Lazy
+from rosrm.model.codec import fields_from_plain, fields_to_plain, to_plain
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
-from rosrm.model.plan_json import plan_to_dict
-from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
+from rosrm.model.values import InstanceId, InstanceStatus
 from rosrm.wording import one_line
 
 
@@ -54,7 +55,8 @@ class PlainPlan(Lazy):
 
     def render(self) -> Mapping[str, Any]:
         """Return all fields of the plan."""
-        return plan_to_dict(self._plan)
+        plain: Mapping[str, Any] = to_plain(self._plan)
+        return plain
 
 
 @dataclass(slots=True)
@@ -72,7 +74,7 @@ class Run:
         committed: the destination owns the name.
         deadline: of the current step.
         begun: the current step has been ordered.
-        order: of the current step, 0: none.
+        order: of the current step; None: it has none.
         stuck: a step that must be done failed; it is retried from `retry_at` on.
         answer: of the slave to the order of the current step: accepted, message.
         bad_result: the executor of the current step ran to its end, but returned no JSON object.
@@ -105,7 +107,7 @@ class Run:
     committed: bool = False
     begun: bool = False
     deadline: float = 0.0
-    order: int = 0
+    order: OrderId | None = None
     order_at: float = 0.0
     failure: str = ""
     stuck: bool = False
@@ -193,6 +195,15 @@ def way_back(plan: Plan, turned_at: int) -> Sequence[Step]:
     return [step.undo for step in reversed(so_far) if step.undo is not None]
 
 
+#: Fields that the journal has unchanged: of a migration, of an end, and of the status of an end.
+JOURNALED: Final = (
+    "strategy", "cause", "wall", "source_node", "destination_node", "index", "turned_at",
+    "committed", "failure", "launched", "suspended", "results", "aim",
+)  # fmt: skip
+_END: Final = ("ordered", "completed", "gone")
+_STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")
+
+
 def run_to_dict(run: Run, stopping: Sequence[int]) -> dict[str, Any]:
     """Return all facts about a migration that a restarted master needs.
 
@@ -203,33 +214,19 @@ def run_to_dict(run: Run, stopping: Sequence[int]) -> dict[str, Any]:
         stopping: numbers of its instances that were ordered to stop.
     """
     return {
-        "strategy": run.strategy, "cause": run.cause, "wall": run.wall, "plan": run.plain_plan,
+        "plan": run.plain_plan, "back": run.undo is not None, "stopping": list(stopping),
         "source": run.source.number, "source_host": run.source_host.name,
-        "source_node": run.source_node, "destination": run.destination.number,
-        "destination_host": run.destination_host.name, "destination_node": run.destination_node,
-        "index": run.index, "back": run.undo is not None, "turned_at": run.turned_at,
-        "committed": run.committed, "failure": run.failure, "launched": sorted(run.launched),
-        "suspended": sorted(run.suspended), "stopping": list(stopping),
+        "destination": run.destination.number, "destination_host": run.destination_host.name,
         "ended": {str(number): _end_to_dict(end) for number, end in run.ended.items()},
-        "results": {name: dict(result) for name, result in run.results.items()},
-        "aim": run.aim.value,
+        **fields_to_plain(run, JOURNALED),
     }  # fmt: skip
 
 
 def _end_to_dict(end: End) -> dict[str, Any]:
-    status = end.status
-    return {
-        "state": status.state.value, "exit_code": status.exit_code,
-        "exit_signal": status.exit_signal, "message": status.message, "ordered": end.ordered,
-        "completed": end.completed, "gone": end.gone, "run_time": status.run_time,
-    }  # fmt: skip
+    return {**fields_to_plain(end.status, _STATUS), **fields_to_plain(end, _END)}
 
 
 def end_from_dict(instance: InstanceId, plain: Mapping[str, Any]) -> End:
     """Return the end of an instance from `run_to_dict`, which has only the fields used later."""
-    status = InstanceStatus(
-        instance, InstanceState(plain["state"]), exit_code=int(plain["exit_code"]),
-        exit_signal=int(plain["exit_signal"]), message=str(plain["message"]),
-        run_time=float(plain.get("run_time", 0.0)),  # older journals have none
-    )  # fmt: skip
-    return End(status, bool(plain["ordered"]), bool(plain["completed"]), bool(plain["gone"]))
+    status = InstanceStatus(instance, **fields_from_plain(InstanceStatus, plain, _STATUS))
+    return End(status, **fields_from_plain(End, plain, _END))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf
-from typing import Final
 
-#: These orders have numbers of their own, because a recording that is replayed without the plugins
-#: must give the other orders the same numbers.
-BEFORE_FIRST: Final = 1 << 42
+from rosrm.core.master.commands import OrderId
+from rosrm.core.master.outcomes import Rejected
 
 
 @dataclass(slots=True)
@@ -18,12 +16,13 @@ class Dumped:
     Attributes:
         process, host: names.
         strategy: name of the strategy that makes them.
-        discard: the executor that removes its images; None: the strategy failed to name it.
+        discard: the executor that removes its images; None: none does; `Rejected`: the strategy
+            failed to name it.
         since: time of the last dump, or time since when the first is due.
         made: at least one exists.
         size: bytes of the newest.
         pause: seconds for which the newest dump paused the process.
-        order: of the dump under way; 0: none is.
+        order: of the dump under way; None: none is.
         asked: incarnation of the slave that received the order.
         trouble: why there is none, or no newer one.
     """
@@ -31,12 +30,12 @@ class Dumped:
     process: str
     host: str
     strategy: str
-    discard: str | None
+    discard: str | Rejected | None
     since: float
     made: bool = False
     size: int = 0
     pause: float = 0.0
-    order: int = 0
+    order: OrderId | None = None
     asked: int = 0
     trouble: str = ""
 
@@ -47,9 +46,7 @@ class Periodic:
 
     Attributes:
         looked: time of the last review.
-        last_order: number of the last order.
     """
 
     of: dict[int, Dumped] = field(default_factory=dict)
     looked: float = -inf
-    last_order: int = BEFORE_FIRST

@@ -12,8 +12,8 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Lazy
+from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.spec_json import spec_to_dict
 from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
 
 
@@ -69,8 +69,7 @@ class Instance:
         given_again: the assignment was delivered again, because its slave did not accept it.
         recalled: a former run of the master ordered it to stop, so its end counts as ordered.
         at_once: it is to end without delay, because another instance owns the name.
-        order: of an unanswered stop, 0: none.
-        order_at: time of that order.
+        order_at: time of the last order to stop it, or to withdraw it; -inf: none.
         node_name: name of its node, where that is not the process's name.
         ready_at: time at which this master learned that it is ready.
     """
@@ -92,8 +91,7 @@ class Instance:
     given_again: bool = False
     recalled: bool = False
     at_once: bool = False
-    order: int = 0
-    order_at: float = 0.0
+    order_at: float = -inf
     node_name: str = ""
     ready_at: float = inf
 
@@ -161,7 +159,14 @@ class PlainSpec(Lazy):
 
     def render(self) -> Mapping[str, Any]:
         """Return all fields of the spec."""
-        return spec_to_dict(self._spec)
+        plain: Mapping[str, Any] = to_plain(self._spec)
+        return plain
+
+
+#: Fields of a process that the journal has unchanged.
+JOURNALED: Final = (
+    "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
+)  # fmt: skip
 
 
 @dataclass(slots=True)

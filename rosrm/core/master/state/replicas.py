@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
+from rosrm.core.master.commands import OrderId
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointPolicy
 from rosrm.model.values import EMPTY, KeptState
@@ -96,7 +97,7 @@ class Told:
     number: int
     incarnation: int
     choice: CheckpointChoice
-    order: int
+    order: OrderId
     at: float
     chosen: bool = True
     taken: bool = False
@@ -111,9 +112,6 @@ class Keeping:
         policy_name: in the configuration.
         holdings: index of snapshots by process and host.
         told: process name to the last order to its slave.
-        orders: process of each order without an answer.
-        next_order: these orders have numbers of their own, because a recording that is replayed
-            without the policy must give the other orders the same numbers.
         dropped_at: time of the last order to a host to drop its replica of a process.
         removed: stateful processes that were removed, each with a number above those of all its
             instances.
@@ -125,17 +123,10 @@ class Keeping:
     policy_name: str = ""
     holdings: Holdings = field(default_factory=Holdings)
     told: dict[str, Told] = field(default_factory=dict)
-    orders: dict[int, str] = field(default_factory=dict)
-    next_order: int = 1 << 40
     dropped_at: dict[tuple[str, str], float] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=dict)
     waiting: list[str] = field(default_factory=list)
     looked: float = -inf
-
-    def order_id(self) -> int:
-        """Return a number for an order about replicas."""
-        self.next_order += 1
-        return self.next_order
 
     def in_reach(self, process: str, since: int, hosts: HostTable) -> tuple[str, ...]:
         """Return the hosts in reach with a snapshot of an instance from a number on, newest first.

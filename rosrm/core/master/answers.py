@@ -1,0 +1,34 @@
+"""Answers of slaves to orders, each handled by the purpose of its order."""
+
+from __future__ import annotations
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.checkpoint import images, periodic, replication
+from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration import steps
+from rosrm.core.master.state.pending_orders import (
+    CapabilityQuery,
+    ImageRemoval,
+    MigrationStep,
+    PeriodicCheckpoint,
+    Replication,
+)
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
+    """Handle the answer of a slave to an order: accepted, refused, or none in time."""
+    purpose = state.pending_orders.pop(event.order)
+    match purpose:
+        case None:
+            return
+        case MigrationStep(process):
+            steps.note_answer(state, process, event)
+        case Replication(process):
+            replication.note_answer(state, process, event)
+        case CapabilityQuery():
+            capabilities.note_answer(state, purpose, event, now)
+        case PeriodicCheckpoint(number):
+            periodic.note_answer(state, number, event, now)
+        case ImageRemoval(number):
+            images.note_answer(state, number, event, now)

@@ -1,0 +1,43 @@
+"""Outcomes of the steps of a plan, and of requests that may be turned down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class StepProgress(Enum):
+    """Progress of the current step of a plan that has not failed."""
+
+    PENDING = "pending"
+    DONE = "done"
+
+
+@dataclass(frozen=True, slots=True)
+class StepFailed:
+    """The current step of a plan failed.
+
+    Attributes:
+        reason: a sentence.
+    """
+
+    reason: str
+
+
+StepOutcome = StepProgress | StepFailed
+
+
+def done_if(condition: bool) -> StepProgress:
+    """Return DONE if a condition holds, else PENDING."""
+    return StepProgress.DONE if condition else StepProgress.PENDING
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A plan, a destination or a setting that was asked for is not available.
+
+    Attributes:
+        reason: a sentence.
+    """
+
+    reason: str

@@ -1,0 +1,82 @@
+"""Table of pending orders: the purpose of each order that awaits its slave's answer."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from rosrm.core.master.commands import OrderId
+
+
+@dataclass(frozen=True, slots=True)
+class MigrationStep:
+    """The order carries out the current step of a process's migration."""
+
+    process: str
+
+
+@dataclass(frozen=True, slots=True)
+class ImageRemoval:
+    """The order removes an unwanted checkpoint image.
+
+    Attributes:
+        number: of the instance that was dumped.
+    """
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Replication:
+    """The order places or drops a replica of a process's snapshot."""
+
+    process: str
+
+
+@dataclass(frozen=True, slots=True)
+class CapabilityQuery:
+    """The order asks a host about a migration strategy."""
+
+    strategy: str
+    host: str
+
+
+@dataclass(frozen=True, slots=True)
+class PeriodicCheckpoint:
+    """The order makes a periodic checkpoint of an instance, or removes those of an ended one."""
+
+    number: int
+
+
+Purpose = MigrationStep | ImageRemoval | Replication | CapabilityQuery | PeriodicCheckpoint
+
+#: Purposes that depend on optional plugins have a series of numbers each, because a recording that
+#: is replayed without such a plugin must give all other orders the same numbers.
+_SERIES: Final[dict[type, Literal["replication", "capability", "periodic"]]] = {
+    Replication: "replication",
+    CapabilityQuery: "capability",
+    PeriodicCheckpoint: "periodic",
+}
+
+
+class PendingOrders:
+    """Purposes of the orders without an answer; a former master's orders have none here."""
+
+    def __init__(self) -> None:
+        self._purposes: dict[OrderId, Purpose] = {}
+        self._numbers = Counter[str]()
+
+    def add(self, purpose: Purpose | None = None) -> OrderId:
+        """Return the id of a new order; without a purpose, its answer is ignored."""
+        series = _SERIES.get(type(purpose), "")
+        self._numbers[series] += 1
+        number = self._numbers[series]
+        order: OrderId = (series, number) if series else number
+        if purpose is not None:
+            self._purposes[order] = purpose
+        return order
+
+    def pop(self, order: OrderId) -> Purpose | None:
+        """Remove an answered order and return its purpose; None: it has none."""
+        return self._purposes.pop(order, None)

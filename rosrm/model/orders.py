@@ -1,0 +1,106 @@
+"""Orders of the master to a slave, one class each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rosrm.model.values import EMPTY, Assignment, InstanceId, RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class StartInstance:
+    """Start an assigned instance."""
+
+    assignment: Assignment
+
+    @property
+    def instance(self) -> InstanceId:
+        """Return the instance of the assignment."""
+        return self.assignment.instance
+
+
+@dataclass(frozen=True, slots=True)
+class StopInstance:
+    """Stop an instance for good."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class FenceInstance:
+    """Kill an instance at once, because it has a successor."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class RestartInstance:
+    """Stop an instance and start it again on the same host."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class SetRestartPolicy:
+    """Replace the restart policy of an instance, which is no shadow from then on."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class ReportInstances:
+    """Report the status of every instance."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunExecutor:
+    """Run an executor of a plugin.
+
+    Attributes:
+        timeout: seconds.
+    """
+
+    executor: str
+    arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    timeout: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReplicateSnapshot:
+    """Replicate the snapshots of an instance to these hosts from now on.
+
+    Attributes:
+        hosts: their names; empty: to none.
+        every: least seconds between two transfers.
+    """
+
+    instance: InstanceId
+    hosts: tuple[str, ...]
+    every: float
+
+
+@dataclass(frozen=True, slots=True)
+class DropReplica:
+    """Delete the snapshots of a process, of instances up to this one."""
+
+    instance: InstanceId
+
+
+#: Orders to the slave's core.
+InstanceOrder = (
+    StartInstance
+    | StopInstance
+    | FenceInstance
+    | RestartInstance
+    | SetRestartPolicy
+    | ReportInstances
+)
+Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica
+
+
+def seconds_of(order: Order) -> float:
+    """Return the seconds that an order may take at its slave, before any time-out of its answer."""
+    return order.timeout if isinstance(order, RunExecutor) else 0.0

@@ -1,0 +1,81 @@
+"""Conversion of orders to requests of a slave's control service and back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from rosrm.errors import Refused
+from rosrm.model.orders import (
+    DropReplica,
+    FenceInstance,
+    Order,
+    ReplicateSnapshot,
+    ReportInstances,
+    RestartInstance,
+    RunExecutor,
+    SetRestartPolicy,
+    StartInstance,
+    StopInstance,
+)
+from rosrm.model.values import InstanceId
+from rosrm.ros import convert
+from rosrm_msgs import srv
+
+_Request = srv.ControlHost.Request
+_ACTIONS: Final[Mapping[type[Order], int]] = {
+    StopInstance: _Request.STOP,
+    RestartInstance: _Request.RESTART,
+    StartInstance: _Request.START,
+    RunExecutor: _Request.EXECUTE,
+    ReportInstances: _Request.REPORT,
+    SetRestartPolicy: _Request.SET_RESTART,
+    FenceInstance: _Request.FENCE,
+    ReplicateSnapshot: _Request.KEEP,
+    DropReplica: _Request.DROP_KEPT,
+}
+#: Orders by an instance alone.
+_OF_INSTANCE: Final[Mapping[int, Callable[[InstanceId], Order]]] = {
+    _ACTIONS[kind]: kind for kind in (StopInstance, RestartInstance, FenceInstance, DropReplica)
+}
+
+
+def order_to_msg(order: Order) -> srv.ControlHost.Request:
+    """Return an order as a request without its envelope."""
+    request = _Request(action=_ACTIONS[type(order)])
+    match order:
+        case RunExecutor(executor, arguments, timeout):
+            request.executor, request.timeout = executor, float(timeout)
+            request.arguments = json.dumps(dict(arguments))
+            return request
+        case ReportInstances():
+            return request
+        case StartInstance(assignment):
+            request.assignment = convert.assignment_to_msg(assignment)
+        case SetRestartPolicy(_, restart):
+            request.restart = convert.restart_to_msg(restart)
+        case ReplicateSnapshot(_, hosts, every):
+            request.keep_on, request.keep_every = list(hosts), float(every)
+    request.instance = convert.instance_to_msg(order.instance)
+    return request
+
+
+def order_from_msg(request: srv.ControlHost.Request) -> Order:
+    """Return the inverse of `order_to_msg`; raise `Refused` for an invalid request."""
+    instance = convert.instance_from_msg(request.instance)
+    match request.action:
+        case _Request.START:
+            return StartInstance(convert.assignment_from_msg(request.assignment))
+        case _Request.EXECUTE:
+            arguments = convert.json_object(request.arguments, "the arguments of an executor")
+            return RunExecutor(request.executor, arguments, request.timeout)
+        case _Request.REPORT:
+            return ReportInstances()
+        case _Request.SET_RESTART:
+            return SetRestartPolicy(instance, convert.restart_from_msg(request.restart))
+        case _Request.KEEP:
+            return ReplicateSnapshot(instance, tuple(request.keep_on), request.keep_every)
+    if request.action not in _OF_INSTANCE:
+        raise Refused(f"unknown action {request.action}")
+    return _OF_INSTANCE[request.action](instance)

@@ -1,0 +1,171 @@
+"""An external watcher of a handoff, which injects faults at chosen protocol messages."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import threading
+from collections.abc import Callable
+from typing import NamedTuple
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Int64, Int64MultiArray
+
+from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
+from rosrm.node.handoff.channel import CHANNEL, STATE_CONFIG
+from rosrm.ros import qos
+from rosrm.supervisor.procfs import read_environment
+from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
+from tests.ros.clusters import Cluster, pids_of, zombie
+
+#: Handoff phases by the names that the tests use.
+SAID = {
+    getattr(StateConfig, name): name
+    for name in ("SHADOW", "SWITCH", "TAKE_OVER", "ABORT", "RESUME", "DONE")
+}
+REPORTED = {
+    getattr(HandoffReport, name): name
+    for name in (
+        "ATTACHED", "SILENT", "RELEASED", "RESUMED", "SHADOWING", "READY", "SWITCHING", "ACTIVE",
+        "ABORTED", "FAILED",
+    )
+}  # fmt: skip
+
+#: Action of a fault injector.
+Fault = Callable[[], None]
+
+
+class Output(NamedTuple):
+    """The instance that published an output, its number, and the input that it answers."""
+
+    instance: int
+    sequence: int
+    answers: int
+
+
+class Watcher:
+    """A thread that receives outputs, `state_config`, handoff channels and process status.
+
+    A recorded event is "says SHADOW" for a message of the master, "READY" for a report of the
+    source or the destination, "source stopping" for a status from a slave. "source policy" means
+    that a slave has applied another restart policy: it then sends the status again, otherwise
+    unchanged.
+
+    Attributes:
+        outputs, heard: outputs and events since `inject_at`.
+        injected: set after the last fault.
+        destination_pid: newest pid from the destination's slave; 0: none.
+
+    Args:
+        domain: ROS domain.
+        inputs: inputs per second to publish, numbered from 1; 0: none.
+    """
+
+    def __init__(self, domain: int, inputs: float = 0.0) -> None:
+        self.outputs: list[Output] = []
+        self.heard: list[str] = []
+        self.injected = threading.Event()
+        self.destination_pid = 0
+        self._source = 0
+        self._faults: list[tuple[str, Fault]] = []
+        self._states: dict[int, str] = {}
+        self._channels: set[str] = set()
+        self._sent = 0
+        self._context = rclpy.Context()
+        rclpy.init(
+            context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+        )
+        self._node = node = rclpy.node.Node("watcher", context=self._context)
+        node.create_subscription(Int64MultiArray, OUTPUT, self._output, QOS)
+        node.create_subscription(StateConfig, "/rosrm/state_config", self._said, STATE_CONFIG)
+        node.create_subscription(
+            ProcessStatusBatch, "/rosrm/process_status", self._told, qos.STATUSES
+        )
+        if inputs:
+            self._inputs = node.create_publisher(Int64, INPUT, QOS)
+            node.create_timer(1.0 / inputs, self._drive)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def inject_at(self, source: int, *faults: tuple[str, Fault]) -> None:
+        """Inject faults at these events, in order, in the next handoff of instance `source`."""
+        self.injected.clear()
+        self.outputs.clear()
+        self.heard.clear()
+        self.destination_pid = 0
+        self._source, self._faults = source, list(faults)
+
+    def _drive(self) -> None:
+        self._sent += 1
+        self._inputs.publish(Int64(data=self._sent))
+
+    def _output(self, message: Int64MultiArray) -> None:
+        self.outputs.append(Output(*message.data))
+
+    def _said(self, config: StateConfig) -> None:
+        if config.channel not in self._channels:
+            self._channels.add(config.channel)
+            self._node.create_subscription(HandoffReport, config.channel, self._reported, CHANNEL)
+        if config.source == self._source:
+            self._hear(f"says {SAID[config.phase]}")
+
+    def _reported(self, report: HandoffReport) -> None:
+        if report.instance >= self._source:
+            self._hear(REPORTED[report.phase])
+
+    def _told(self, batch: ProcessStatusBatch) -> None:
+        for status in batch.statuses:
+            self._is(status, repeats=batch.complete)
+
+    def _is(self, status: ProcessStatus, *, repeats: bool) -> None:
+        number = status.instance.number
+        before, self._states[number] = self._states.get(number), status.state
+        if number < self._source or (repeats and before == status.state):
+            return
+        role = "source" if number == self._source else "destination"
+        if role == "destination":
+            self.destination_pid = status.pid
+        self._hear(f"{role} {'policy' if before == status.state else status.state}")
+
+    def _hear(self, word: str) -> None:
+        self.heard.append(word)
+        if self._faults and self._faults[0][0] == word:
+            _, fault = self._faults.pop(0)
+            fault()
+            if not self._faults:
+                self.injected.set()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._thread.join(5.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+def blocks(outputs: list[Output]) -> list[list[Output]]:
+    """Group the outputs, in order of arrival, by the instance that published them."""
+    return [list(group) for _, group in itertools.groupby(outputs, lambda one: one.instance)]
+
+
+def is_gapless(outputs: list[Output]) -> bool:
+    """Return True if each number and each answered input occurs once and in order."""
+    first = outputs[0]
+    return [one[1:] for one in outputs] == [
+        (first.sequence + n, first.answers + n) for n in range(len(outputs))
+    ]
+
+
+def instances(cluster: Cluster, process: str) -> dict[int, int]:
+    """Return the pids of a process's running instances in a cluster, by instance number."""
+    mark, found = f"ROSRM_INSTANCE={process}#".encode(), {}
+    for pid in pids_of(cluster.directory):
+        with contextlib.suppress(OSError):
+            variables = read_environment(pid)
+            number = next((v.removeprefix(mark) for v in variables if v.startswith(mark)), b"")
+            if number and not zombie(pid):
+                found[int(number)] = pid
+    return found

@@ -1,0 +1,117 @@
+"""Orders of a handoff to a real slave: another restart policy, and readiness."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from rosrm.model.values import InstanceId, RestartPolicy
+from rosrm.ros import convert, names, qos
+from rosrm.ros.client import wait_for_service
+from rosrm.ros.control import ControlClient
+from rosrm.ros.participant import Participant
+from rosrm_msgs import srv
+from tests.ros.calls import answer_to
+from tests.ros.clusters import NODE, host, node, service
+from tests.waiting import PATIENCE, wait_gone
+
+NEVER = RestartPolicy("never")
+ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    return make_shared(host("h0"))
+
+
+class Orders:
+    """A sender of orders beside the master, on the slave's machine and so with its clock."""
+
+    def __init__(self, cluster) -> None:
+        self.participant = Participant(cluster.ros, "orders")
+        path = names.Names(cluster.ros.namespace).of_host("h0", names.CONTROL)
+        self.control = ControlClient(self.participant, "test")
+        self.client = self.participant.node.create_client(
+            srv.ControlHost, path, qos_profile=qos.SERVICE
+        )
+
+    def set_restart(self, instance: InstanceId, restart: RestartPolicy):
+        """Order another restart policy; return the answer."""
+        deadline = time.monotonic() + PATIENCE
+        assert wait_for_service(self.participant, self.client, deadline)
+        request = srv.ControlHost.Request(
+            envelope=self.control.envelope(time.monotonic_ns(), 1 << 40),
+            action=srv.ControlHost.Request.SET_RESTART,
+            instance=convert.instance_to_msg(instance), restart=convert.restart_to_msg(restart),
+        )  # fmt: skip
+        return answer_to(self.participant, self.client.call_async(request), deadline).answer
+
+
+@pytest.fixture
+def orders(cluster):
+    made = Orders(cluster)
+    yield made
+    made.participant.close()
+
+
+def end(pid: int) -> None:
+    os.kill(pid, signal.SIGKILL)
+    wait_gone(pid)
+
+
+def test_another_policy_applies_from_its_answer_on(cluster, orders) -> None:
+    """An acknowledged policy applies, whatever is killed a moment later."""
+    cluster.submit(service("source", restart=ON_FAILURE), service("copy"))
+    for name in ("source", "copy"):
+        cluster.wait(name, "running")
+    rows = {name: cluster.process(name) for name in ("source", "copy")}
+    for name, restart in (("source", NEVER), ("copy", ON_FAILURE)):
+        answer = orders.set_restart(InstanceId(name, rows[name].number), restart)
+        assert answer.accepted, answer.message
+    os.kill(cluster.supervisor("h0"), signal.SIGKILL)
+    for row in rows.values():
+        end(row.pid)
+    assert cluster.wait("source", "failed", "finished").state == "failed"
+    cluster.wait("copy", "running", restarts=1)
+    again = orders.set_restart(InstanceId("source", rows["source"].number), ON_FAILURE)
+    assert again.accepted
+    cluster.cancel("copy")
+
+
+def test_a_policy_for_a_process_of_a_killed_slave(cluster, orders) -> None:
+    """The next slave changes the policy, although it does not know the spec."""
+    cluster.submit(service("left", restart=ON_FAILURE))
+    row = cluster.wait("left", "running")
+    cluster.start_slave_again("h0")
+    cluster.wait("left", "running")
+    answer = orders.set_restart(InstanceId("left", row.number), NEVER)
+    assert answer.accepted, answer.message
+    end(row.pid)
+    assert cluster.wait("left", "failed").restarts == 0
+
+
+def test_a_policy_for_an_unknown_instance_is_refused(orders) -> None:
+    """The refusal has a code for programs and a reason for users."""
+    answer = orders.set_restart(InstanceId("nobody", 99), NEVER)
+    assert (answer.accepted, answer.code) == (False, "unknown")
+    assert "nobody#99 is not known here" in answer.message
+
+
+def test_readiness_over_kills_of_the_slave(cluster, tmp_path) -> None:
+    """The next slave waits for readiness; the one after that knows that the node was ready."""
+    go = tmp_path / "go"
+    waits = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.05)\n"
+    cluster.submit(node("late", waits + NODE))
+    pid = cluster.wait("late", "starting").pid
+    cluster.start_slave_again("h0")
+    cluster.stays(
+        1.0, lambda: cluster.process("late").state in ("starting", "unreachable"), "not ready"
+    )
+    go.touch()
+    assert cluster.wait("late", "running").pid == pid
+    cluster.start_slave_again("h0")
+    assert cluster.wait("late", "running").pid == pid
+    cluster.cancel("late")

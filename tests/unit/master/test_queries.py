@@ -1,0 +1,65 @@
+"""Plugin rows of the master: failing plugins with their last error."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.core.master import events as happened
+from rosrm.errors import PluginError
+from rosrm.master.queries import Reading
+from rosrm.model.rows import PluginRow
+from tests.unit.core.cluster import Cluster
+
+SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")
+
+
+def rows(cluster: Cluster, *, failing: bool = False) -> list[PluginRow]:
+    """Return the rows of `rosrm plugins`, or those that `rosrm status` requests."""
+    reading = Reading(
+        "m", cluster.state, SimpleNamespace(last_sequence=0), [SELECTED],
+        uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
+    )  # fmt: skip
+    asked = SimpleNamespace(hosts=0, processes=0, plugins=True, events=0, failing=failing)
+    return list(reading.snapshot(asked).plugins)
+
+
+def named(cluster: Cluster, name: str) -> PluginRow:
+    return next(row for row in rows(cluster) if row.name == name)
+
+
+def test_a_plugin_that_works_is_shown_as_the_registry_has_it() -> None:
+    """The row has its summary, and for a probe its scope."""
+    cluster = Cluster("a")
+    assert named(cluster, "eq1") == SELECTED
+    assert (named(cluster, "cpu").state, named(cluster, "cpu").host) == ("selected", "a")
+
+
+def test_a_policy_that_fails_is_shown_as_failing() -> None:
+    """The row has the hook and the last error."""
+    cluster = Cluster("a")
+    with pytest.raises(PluginError):
+        cluster.state.plugins.ask("scoring", "eq1", "score", lambda: 1 / 0)
+    cluster.wait(0.1)
+    row = named(cluster, "eq1")
+    assert row.state == "failing"
+    assert row.reason.startswith("score: ZeroDivisionError: division by zero (")
+    assert rows(cluster, failing=True) == [row]
+
+
+def test_a_probe_that_fails_is_shown_as_failing_on_its_host() -> None:
+    """The row has the slave's reason until a report without it."""
+    cluster = Cluster("a", "b")
+    machine = cluster.machines["a"]
+    for failing, state in (({"cpu": "probe cpu: unplugged"}, "failing"), ({}, "selected")):
+        machine.batches += 1
+        cluster.tell(
+            happened.StatusesReceived(
+                machine.host_id, machine.incarnation, machine.batches, False, (), failing
+            )
+        )
+        states = {row.host: row.state for row in rows(cluster) if row.name == "cpu"}
+        assert states == {"a": state, "b": "selected"}
+        fails = [("cpu", "a")] if failing else []
+        assert [(row.name, row.host) for row in rows(cluster, failing=True)] == fails

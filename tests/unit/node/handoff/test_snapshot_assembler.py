@@ -1,0 +1,90 @@
+"""Assembly of snapshots from marks and parts: a cut is consistent or dropped."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.node.handoff.snapshot_assembler import CutAssembler, part_key
+
+A, B = "/a", "/b"
+
+
+def mark(sequence, **parts):
+    described = [
+        SimpleNamespace(topic=f"/{name}", size=part_key(data).size, digest=part_key(data).digest)
+        for name, data in parts.items()
+    ]
+    return SimpleNamespace(sequence=sequence, parts=described)
+
+
+def assembler(*topics):
+    cuts = CutAssembler()
+    for topic in topics:
+        cuts.expect(topic)
+    return cuts
+
+
+def test_a_state_is_complete_with_its_mark_and_all_parts():
+    """Mark and parts may arrive in any order."""
+    cuts = assembler(A, B)
+    cuts.add_part(A, b"a1")
+    cuts.add_mark(mark(1, a=b"a1", b=b"b1"), 7.0)
+    assert (cuts.take(), cuts.missing()) == (None, [B])
+    cuts.add_part(B, b"b1")
+    cut = cuts.take()
+    assert (cut.mark.sequence, dict(cut.parts), cut.arrived) == (1, {A: b"a1", B: b"b1"}, 7.0)
+    assert cuts.take() is None
+
+
+def test_parts_of_different_cycles_are_never_mixed():
+    """A mark whose part was lost waits for the next."""
+    cuts = assembler(A, B)
+    cuts.add_part(A, b"a1")
+    cuts.add_part(B, b"b2")
+    cuts.add_mark(mark(1, a=b"a1", b=b"b1"), 0.0)
+    assert cuts.take() is None
+    cuts.add_mark(mark(2, a=b"a1", b=b"b2"), 0.0)
+    assert cuts.take().mark.sequence == 2
+
+
+def test_no_more_is_kept_than_the_state_in_use_and_what_may_come():
+    """A snapshot of megabytes in every cycle would fill the memory."""
+    cuts = assembler(A)
+    for sequence in range(100):
+        cuts.add_part(A, b"%d" % sequence)
+        cuts.add_mark(mark(sequence, a=b"%d" % sequence), 0.0)
+        cuts.take()
+    assert len(cuts._at_hand[A]) == 1
+    assert not cuts._waiting
+
+
+@given(st.data())
+def test_any_order_of_arrival_ends_at_the_last_state(data):
+    """Each single topic is in order; a part is sent when it changes, and may recur."""
+    part = st.sampled_from([b"x", b"y"])
+    states = data.draw(st.lists(st.tuples(part, part), min_size=1))
+    queues = {A: [], B: [], "mark": []}
+    before = (None, None)
+    for sequence, (a, b) in enumerate(states):
+        if a != before[0]:
+            queues[A].append(a)
+        if b != before[1]:
+            queues[B].append(b)
+        queues["mark"].append(mark(sequence, a=a, b=b))
+        before = (a, b)
+    cuts = assembler(A, B)
+    taken = []
+    while any(queues.values()):
+        name = data.draw(st.sampled_from([name for name, queue in queues.items() if queue]))
+        item = queues[name].pop(0)
+        cuts.add_mark(item, 0.0) if name == "mark" else cuts.add_part(name, item)
+        cut = cuts.take()
+        if cut is not None:
+            taken.append(cut)
+    assert [cut.mark.sequence for cut in taken] == sorted({cut.mark.sequence for cut in taken})
+    for cut in taken:
+        assert (cut.parts[A], cut.parts[B]) == states[cut.mark.sequence]
+    assert taken[-1].mark.sequence == len(states) - 1

@@ -1,0 +1,138 @@
+"""The probe `gpu`, with a fake driver."""
+
+import ctypes
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.errors import ConfigError, SkipPlugin
+from rosrm.testing import probe_context
+from rosrm_resources import gpu
+from rosrm_resources.gpu import GpuOptions, GpuProbe
+
+GIB = 2**30
+
+
+class FakeNvml:
+    """The part of `pynvml` that the probe uses; for each GPU (percent busy, bytes used, total)."""
+
+    class NVMLError(Exception):
+        pass
+
+    def __init__(self, *devices):
+        self.devices = devices
+        self.shut_down = 0
+
+    def nvmlInit(self):  # noqa: N802 - the driver's name
+        return None
+
+    def nvmlShutdown(self):  # noqa: N802
+        self.shut_down += 1
+
+    def nvmlDeviceGetCount(self):  # noqa: N802
+        return len(self.devices)
+
+    def nvmlDeviceGetHandleByIndex(self, index):  # noqa: N802
+        return index
+
+    def nvmlDeviceGetUtilizationRates(self, handle):  # noqa: N802
+        return SimpleNamespace(gpu=self._told(self.devices[handle][0]), memory=0)
+
+    def nvmlDeviceGetMemoryInfo(self, handle):  # noqa: N802
+        _, used, total = self.devices[handle]
+        return SimpleNamespace(used=self._told(used), total=total)
+
+    def _told(self, value):
+        if value is None:
+            raise self.NVMLError("Not Supported")
+        return value
+
+
+def readings(probe):
+    return {reading.resource: reading.usage for reading in probe.read()}
+
+
+def capacities(probe):
+    return {resource.name: resource.capacity for resource in probe.resources}
+
+
+@pytest.mark.parametrize(
+    ("options", "devices", "capacity", "usage"),
+    [
+        (GpuOptions(), [(40, 20, 80)], (1.0, 80.0), (0.4, 0.25)),
+        # A process that fits the fullest GPU fits whichever GPU it gets.
+        (GpuOptions(), [(10, 8, 16), (90, 8, 80)], (1.0, 16.0), (0.9, 0.5)),
+        # A process may use several GPUs: capacity and usage are those of all together.
+        (GpuOptions(combine="mean"), [(10, 8, 16), (90, 0, 16)], (2.0, 32.0), (0.5, 0.25)),
+        (GpuOptions(devices=(1,)), [(100, 1, 1), (20, 4, 8)], (1.0, 8.0), (0.2, 0.5)),
+    ],
+    ids=["one", "the fullest", "the mean", "the chosen one"],
+)
+def test_capacity_and_usage(options, devices, capacity, usage):
+    """Utilisation is a fraction, and memory is relative to its size."""
+    nvml = FakeNvml(*((busy, used * GIB, total * GIB) for busy, used, total in devices))
+    probe = GpuProbe(options, nvml)
+    assert capacities(probe) == {"gpu": capacity[0], "gpu_memory": capacity[1] * GIB}
+    assert readings(probe) == pytest.approx({"gpu": usage[0], "gpu_memory": usage[1]})
+
+
+def test_unknown_device_is_refused():
+    """The error lists the existing devices."""
+    with pytest.raises(ConfigError, match=r"devices \[3\] do not exist; there are 2: 0 to 1"):
+        GpuProbe(GpuOptions(devices=(0, 3)), FakeNvml((0, 0, 1), (0, 0, 1)))
+
+
+def test_what_a_gpu_does_not_tell_is_left_out():
+    """A GPU cut into instances has no utilisation; its memory is read all the same."""
+    probe = GpuProbe(GpuOptions(), FakeNvml((None, 4, 8)))
+    assert capacities(probe) == {"gpu_memory": 8.0}
+    with pytest.raises(SkipPlugin, match="neither its utilisation nor its memory"):
+        GpuProbe(GpuOptions(), FakeNvml((None, None, 8)))
+
+
+def test_no_driver_is_absent_with_the_reason(monkeypatch):
+    """The probe searches for the library before the import of the module."""
+
+    def missing(name):
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(ctypes, "CDLL", missing)
+    monkeypatch.setitem(sys.modules, "pynvml", None)  # importing it would raise
+    with pytest.raises(SkipPlugin, match=r"no NVIDIA driver: libnvidia-ml.so.1 is not installed"):
+        gpu.create(GpuOptions(), probe_context())
+
+
+@pytest.fixture
+def driver(monkeypatch):
+    """Install a fake driver on this machine."""
+
+    def install(nvml):
+        monkeypatch.setattr(ctypes, "CDLL", lambda name: None)
+        monkeypatch.setitem(sys.modules, "pynvml", nvml)
+        return nvml
+
+    return install
+
+
+def test_driver_that_does_not_run_is_absent(driver):
+    """A container without a GPU has such a driver."""
+    nvml = driver(FakeNvml())
+
+    def refuse():
+        raise nvml.NVMLError("Driver Not Loaded")
+
+    nvml.nvmlInit = refuse
+    with pytest.raises(SkipPlugin, match="no NVIDIA driver: Driver Not Loaded"):
+        gpu.create(GpuOptions(), probe_context())
+
+
+def test_the_driver_is_closed_once(driver):
+    """The probe closes the driver, also where no GPU is found."""
+    nvml = driver(FakeNvml())
+    with pytest.raises(SkipPlugin, match="sees no GPU"):
+        gpu.create(GpuOptions(), probe_context())
+    assert nvml.shut_down == 1
+    nvml = driver(FakeNvml((0, 0, 1)))
+    gpu.create(GpuOptions(), probe_context()).close()
+    assert nvml.shut_down == 1

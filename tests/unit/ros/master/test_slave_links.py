@@ -1,0 +1,105 @@
+"""Orders to a slave: each carries a recent beat of that slave."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rosrm.core.master.commands import SendOrder
+from rosrm.core.master.events import BAD_RESULT
+from rosrm.model.orders import ReportInstances
+from rosrm.model.values import HostDescription
+from rosrm.ros.control import accepted
+from rosrm.ros.master.slave_links import HostLinks, _order_answered
+from rosrm.ros.reading_codec import Runs
+from rosrm_msgs import srv
+
+HOST, RUN = 1, 500
+DESCRIPTION = HostDescription("shelf", RUN)
+
+
+class FakeClient:
+    """Fake client that stores the requests instead of sending them."""
+
+    def __init__(self) -> None:
+        self.beats: list[int] = []
+
+    def envelope(self, beat, epoch):
+        self.beats.append(beat)
+        return SimpleNamespace()
+
+    def call(self, *arguments):
+        pass
+
+
+def heard(links: HostLinks, beat: int, sequence: int) -> None:
+    column = np.array([HOST], np.int64)
+    one = np.ones(1, np.int64)
+    links.ledger.take(
+        Runs(column, np.array([RUN], np.uint64), one, one * sequence, np.array([beat], np.uint64),
+             one), 0.0,
+    )  # fmt: skip
+    links.heard([HOST])
+
+
+class Control:
+    """Fake client of the slave's service."""
+
+    ready = True
+
+    def service_is_ready(self) -> bool:
+        return self.ready
+
+
+@pytest.fixture
+def control() -> Control:
+    return Control()
+
+
+@pytest.fixture
+def links(monkeypatch, control) -> HostLinks:
+    node = SimpleNamespace(create_client=lambda *arguments, **named: control)
+    participant = SimpleNamespace(node=node, settings=SimpleNamespace(namespace="/rosrm"))
+    links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
+    links._client = FakeClient()
+    monkeypatch.setattr(
+        "rosrm.ros.master.slave_links.order_to_msg",
+        lambda command: SimpleNamespace(envelope=None),
+    )
+    return links
+
+
+def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control):
+    """An earlier order would be lost, and repeated only after `control.order_retry`."""
+    control.ready = False
+    links.renew(HOST, DESCRIPTION)
+    heard(links, beat=100, sequence=1)
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
+    heard(links, beat=200, sequence=2)
+    assert links._client.beats == []
+    control.ready = True
+    heard(links, beat=300, sequence=3)
+    assert links._client.beats == [300]
+
+
+def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
+    """A host that was cut off has only old readings; an order with their beat would be stale."""
+    client = links._client
+    links.renew(HOST, DESCRIPTION)
+    heard(links, beat=100, sequence=1)
+    links.renew(HOST, DESCRIPTION)
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
+    assert client.beats == []
+    heard(links, beat=900, sequence=2)
+    assert client.beats == [900]
+
+
+@pytest.mark.parametrize("text", ["null", "[1]", "3", "{"])
+def test_a_result_that_is_no_object_fails_the_order(text):
+    """The step fails with that message; the callback of the answer raises nothing."""
+    response = srv.ControlHost.Response(answer=accepted(), result=text)
+    event = _order_answered(7, response)
+    assert (event.order, event.accepted, event.code) == (7, False, BAD_RESULT)
+    assert "a result is" in event.message

@@ -1,0 +1,442 @@
+"""Connection of a slave to its master: without DDS, with a simulated clock."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from rosrm.core.slave import events
+from rosrm.core.slave.state import SlaveState
+from rosrm.model.values import HostDescription
+from rosrm.ros.callback_guard import CallbackGuard
+from rosrm.ros.slave import endpoint
+from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
+from rosrm.ros.slave.journal_watermark import JournalSeen, Seen
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import msg, srv
+
+PERIOD = 0.2
+
+
+class Clock:
+    """Clock in seconds; stands in for the module `time`."""
+
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return int(self.now * 1e9)
+
+
+class Call:
+    """Request on its way, with its result."""
+
+    def __init__(self, request) -> None:
+        self.request = request
+        self._done = None
+
+    def add_done_callback(self, done) -> None:
+        self._done = done
+
+    def answer(self, response) -> None:
+        self._response = response
+        self._done(self)
+
+    def result(self):
+        return self._response
+
+
+class Peer:
+    """Fake service client and publisher that store what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[Call] = []
+
+    def service_is_ready(self) -> bool:
+        return True
+
+    def call_async(self, request) -> Call:
+        self.sent.append(Call(request))
+        return self.sent[-1]
+
+    def remove_pending_request(self, call) -> None:
+        pass
+
+    def publish(self, message) -> None:
+        pass
+
+
+class Wire:
+    """Fake participant, and its node."""
+
+    settings = type("Settings", (), {"namespace": "/rosrm"})
+
+    def __init__(self) -> None:
+        self.node = self
+        self.guard = CallbackGuard()
+        self.to: dict[type, Peer] = {}
+        self.hear = {}
+
+    def create_client(self, kind, _name, *, qos_profile) -> Peer:
+        return self.to.setdefault(kind, Peer())
+
+    def create_publisher(self, _kind, _name, _qos) -> Peer:
+        return Peer()
+
+    def create_subscription(self, kind, _name, callback, _qos) -> None:
+        self.hear[kind] = callback
+
+    def counted(self, callback):
+        return callback
+
+    def serve(self, *_arguments) -> None:
+        pass
+
+
+class Host:
+    """Fake runtime of the slave."""
+
+    def __init__(self) -> None:
+        self.events = []
+        self.heard: list[float] = []
+
+    def take(self, event) -> None:
+        if isinstance(event, events.MasterHears):
+            self.heard.append(event.at)
+        else:
+            self.events.append(event)
+
+
+class Master:
+    """Run of a master, as a slave sees it."""
+
+    def __init__(self, slave: Slave, incarnation: int, epoch: int = 1, pid: int = 7) -> None:
+        self._slave = slave
+        self._is = {"hostname": "m", "pid": pid, "epoch": epoch}
+        self._incarnation = incarnation
+        self._epoch = epoch
+
+    def beat(self, unheard=(), age: float = 0.0, journal: int = 0) -> None:
+        beat = msg.MasterBeat(
+            protocol_version=PROTOCOL_VERSION, incarnation=self._incarnation,
+            beat=self._slave.clock.monotonic_ns() - int(age * 1e9), unheard=list(unheard),
+            journal=journal, **self._is,
+        )  # fmt: skip
+        self._slave.wire.hear[msg.MasterBeat](beat)
+
+    def greet(self) -> None:
+        response = srv.Handshake.Response(
+            protocol_version=PROTOCOL_VERSION, accepted=True, master="m",
+            beat=self._slave.clock.monotonic_ns(), **self._is,
+        )  # fmt: skip
+        self._slave.newest(srv.Handshake).answer(response)
+
+    def take_in(self, **refusal) -> None:
+        """Answer the slave's registration; `refusal` has the fields of a refusal."""
+        answer = {"protocol_version": PROTOCOL_VERSION, "accepted": not refusal, **refusal}
+        self._slave.newest(srv.RegisterHost).answer(
+            srv.RegisterHost.Response(
+                answer=msg.Answer(epoch=self._epoch, **answer), host_id=1, beat_period=PERIOD
+            )
+        )
+
+
+class Slave:
+    """Endpoint of a slave with its fake surroundings."""
+
+    def __init__(self, clock: Clock, seen: JournalSeen | None = None) -> None:
+        self.clock, self.wire, self.host = clock, Wire(), Host()
+        description = HostDescription("h0", 5)
+        self.endpoint = SlaveEndpoint(
+            self.wire, description, SlaveState(), take=self.host.take, seen=seen
+        )
+
+    @property
+    def link(self) -> Link:
+        return self.endpoint.link
+
+    def sent(self, kind) -> list[Call]:
+        return self.wire.to[kind].sent
+
+    def newest(self, kind) -> Call:
+        return self.sent(kind)[-1]
+
+    def pass_time(self, seconds: float, *masters: Master) -> None:
+        """Let time pass, cycle by cycle, with beats of these masters."""
+        for _ in range(round(seconds / PERIOD)):
+            self.clock.now += PERIOD
+            for master in masters:
+                master.beat()
+            self.endpoint.go_on(self.clock.now)
+            self.endpoint.ask(self.clock.now)
+
+    def find(self, master: Master) -> None:
+        """Greet the slave and send a beat, so that it registers."""
+        self.pass_time(PERIOD)
+        master.beat()
+        master.greet()
+
+    def join(self, master: Master) -> None:
+        """Greet the slave, send beats and accept its registration."""
+        self.find(master)
+        master.take_in()
+        assert self.link is Link.REGISTERED
+
+
+@pytest.fixture
+def slave(monkeypatch, caplog) -> Slave:
+    caplog.set_level(logging.INFO)
+    clock = Clock()
+    monkeypatch.setattr(endpoint, "time", clock)
+    return Slave(clock)
+
+
+@pytest.mark.parametrize("epoch", [1, 2, 3])
+def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> None:
+    """A master with a lost journal begins at epoch 1 again: the slave registers with it, too."""
+    old, new = Master(slave, 11, epoch=2), Master(slave, 12, epoch=epoch, pid=8)
+    slave.join(old)
+    slave.pass_time(2.0, old)
+    assert slave.link is Link.REGISTERED
+    slave.pass_time(1.0, new)
+    assert events.MasterLost() in slave.host.events
+    assert slave.link is Link.GREETING
+
+    new.greet()
+    assert slave.link is Link.REGISTERING
+    new.take_in()
+    asked = len(slave.sent(srv.RequestProcess))
+    slave.pass_time(PERIOD, new)
+    assert slave.host.events[-1] == events.Registered(epoch, renumbers=epoch <= 2)
+    assert len(slave.sent(srv.RegisterHost)) == 2
+    assert len(slave.sent(srv.RequestProcess)) == asked + 1
+    assert slave.newest(srv.RequestProcess).request.envelope.epoch == epoch
+
+
+def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
+    """The first run is killed right after its greeting, which does not identify the run."""
+    old, new = Master(slave, 11), Master(slave, 12, pid=8)
+    slave.pass_time(PERIOD)
+    old.greet()
+    assert slave.link is Link.LISTENING
+    slave.pass_time(1.0, new)
+    assert slave.sent(srv.RegisterHost) == []
+    slave.pass_time(3.0, new)  # the greeting has expired
+    new.greet()
+    new.take_in()
+    assert slave.link is Link.REGISTERED
+
+
+def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
+    """In a container every master is pid 1 of the same host name."""
+    old, new = Master(slave, 11, pid=1), Master(slave, 12, pid=1)
+    slave.join(old)
+    slave.pass_time(1.0, new)
+    assert slave.link is Link.GREETING
+    new.greet()
+    new.take_in()
+    assert slave.host.events[-1] == events.Registered(1, renumbers=True)
+    slave.pass_time(5.0, new)
+    assert slave.link is Link.REGISTERED
+    assert len(slave.sent(srv.RegisterHost)) == 2
+    slave.pass_time(3.0)  # the new run is silent for a while
+    slave.pass_time(PERIOD, new)
+    new.greet()
+    new.take_in()
+    assert slave.host.events[-1] == events.Registered(1, renumbers=False)
+
+
+def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
+    """The younger of two masters stops; the slave switches at once only to a newer epoch."""
+    ours = Master(slave, 11, epoch=2)
+    slave.join(ours)
+    for epoch in (1, 2):
+        slave.pass_time(3.0, ours, Master(slave, 12, epoch=epoch, pid=8))
+        assert slave.link is Link.REGISTERED
+    Master(slave, 13, epoch=3, pid=9).beat()
+    assert slave.link is Link.SEARCHING
+
+
+def test_beats_say_that_the_master_hears_this_host(slave) -> None:
+    """Beats of the accepting master count, unless they list this host as silent."""
+    ours, another = Master(slave, 11, epoch=2), Master(slave, 12, epoch=1, pid=8)
+    slave.pass_time(PERIOD, ours)
+    ours.greet()
+    assert slave.host.heard == []  # no master has accepted the host yet
+    ours.take_in()
+    slave.host.heard.clear()
+    slave.clock.now += 1.0
+    ours.beat(unheard=[1, 7])
+    another.beat()
+    assert slave.host.heard == []
+    ours.beat(unheard=[2])
+    assert slave.host.heard == pytest.approx([slave.clock.now])
+
+
+def test_old_beats_say_who_was_heard_then(slave) -> None:
+    """A slave that was stopped finds old beats in its sockets."""
+    ours = Master(slave, 11)
+    slave.join(ours)
+    slave.pass_time(1.0, ours)
+    slave.host.heard.clear()
+    slave.clock.now += 1.5
+    ours.beat(age=1.3)
+    ours.beat(age=1.1)
+    now = slave.clock.now
+    assert slave.host.heard == pytest.approx([now - 1.3, now - 1.1], abs=0.01)
+
+
+def test_an_answer_that_was_taken_in_late_greets_nobody(slave) -> None:
+    """Its round trip is too long to tell the age of the master's messages."""
+    ours = Master(slave, 11)
+    slave.pass_time(PERIOD)
+    slave.clock.now += 10.0
+    ours.greet()
+    assert slave.link is Link.SEARCHING
+
+
+def test_a_silent_master_is_lost(slave) -> None:
+    slave.join(Master(slave, 11))
+    slave.pass_time(1.8)
+    assert slave.link is Link.REGISTERED
+    slave.pass_time(0.6)
+    assert slave.link is not Link.REGISTERED
+    assert events.MasterLost() in slave.host.events
+
+
+def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave, caplog) -> None:
+    """The slave leaves once the master is silent; its log claims no running processes."""
+    slave.join(Master(slave, 11))
+    slave.pass_time(1.6)
+    told = []
+    slave.endpoint.leave(lambda: told.append(slave.clock.now))
+    slave.pass_time(0.6)
+    assert slave.link is not Link.REGISTERED
+    assert len(told) == 1
+    assert not [line for line in caplog.messages if "keep running" in line]
+
+
+def test_a_master_that_comes_back_is_told_that_the_slave_leaves(slave) -> None:
+    """The stop may take long; until its end the master must not count the host as staying."""
+    slave.join(Master(slave, 11))
+    slave.endpoint.leave(lambda: None)
+    slave.pass_time(3.0)
+    slave.join(Master(slave, 12, epoch=2))
+    assert [call.request.envelope.epoch for call in slave.sent(srv.Leave)] == [1, 2]
+
+
+def test_a_request_for_work_that_was_lost_is_soon_repeated(slave) -> None:
+    """The first request after a registration may get lost; a long open one is repeated rarely."""
+    master = Master(slave, 11)
+    slave.join(master)
+    start, at = slave.clock.now, []
+    for _ in range(round(100.0 / PERIOD)):
+        before = len(slave.sent(srv.RequestProcess))
+        slave.pass_time(PERIOD, master)
+        if len(slave.sent(srv.RequestProcess)) > before:
+            at.append(slave.clock.now - start)
+    assert at == pytest.approx([0.2, 1.2, 3.2, 7.2, 15.2, 31.2, 61.2, 91.2], abs=1.0)
+    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True)
+    slave.newest(srv.RequestProcess).answer(srv.RequestProcess.Response(answer=answer))
+    before = len(slave.sent(srv.RequestProcess))
+    slave.pass_time(29.0, master)
+    assert len(slave.sent(srv.RequestProcess)) == before + 1
+
+
+def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
+    """The master answered the former request at the moment in which the slave renewed it."""
+    master = Master(slave, 11)
+    slave.join(master)
+    slave.pass_time(1.4, master)
+    first, second = slave.sent(srv.RequestProcess)
+    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True)
+    first.answer(srv.RequestProcess.Response(answer=answer))
+    assert events.AssignmentsReceived((), None) in slave.host.events
+    slave.pass_time(PERIOD, master)
+    assert len(slave.sent(srv.RequestProcess)) == 3  # the master keeps the newest of them open
+    slave.pass_time(5.0, master)
+    second.answer(srv.RequestProcess.Response(answer=answer))  # the slave has given it up by then
+    assert slave.host.events.count(events.AssignmentsReceived((), None)) == 1
+
+
+def test_a_name_that_is_taken_is_said_at_once(slave, caplog) -> None:
+    """The slave retries for a moment, and logs the conflict once."""
+    ours = Master(slave, 11)
+    for _ in range(3):
+        slave.find(ours)
+        ours.take_in(code="name_taken", message="a live one")
+    (said,) = caplog.messages
+    assert said.startswith("a live one. Asking again for 5 s")
+    assert slave.endpoint.failure == ""
+
+
+# --- remembered journal numbers ----------------------------------------------------------------
+
+
+def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_path) -> None:
+    """A later run of the slave reports it, too; the same run of the master needs no report."""
+    clock = Clock()
+    monkeypatch.setattr(endpoint, "time", clock)
+    path = tmp_path / "journal_seen"
+    slave = Slave(clock, JournalSeen(path))
+    old = Master(slave, 11, epoch=2)
+    slave.join(old)
+    assert slave.newest(srv.RegisterHost).request.journal_seen == 0
+    old.beat(journal=40)
+    old.beat(journal=41)
+    slave.pass_time(PERIOD)
+    again = Slave(clock, JournalSeen(path))
+    for one in (slave, again):
+        told = Master(one, 12, epoch=3, pid=8)
+        one.pass_time(3.0, told)
+        told.greet()
+        assert one.newest(srv.RegisterHost).request.journal_seen == 41
+        told.take_in()
+        told.beat(journal=7)
+    assert JournalSeen(path).of_former_run("m", 12) == 0
+    assert JournalSeen(path).of_former_run("m", 13) == 7
+    assert JournalSeen(path).of_former_run("another", 13) == 0
+
+
+def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -> None:
+    """The slave's disk is full, or its file is invalid."""
+    path = tmp_path / "journal_seen"
+    path.write_bytes(b"\xff nonsense")
+    seen = JournalSeen(path)
+    assert seen.of_former_run("m", 2) == 0
+    path.unlink()
+    path.mkdir()
+    seen.note(Seen(5, 1, "m"))
+    assert seen.of_former_run("m", 2) == 5
+
+
+def test_a_master_that_cannot_write_is_asked_again(slave, caplog) -> None:
+    """A master with a journal stall accepts no host for now: the slave retries and logs it once."""
+    ours = Master(slave, 11)
+    for _ in range(3):
+        slave.find(ours)
+        ours.take_in(code="journal", message="a full disk")
+        assert slave.link is Link.SEARCHING
+    slave.find(ours)
+    assert slave.endpoint.failure == ""
+    assert [word for word in caplog.messages if "a full disk" in word] == caplog.messages[:1]
+    ours.take_in()
+    assert slave.link is Link.REGISTERED
+
+
+def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) -> None:
+    """The slave repeats its request, instead of waiting forever during a registration."""
+    master = Master(slave, 11)
+    slave.find(master)
+
+    def fails(*_arguments) -> None:
+        raise KeyError("oops")
+
+    monkeypatch.setattr(slave.endpoint._reporter, "begin", fails)
+    master.take_in()
+    assert slave.wire.guard.failures == 1
+    assert slave.link is Link.SEARCHING
+    monkeypatch.undo()

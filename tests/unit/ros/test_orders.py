@@ -1,0 +1,64 @@
+"""Orders of the master as requests, and as events of the slave's core."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from rosrm.core.slave import events as happened
+from rosrm.core.slave.orders import event_of
+from rosrm.errors import Refused
+from rosrm.model.orders import (
+    DropReplica,
+    FenceInstance,
+    Order,
+    ReplicateSnapshot,
+    ReportInstances,
+    RestartInstance,
+    RunExecutor,
+    SetRestartPolicy,
+    StartInstance,
+    StopInstance,
+)
+from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy
+from rosrm.ros.orders import order_from_msg, order_to_msg
+from rosrm_msgs import srv
+
+ONE = InstanceId("p", 7)
+POLICY = RestartPolicy("always", delay=2.0)
+ASSIGNMENT = Assignment(ONE, ProcessSpec("p", command=("true",)), epoch=3, node_name="p")
+EVENTS = [
+    (StartInstance(ASSIGNMENT), happened.AssignmentsReceived((ASSIGNMENT,), 5.0)),
+    (StopInstance(ONE), happened.StopOrdered(ONE)),
+    (FenceInstance(ONE), happened.FenceOrdered(ONE)),
+    (RestartInstance(ONE), happened.RestartOrdered(ONE)),
+    (SetRestartPolicy(ONE, POLICY), happened.RestartPolicySet(ONE, POLICY)),
+    (ReportInstances(), happened.ReportRequested()),
+]
+ORDERS = [
+    *(order for order, _ in EVENTS),
+    RunExecutor("criu_dump", {"of": 7, "to": ["b"]}, 2.5),
+    ReplicateSnapshot(ONE, ("b", "c"), 0.5),
+    DropReplica(ONE),
+]
+
+
+def test_every_order_is_tried_below():
+    assert {type(order) for order in ORDERS} == set(get_args(Order))
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
+def test_an_order_is_the_same_after_its_way_to_the_slave(order):
+    assert order_from_msg(order_to_msg(order)) == order
+
+
+@pytest.mark.parametrize(("order", "event"), EVENTS, ids=lambda one: type(one).__name__)
+def test_an_order_for_the_core_becomes_its_event(order, event):
+    assert event_of(order, 5.0) == event
+
+
+def test_an_unknown_action_is_refused():
+    """A newer master may send one."""
+    with pytest.raises(Refused, match="unknown action 99"):
+        order_from_msg(srv.ControlHost.Request(action=99))

@@ -1,0 +1,140 @@
+"""Table of a slave's sessions, with a written process tree."""
+
+import os
+import shutil
+
+import pytest
+
+from rosrm.slave.sessions import SessionTable, SessionUsage
+
+TICKS = os.sysconf("SC_CLK_TCK")
+PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+class Tree:
+    """A /proc with the processes of a test."""
+
+    def __init__(self, path):
+        self.path = path
+        self.session = {}
+
+    def put(self, pid, session, *, own=0.0, children=0.0, pages=0, name="sleep"):
+        """Add a process: its CPU seconds, those of its reaped children, its resident pages."""
+        self.session[pid] = session
+        fields = [
+            "S", 1, pid, session, 0, -1, 0, 0, 0, 0, 0,
+            int(own * TICKS), 0, int(children * TICKS), 0, 20, 0, 1, 0, 77, 4096, pages, 0,
+        ]  # fmt: skip
+        folder = self.path / str(pid)
+        folder.mkdir(exist_ok=True)
+        (folder / "stat").write_text(f"{pid} ({name}) {' '.join(map(str, fields))}\n")
+
+    def end(self, pid):
+        """Remove a process that was reaped."""
+        del self.session[pid]
+        shutil.rmtree(self.path / str(pid))
+
+    def session_of(self, pid):
+        try:
+            return self.session[pid]
+        except KeyError:
+            raise ProcessLookupError(pid) from None
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return Tree(tmp_path)
+
+
+@pytest.fixture
+def table(tree):
+    return SessionTable(tree.path, tree.session_of)
+
+
+def test_leader_counts_at_once_members_at_the_walk(tree, table):
+    """The leader counts once the session is added, other processes from the next walk on."""
+    tree.put(10, 10)
+    tree.put(11, 10)
+    tree.put(12, 12)
+    table.add(10)
+    assert table.pids() == (10,)
+    table.refresh(0.0)
+    assert table.pids() == (10, 11)
+    assert table.members(10) == (10, 11)
+    assert table.members(12) == ()
+
+
+def test_usage_is_a_mean_between_walks(tree, table):
+    """Cores are CPU time over time passed; memory is the sum over all processes."""
+    tree.put(10, 10, own=5.0, pages=100)
+    tree.put(11, 10, own=1.0, pages=50)
+    table.add(10)
+    table.refresh(0.0)
+    assert table.usage() == {10: SessionUsage(0.0, 150 * PAGE)}
+    tree.put(10, 10, own=6.0, pages=100)
+    tree.put(11, 10, own=1.5, pages=70)
+    table.refresh(1.0)
+    assert table.usage() == {10: SessionUsage(pytest.approx(1.5), 170 * PAGE)}
+
+
+@pytest.mark.parametrize(
+    ("parent", "cpu"), [({"own": 1.5, "children": 100.0}, 0.5), ({"own": 1.0}, 0.0)]
+)
+def test_a_child_that_ends_makes_no_negative_usage_and_no_jump(tree, table, parent, cpu):
+    """The time of an ended child is its parent's; the time of an orphan is lost."""
+    tree.put(10, 10, own=1.0)
+    tree.put(11, 10, own=100.0)
+    table.add(10)
+    table.refresh(0.0)
+    tree.end(11)
+    tree.put(10, 10, **parent)
+    table.refresh(1.0)
+    assert table.usage()[10].cpu == pytest.approx(cpu)
+
+
+def test_removed_session_is_gone_and_its_time_kept(tree, table):
+    """The CPU time of a removed session is kept for good; the others do not change."""
+    for leader in (10, 20):
+        tree.put(leader, leader, own=1.0)
+        table.add(leader)
+    table.refresh(0.0)
+    table.remove(10, cpu_time=1.25)
+    assert table.pids() == (20,)
+    assert set(table.usage()) == {20}
+    assert table.ended_cpu_time() == 1.25
+    table.remove(99, cpu_time=0.5)
+    assert table.ended_cpu_time() == 1.75
+
+
+def test_ended_time_never_falls(table):
+    """Invalid values from the kernel or the supervisor do not lower the sum."""
+    table.remove(10, cpu_time=2.0)
+    table.remove(11, cpu_time=-1.0)
+    assert table.ended_cpu_time() == 2.0
+
+
+def test_process_that_ends_during_the_walk_is_no_error(tree, table):
+    """The process was listed a moment earlier. A program may have any name."""
+    tree.put(10, 10, pages=10, name="a) S 1 (b c")  # like the end of the name field
+    tree.put(11, 10, pages=10)
+    table.add(10)
+    (tree.path / "11" / "stat").unlink()
+    (tree.path / "12").mkdir()  # ended before its session was read
+    table.refresh(0.0)
+    assert table.usage()[10].memory == 10 * PAGE
+
+
+def test_without_sessions_nothing_is_walked(table, tmp_path):
+    """A slave without processes has no overhead."""
+    shutil.rmtree(tmp_path)
+    table.refresh(0.0)
+    assert (table.pids(), dict(table.usage())) == ((), {})
+
+
+def test_what_was_handed_out_does_not_change(tree, table):
+    """`pids` may be read in another thread while the loop adds and removes."""
+    table.add(10)
+    before = table.pids()
+    table.add(20)
+    table.remove(10, 0.0)
+    assert before == (10,)

@@ -1,0 +1,228 @@
+"""Snapshot files: whole, torn, damaged, older and newer ones, after any end of their writer."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosrm import snapshots
+from rosrm.snapshots import Block, Damaged, SlotWriter
+
+
+def blocks(*contents: bytes) -> list[Block]:
+    return [Block(data, zlib.crc32(data)) for data in contents]
+
+
+def write(directory: Path, sequence: int, *contents: bytes, instance: int = 7) -> bool:
+    writer = SlotWriter(directory, "counter", instance)
+    try:
+        return writer.write(sequence, blocks(*contents))
+    finally:
+        writer.close()
+
+
+def newest(directory: Path, up_to: int = 99):
+    found, _ = snapshots.newest(directory, up_to)
+    return None if found is None else (found.head.age, found.blocks)
+
+
+CONTENTS = st.lists(st.binary(max_size=200), min_size=1, max_size=4)
+
+
+@given(contents=CONTENTS, sequence=st.integers(0, 2**64 - 1), name=st.text(max_size=20))
+def test_what_is_written_is_read(contents, sequence, name):
+    """Name, instance, sequence and every block are equal, bit by bit."""
+    parts = blocks(*contents)
+    data = snapshots.encoded_head(name, 3, sequence, parts) + b"".join(contents)
+    read = snapshots.decoded(data)
+    assert (read.head.process, read.head.instance, read.head.sequence) == (name, 3, sequence)
+    assert list(read.blocks) == contents
+    assert read.head.size == len(data)
+
+
+@given(contents=CONTENTS, data=st.data())
+def test_no_change_goes_unseen(contents, data):
+    """One changed byte anywhere, or a file that ends too early, is detected."""
+    parts = blocks(*contents)
+    whole = snapshots.encoded_head("counter", 3, 5, parts) + b"".join(contents)
+    at = data.draw(st.integers(0, len(whole) - 1))
+    other = data.draw(st.integers(1, 255))
+    with pytest.raises(Damaged):
+        snapshots.decoded(whole[:at])
+    with pytest.raises(Damaged):
+        snapshots.decoded(whole[:at] + bytes([whole[at] ^ other]) + whole[at + 1 :])
+
+
+@given(garbage=st.binary(max_size=300))
+def test_what_is_no_state_is_said_so(garbage):
+    with pytest.raises(Damaged):
+        snapshots.decoded(garbage)
+
+
+def test_the_newest_counts(tmp_path):
+    """The newest is by instance first, then by sequence; the slots are used in turn."""
+    for sequence in (1, 2, 3):
+        write(tmp_path, sequence, b"a%d" % sequence)
+    assert newest(tmp_path) == ((7, 3), (b"a3",))
+    write(tmp_path, 1, b"b", instance=8)
+    assert newest(tmp_path) == ((8, 1), (b"b",))
+    assert newest(tmp_path, up_to=7) == ((7, 3), (b"a3",))
+
+
+def test_a_newer_instance_is_never_overwritten(tmp_path):
+    """The write of an old instance that still runs returns False and changes nothing."""
+    old = SlotWriter(tmp_path, "counter", 7)
+    assert old.write(1, blocks(b"old"))
+    write(tmp_path, 10, b"new", instance=8)
+    write(tmp_path, 11, b"new", instance=8)
+    assert not old.write(2, blocks(b"old"))
+    old.close()
+    assert newest(tmp_path) == ((8, 11), (b"new",))
+
+
+class Killed(BaseException):
+    """Stand for the death of the process."""
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.lists(st.integers(0, 3000), min_size=2, max_size=6), st.integers(0, 12_000))
+def test_killed_at_any_byte_a_whole_state_is_left(tmp_path_factory, sizes, bytes_left):
+    """The snapshot is that of the last complete write, or the one being written."""
+    directory = tmp_path_factory.mktemp("k")
+    left = bytes_left
+    real = os.pwritev
+
+    def pwritev(file, buffers, at):
+        nonlocal left
+        data = b"".join(buffers)[:left]
+        left -= len(data)
+        if data:
+            real(file, [data], at)
+        if left == 0:
+            raise Killed
+        return len(data)
+
+    done = 0
+    with pytest.MonkeyPatch.context() as patch, contextlib.suppress(Killed):
+        patch.setattr(os, "pwritev", pwritev)
+        for number, size in enumerate(sizes, start=1):
+            write(directory, number, bytes([number]) * size, b"x")
+            done = number
+    found = newest(directory)
+    if found is None:
+        assert done == 0
+    else:
+        (_, sequence), (first, second) = found
+        assert sequence in (done, done + 1)
+        assert (first, second) == (bytes([sequence]) * sizes[sequence - 1], b"x")
+        write(directory, 100, b"next")  # the next start continues from that snapshot
+        assert newest(directory) == ((7, 100), (b"next",))
+
+
+def test_a_damaged_newest_leaves_the_older_one_and_is_named(tmp_path):
+    """The next write replaces the damaged snapshot, not the last whole one."""
+    write(tmp_path, 1, b"first")
+    write(tmp_path, 2, b"second")
+    damaged = tmp_path / snapshots.SLOTS[1]
+    content = damaged.read_bytes()
+    damaged.write_bytes(content[:-1] + b"?")
+    found, faults = snapshots.newest(tmp_path, 99)
+    assert found is not None
+    assert found.head.sequence == 1
+    assert len(faults) == 1
+    assert str(damaged) in faults[0]
+    write(tmp_path, 3, b"third")
+    assert snapshots.read(tmp_path / snapshots.SLOTS[0]).head.sequence == 1
+
+
+def test_a_full_disk_leaves_the_newest_state(tmp_path, monkeypatch):
+    """The writer gets an OSError; the old snapshot stays, and later writes succeed again."""
+    writer = SlotWriter(tmp_path, "counter", 7)
+    writer.write(1, blocks(b"first"))
+    real = os.pwritev
+
+    def full(file, buffers, at):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwritev", full)
+    with pytest.raises(OSError, match="No space"):
+        writer.write(2, blocks(b"second"))
+    assert newest(tmp_path) == ((7, 1), (b"first",))
+    monkeypatch.setattr(os, "pwritev", real)
+    assert writer.write(3, blocks(b"third"))
+    writer.close()
+    assert newest(tmp_path) == ((7, 3), (b"third",))
+
+
+def test_files_are_the_owners_alone_and_do_not_stay_large(tmp_path):
+    """This holds under any umask; a snapshot that has become small frees its room."""
+    directory = tmp_path / "counter"
+    old = os.umask(0)
+    try:
+        for sequence in range(4):
+            write(directory, sequence, bytes(1_000_000) if sequence < 2 else b"small")
+        snapshots.write_copy(directory, snapshots.newest_content(directory)[1])
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE(directory.stat().st_mode) == 0o700
+    for path in directory.iterdir():
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert path.stat().st_size < 1000
+
+
+def test_a_copy_from_another_host_counts_like_a_state_of_ones_own(tmp_path):
+    """The replica counts until a newer instance has written a snapshot."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    write(there, 5, b"state")
+    found = snapshots.newest_content(there)
+    assert found is not None
+    snapshots.write_copy(here, found[1])
+    assert newest(here) == ((7, 5), (b"state",))
+    write(here, 1, b"mine", instance=9)
+    assert newest(here) == ((9, 1), (b"mine",))
+
+
+def test_dropped_are_the_states_of_older_instances_alone(tmp_path):
+    """Snapshots of newer instances stay; an empty directory is removed."""
+    directory = tmp_path / "counter"
+    write(directory, 5, b"old")
+    write(directory, 1, b"new", instance=9)
+    assert not snapshots.drop(directory, 8)
+    assert newest(directory) == ((9, 1), (b"new",))
+    assert snapshots.drop(directory, 9)
+    assert not directory.exists()
+
+
+def test_a_writer_whose_files_were_deleted_goes_on_in_new_ones(tmp_path):
+    """The snapshot of a former instance may be dropped while the new one runs."""
+    directory = tmp_path / "counter"
+    write(directory, 5, b"old", instance=7)
+    writer = SlotWriter(directory, "counter", 9)
+    assert snapshots.drop(directory, 8)
+    assert writer.write(1, blocks(b"new"))
+    assert newest(directory) == ((9, 1), (b"new",))
+    assert writer.write(2, blocks(b"newer"))
+    snapshots.drop(directory, 8)
+    assert writer.write(3, blocks(b"newest"))
+    writer.close()
+    assert newest(directory) == ((9, 3), (b"newest",))
+
+
+def test_links_are_not_followed(tmp_path):
+    """Write access to the directory must not allow writes to another file."""
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"precious")
+    directory = tmp_path / "counter"
+    directory.mkdir()
+    (directory / snapshots.SLOTS[0]).symlink_to(victim)
+    with pytest.raises(OSError, match="symbolic"):
+        write(directory, 1, b"state")
+    assert victim.read_bytes() == b"precious"

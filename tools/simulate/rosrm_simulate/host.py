@@ -1,0 +1,325 @@
+"""Base of simulated hosts: a slave's core, and programs in place of real processes.
+
+The hosts of the simulator and those of the unit tests share it. Here nothing takes time; the
+subclasses add the usage of the programs, delays and faults.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from rosrm.core.master.commands import OrderId, SendOrder
+from rosrm.core.master.events import OrderAnswered, StatusesReceived, UsagesReceived
+from rosrm.core.master.state.host_arrays import FloatArray
+from rosrm.core.slave import commands, events, reducer
+from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.state import SlaveState, under_limits
+from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
+from rosrm.model.values import (
+    EMPTY,
+    RESOURCE_SLOTS,
+    Assignment,
+    HostDescription,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ResourceDescription,
+    RestartPolicy,
+)
+
+_SIGINT, _SIGKILL = 2, 9
+
+
+@dataclass(slots=True, kw_only=True)
+class Program:
+    """One instance on a host.
+
+    Attributes:
+        restart: restart policy that the supervisor applies when the instance ends.
+        run: number of its restarts; a delayed action for an earlier run has no effect.
+    """
+
+    assignment: Assignment
+    restart: RestartPolicy
+    pid: int
+    state: InstanceState = InstanceState.STARTING
+    run: int = 0
+
+
+ProgramT = TypeVar("ProgramT", bound=Program)
+
+
+class Reading(NamedTuple):
+    """A slave's reading.
+
+    Attributes:
+        at: time of the reading.
+        usage: (RESOURCE_SLOTS,) fractions.
+        stale: bit i stands for slot i.
+        accepts: the host is under all its limits and takes work.
+    """
+
+    at: float
+    usage: FloatArray
+    stale: int
+    accepts: bool
+
+
+@dataclass(kw_only=True)
+class Host(ABC, Generic[ProgramT]):
+    """Simulated host: its slave and its programs.
+
+    Attributes:
+        limits: upper limits, fractions by resource.
+        busy: usage by other programs, fractions by resource.
+        start_time, stop_time: seconds that a program takes to start and to stop.
+        incarnation: of its slave.
+        host_id: assigned by the master; 0: not registered.
+        programs: instances that really run; they outlive the slave.
+        ends: statuses of ended instances that the supervisor remembers.
+        polled: assignments at the master that wait for the slave's next request.
+        said: status batches on their way to the master.
+        stale: resources whose readings are too old.
+        limit: (RESOURCE_SLOTS,) as in its readings.
+    """
+
+    name: str = field(kw_only=False)
+    resources: tuple[ResourceDescription, ...] = ()
+    limits: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    max_processes: int = 0
+    busy: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    period: float = 0.1
+    start_time: float = 0.0
+    stop_time: float = 0.0
+    incarnation: int = 0
+
+    host_id: int = 0
+    slave: SlaveState = field(default_factory=SlaveState)
+    programs: dict[InstanceId, ProgramT] = field(default_factory=dict)
+    ends: dict[InstanceId, InstanceStatus] = field(default_factory=dict)
+    polled: list[Assignment] = field(default_factory=list)
+    said: deque[StatusesReceived] = field(default_factory=deque)
+    stale: set[str] = field(default_factory=set)
+    sequence: int = 0
+    batches: int = 0
+    limit: FloatArray = field(init=False)
+    _settled: list[commands.Settle] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Prepare the slave's core and the limits."""
+        self.slave.max_processes = self.max_processes
+        self.limit = np.ones(RESOURCE_SLOTS)
+        limits = [self.limits.get(one.name, 1.0) for one in self.resources]
+        self.limit[: len(limits)] = limits
+
+    # --- differences between the simulator's hosts and those of the unit tests -------------
+
+    @abstractmethod
+    def make_program(self, assignment: Assignment, restart: RestartPolicy) -> ProgramT:
+        """Return the program of a new instance."""
+
+    @abstractmethod
+    def used_by(self, program: ProgramT, now: float) -> Mapping[str, float]:
+        """Return the base units of each resource that an instance uses."""
+
+    @abstractmethod
+    def spent(self, program: ProgramT, now: float) -> tuple[float, float, float]:
+        """Return run time, peak memory and CPU time of an instance that ends."""
+
+    def execute(self, order_id: OrderId, order: RunExecutor) -> OrderAnswered:
+        """Run an executor, and answer; a simulated host has none."""
+        message = f"the simulation cannot carry out {order.executor!r}"
+        return OrderAnswered(order_id, False, "failed", message)
+
+    def replicate(self, order: ReplicateSnapshot | DropReplica) -> None:
+        """Carry out an order about snapshots; here nodes publish none."""
+
+    def say(self, batch: StatusesReceived) -> None:
+        """Send statuses to the master."""
+        self.said.append(batch)
+
+    def later(self, _seconds: float, now: float, action: Callable[[float], None]) -> None:
+        """Call an action after some seconds, with the time at which it happens."""
+        action(now)
+
+    def run_begins(self, program: ProgramT, now: float) -> None:
+        """Note that a program runs from now on."""
+
+    def run_begins_again(self, program: ProgramT, now: float) -> None:
+        """Note that a program starts again."""
+
+    def run_ended(self, now: float) -> None:
+        """Note that a program is gone."""
+
+    # --- messages to the master ------------------------------------------------------------
+
+    def description(self) -> HostDescription:
+        """Return the description with which its slave registers."""
+        return HostDescription(
+            self.name, self.incarnation, labels=self.labels, resources=self.resources,
+            max_processes=self.max_processes, period=self.period,
+        )  # fmt: skip
+
+    def usage(self, now: float) -> dict[str, float]:
+        """Return the fraction of each resource that is used."""
+        used = [self.used_by(program, now) for program in self.programs.values()]
+        return {
+            one.name: self.busy.get(one.name, 0.0)
+            + sum(amounts.get(one.name, 0.0) for amounts in used) / one.capacity
+            for one in self.resources
+        }
+
+    def reading(self, now: float) -> Reading:
+        """Return the slave's reading."""
+        used, count = self.usage(now), len(self.resources)
+        usage = np.zeros(RESOURCE_SLOTS)
+        usage[:count] = [used[one.name] for one in self.resources]
+        stale = sum((one.name in self.stale) << slot for slot, one in enumerate(self.resources))
+        accepts = under_limits(
+            usage.astype(np.float32), self.limit.astype(np.float32), (1 << count) - 1, stale
+        )
+        return Reading(now, usage, stale, accepts)
+
+    def used(self, now: float) -> tuple[tuple[int, float, float], ...]:
+        """Return number, cores and bytes of each instance."""
+        told = []
+        for instance, program in self.programs.items():
+            amounts = self.used_by(program, now)
+            told.append((instance.number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0)))
+        return tuple(told)
+
+    def usages(self, now: float) -> UsagesReceived:
+        """Return the event with the usage of each instance."""
+        used = self.used(now)
+        numbers, cpu, memory = zip(*used, strict=True) if used else ((), (), ())
+        return UsagesReceived(
+            self.host_id, self.incarnation, np.array(numbers, np.uint64),
+            np.array(cpu, np.float64), np.array(memory, np.float64),
+        )  # fmt: skip
+
+    # --- the slave -------------------------------------------------------------------------
+
+    def tell(self, event: events.Event, now: float) -> None:
+        """Process an event in the slave's core, and carry out its commands."""
+        for command in reducer.step(self.slave, event, now):
+            self._carry_out(command, now)
+
+    def _carry_out(self, command: commands.Command, now: float) -> None:
+        match command:
+            case commands.Report(statuses, complete):
+                self.batches += 1
+                self.say(
+                    StatusesReceived(
+                        self.host_id, self.incarnation, self.batches, complete, statuses
+                    )
+                )
+            case commands.Launch(assignments):
+                for assignment in assignments:
+                    self._launch(assignment, now)
+            case commands.Stop(instance):
+                self._stop(instance, now)
+            case commands.Fence(instance):
+                if instance in self.programs:
+                    self._end(instance, InstanceState.FENCED, now, signal=_SIGKILL)
+            case commands.Restart(instance):
+                self._restart(instance, now)
+            case commands.Amend(instance, restart):
+                self.programs[instance].restart = restart
+                self.tell(events.RestartPolicyRecorded(instance, restart), now)
+            case commands.Settle():
+                self._settled.append(command)
+            case commands.Forget(instances):
+                for instance in instances:
+                    self.ends.pop(instance, None)
+
+    def obey(self, sent: SendOrder, now: float) -> OrderAnswered:
+        """Carry out an order, and return the answer."""
+        order, refusal = sent.order, ""
+        match order:
+            case RunExecutor():
+                return self.execute(sent.order_id, order)
+            case ReplicateSnapshot() | DropReplica():
+                self.replicate(order)
+            case SetRestartPolicy():
+                self._settled.clear()
+                self.tell(event_of(order), now)
+                (settled,) = self._settled
+                refusal = settled.refusal
+            case _:
+                self.tell(event_of(order), now)
+        return OrderAnswered(sent.order_id, not refusal, "refused" if refusal else "", refusal)
+
+    def shut_down(self, now: float) -> None:
+        """Stop all instances, as a slave does that leaves."""
+        for instance, held in list(self.slave.held.items()):
+            if not held.status.state.ended:
+                self.tell(events.StopOrdered(instance), now)
+
+    # --- programs --------------------------------------------------------------------------
+
+    def _supervisor_says(self, status: InstanceStatus, now: float) -> None:
+        self.tell(events.SupervisorReported((status,)), now)
+
+    def _launch(self, assignment: Assignment, now: float) -> None:
+        silent = assignment.shadow or assignment.restored
+        restart = RestartPolicy() if silent else assignment.spec.restart
+        instance = assignment.instance
+        self.programs[instance] = self.make_program(assignment, restart)
+        self.later(self.start_time, now, partial(self._started, instance, 0))
+
+    def _started(self, instance: InstanceId, run: int, now: float) -> None:
+        program = self.programs.get(instance)
+        if program is None or program.run != run or program.state is not InstanceState.STARTING:
+            return
+        program.state = InstanceState.RUNNING
+        self.run_begins(program, now)
+        status = InstanceStatus(instance, InstanceState.RUNNING, pid=program.pid, restarts=run)
+        self._supervisor_says(status, now)
+
+    def _restart(self, instance: InstanceId, now: float) -> None:
+        program = self.programs[instance]
+        if program.state is InstanceState.STOPPING:
+            return  # an order to stop prevails
+        program.state = InstanceState.STARTING
+        program.run += 1
+        self.run_begins_again(program, now)
+        status = InstanceStatus(instance, InstanceState.STOPPING, restarts=program.run)
+        self._supervisor_says(status, now)
+        seconds = self.stop_time + self.start_time
+        self.later(seconds, now, partial(self._started, instance, program.run))
+
+    def _stop(self, instance: InstanceId, now: float) -> None:
+        program = self.programs.get(instance)
+        if program is None or program.state is InstanceState.STOPPING:
+            return
+        program.state = InstanceState.STOPPING
+        status = InstanceStatus(instance, InstanceState.STOPPING, pid=program.pid)
+        self._supervisor_says(status, now)
+        self.later(self.stop_time, now, partial(self._stopped, instance))
+
+    def _stopped(self, instance: InstanceId, now: float) -> None:
+        if instance in self.programs:
+            self._end(instance, InstanceState.EXITED, now, signal=_SIGINT)
+
+    def _end(
+        self, instance: InstanceId, state: InstanceState, now: float, *, code: int = 0,
+        signal: int = 0,
+    ) -> None:  # fmt: skip
+        run_time, peak_memory, cpu_time = self.spent(self.programs[instance], now)
+        del self.programs[instance]
+        self.run_ended(now)
+        status = InstanceStatus(
+            instance, state, exit_code=code, exit_signal=signal, run_time=run_time,
+            peak_memory=peak_memory, cpu_time=cpu_time,
+            message=f"exit code {code}" if code else "",
+        )  # fmt: skip
+        self.ends[instance] = status
+        self._supervisor_says(status, now)
