@@ -25,10 +25,8 @@ _DISTRIBUTIONS = (
     "rosrm-criu",
     "ros-jazzy-rclpy",
     "ros-jazzy-rmw-fastrtps-cpp",
-    "aiohttp",
     "backports.zstd",
     "cryptography",
-    "urllib3",
 )
 
 

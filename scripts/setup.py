@@ -31,6 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 CRIU = VENV / "criu"  # the same path as in tests/conftest.py and the Makefile
+INSTALL_CRIU = ROOT / "scripts" / "install_criu.sh"
 LOG = VENV / "setup.log"
 STAMP = VENV / "rosrm-setup.json"
 INTERFACES = ROOT / "rosrm_msgs"
@@ -159,13 +160,13 @@ def cache_folder() -> Path:
 
 def try_criu(steps: Steps) -> None:
     """Install CRIU into the environment, if available; without it its tests are skipped."""
-    command = [PYTHON, "-m", "rosrm.cli", "criu", "install", "--prefix", CRIU]
     try:
-        steps.run("CRIU, if there is one for this machine", *command)
+        steps.run("CRIU, if there is one for this machine", INSTALL_CRIU, CRIU)
     except SetupError as error:
-        last = str(error).strip().splitlines()[-1].removeprefix("rosrm: ")
+        last = str(error).strip().splitlines()[-1].removeprefix("install_criu: ")
         print(f"      without CRIU; what needs it is skipped in the tests. {last}")
-        print(f"      To try again: .venv/bin/rosrm criu install --prefix {CRIU.relative_to(ROOT)}")
+        script, folder = INSTALL_CRIU.relative_to(ROOT), CRIU.relative_to(ROOT)
+        print(f"      To try again: {script} {folder}")
 
 
 # ----------------------------------------------------------------------------- present state
@@ -179,7 +180,8 @@ def interfaces_digest() -> str:
 
 def packages_digest() -> str:
     """Return a digest of all files that determine the packages of the environment."""
-    return digest([CONSTRAINTS, Path(__file__), *(d / "pyproject.toml" for d in distributions())])
+    scripts = (Path(__file__), INSTALL_CRIU)
+    return digest([CONSTRAINTS, *scripts, *(d / "pyproject.toml" for d in distributions())])
 
 
 def digest(files: list[Path]) -> str:

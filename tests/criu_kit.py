@@ -119,7 +119,7 @@ class Theatre:
             actor.process.wait(TIMEOUT)
         return directory
 
-    def hold(
+    def shim(
         self,
         directory: Path,
         *options: str,
@@ -127,10 +127,10 @@ class Theatre:
         environment: Mapping[str, str] | None = None,
     ) -> Actor:
         """The program that restores an image, just started."""
-        command = [*self.hold_command(directory, remove=remove), *options]
+        command = [*self.shim_command(directory, remove=remove), *options]
         return self.run(command, environment=environment)
 
-    def hold_command(
+    def shim_command(
         self, directory: Path, *, remove: bool = False, then: Sequence[str] = ()
     ) -> tuple[str, ...]:
         """Its command line."""
@@ -141,7 +141,7 @@ class Theatre:
 
     def restore(self, directory: Path, *options: str, **named: Any) -> Actor:
         """The program that holds a restored process."""
-        actor = self.hold(directory, *options, **named)
+        actor = self.shim(directory, *options, **named)
         actor.outcome = restore_result.wait(
             directory, timeout=TIMEOUT, ended=lambda: actor.process.poll() is not None
         )

@@ -15,7 +15,7 @@ import pytest
 
 from rosrm.errors import CriuError
 from rosrm.model.values import RestartPolicy
-from rosrm_criu.engine import dump, image, process_tree, restore
+from rosrm_criu.engine import dump, image, process_tree, restore, restore_result
 from rosrm_criu.engine.image import MappedFile
 from tests.criu_kit import TIMEOUT, eventually
 from tests.integration.supervisor.conftest import Host
@@ -208,13 +208,6 @@ def test_a_file_of_the_kernels_needs_not_lie_there(theatre):
 # --- what becomes of the source -----------------------------------------------------------------
 
 
-def test_it_runs_on_after_a_dump_that_leaves_it_running(theatre, counter):
-    """A checkpoint costs it a moment, and no number."""
-    theatre.dump(counter, leave="running")
-    counter.counts()
-    assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
-
-
 def test_it_does_not_stand_still_for_the_checksums(theatre, counter, monkeypatch):
     """Of a large image they take as long as the dump; a process that runs on is not held up."""
     make = image.file_checksums
@@ -226,6 +219,7 @@ def test_it_does_not_stand_still_for_the_checksums(theatre, counter, monkeypatch
     monkeypatch.setattr(image, "file_checksums", make_while_it_counts)
     theatre.dump(counter, leave="running")
     assert theatre.manifest.checksums.keys() == theatre.manifest.sizes.keys()
+    assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
 
 
 def test_it_stands_still_until_it_is_resumed(theatre, counter):
@@ -337,8 +331,8 @@ def test_an_image_that_has_no_room_is_not_begun(theatre, counter, monkeypatch):
 # --- below the hold -----------------------------------------------------------------------------
 
 
-def test_the_exit_code_comes_through_the_hold(theatre, counter):
-    """SIGTERM is passed on, and the process's own answer to it is the hold's end."""
+def test_the_exit_code_comes_through_the_shim(theatre, counter):
+    """SIGTERM is passed on, and the process's own answer to it is the shim's end."""
     restored = theatre.restore(theatre.dump(counter))
     restored.process.terminate()
     assert restored.process.wait(TIMEOUT) == 7
@@ -351,15 +345,15 @@ def test_who_ends_at_once_was_restored_all_the_same(theatre, option):
     actor = theatre.start(code)
     assert process_tree.wait_until_stopped([actor.pid], TIMEOUT)
     directory = theatre.dump(actor)
-    hold = theatre.hold(directory, *option)
-    eventually((directory / "hold.json").exists, "the end of the restore")
-    os.killpg(hold.pid, signal.SIGCONT)
-    assert hold.process.wait(TIMEOUT) == 9
-    assert json.loads((directory / "hold.json").read_text())["reason"] == ""
+    shim = theatre.shim(directory, *option)
+    eventually((directory / "shim.json").exists, "the end of the restore")
+    os.killpg(shim.pid, signal.SIGCONT)
+    assert shim.process.wait(TIMEOUT) == 9
+    assert json.loads((directory / "shim.json").read_text())["reason"] == ""
 
 
-def test_signals_come_through_the_hold(theatre, counter):
-    """What the process handles it handles; what kills it, the hold dies of too."""
+def test_signals_come_through_the_shim(theatre, counter):
+    """The restored process handles its signals; the shim ends by the signal that kills it."""
     restored = theatre.restore(theatre.dump(counter))
     os.killpg(restored.pid, signal.SIGUSR1)
     restored.says("usr1")
@@ -369,7 +363,7 @@ def test_signals_come_through_the_hold(theatre, counter):
 
 
 @pytest.mark.parametrize("group", [True, False])
-def test_sigkill_of_the_hold_ends_all_of_it(theatre, group):
+def test_sigkill_of_the_shim_ends_all_of_it(theatre, group):
     """Also a daemon that has left group and session. It takes milliseconds on an idle machine."""
     code = f"""
 import os, signal
@@ -415,7 +409,7 @@ def living_in(namespace: str) -> list[int]:
 
 
 def test_what_the_process_leaves_behind_ends_with_it(theatre):
-    """Its end is the end of the namespace, before the hold's own is seen."""
+    """Its end is the end of the namespace, before the shim's own is seen."""
     code = f"""
 import os, signal
 def become_two(*_):
@@ -451,10 +445,26 @@ def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
     assert modes == {0}
     restored = theatre.restore(directory, remove=True)
-    eventually(lambda: [path.name for path in directory.iterdir()] == ["hold.json"], "a clean end")
+    eventually(lambda: [path.name for path in directory.iterdir()] == ["shim.json"], "a clean end")
     restored.process.terminate()
     restored.process.wait(TIMEOUT)
-    assert [path.name for path in directory.iterdir()] == ["hold.json"]
+    assert [path.name for path in directory.iterdir()] == ["shim.json"]
+
+
+@pytest.mark.parametrize("victim", ["the process", "its shim"])
+def test_that_it_was_restored_is_known_after_its_end(theatre, counter, victim):
+    """The result of a restore survives any early end of the process; its memory is removed."""
+    directory = theatre.dump(counter)
+    restored = theatre.restore(directory, remove=True)
+    told = restored.outcome
+    eventually(
+        lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "its removal"
+    )
+    pid = restored.pid if victim == "its shim" else restored.outcome.pid
+    os.kill(pid, signal.SIGKILL)
+    assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
+    assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
+    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == told
 
 
 @pytest.fixture
@@ -465,26 +475,13 @@ def host(tmp_path):
     host.clean_up()
 
 
-def test_below_a_supervisor(theatre, counter, host):
-    """The supervisor starts a hold like any process: it stops it, and sees its end."""
-    directory = theatre.dump(counter)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
-    assert process_tree.root_of(running.pid) != running.pid
-    client.stop(running.instance)
-    ended = host.ended(client, "actor", number=2)
-    assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
-
-
 def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     """It runs on meanwhile, is known again, and is stopped like any other."""
     directory = theatre.dump(counter)
     client = host.connect()
-    client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
+    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
     before = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / "shim.json").exists, "the end of the restore")
     log = host.log("actor", 2)
     host.kill_supervisor(client)
     client = host.connect()
@@ -492,22 +489,23 @@ def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     seen = log.read_text()
     eventually(lambda: len(log.read_text()) > len(seen), "more numbers")
     client.stop(after.instance)
-    host.ended(client, "actor", number=2)
+    ended = host.ended(client, "actor", number=2)
+    assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
     assert (after.state, after.pid) == (before.state, before.pid)
     assert not process_tree.is_alive(before.pid)
 
 
 def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
-    """The stop policy and the fences come to a SIGKILL of the hold's group, which leaves nobody."""
+    """The stop policy ends in a SIGKILL of the shim's group, which leaves no process."""
     ignoring = "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     code = COUNTER.replace("count = 0", f"{ignoring}count = 0").replace("sys.exit(7)", "None")
     actor = theatre.start(code)
     actor.counts()
     directory = theatre.dump(actor)
     client = host.connect()
-    client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
+    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
     running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / "shim.json").exists, "the end of the restore")
     namespace = pid_namespace(process_tree.root_of(running.pid))
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
@@ -519,27 +517,18 @@ def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
     """The restart policy holds for what was restored: it begins at one, as after any crash."""
     directory = theatre.dump(counter)
     then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "a word of its own"]
-    command = theatre.hold_command(directory, remove=True, then=then)
+    command = theatre.shim_command(directory, remove=True, then=then)
     client = host.connect()
     restart = RestartPolicy("on-failure", delay=0.01)
     client.start([host.order("actor", *command, number=2, restart=restart)])
     running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / "shim.json").exists, "the end of the restore")
     log = host.log("actor", 2)
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
     eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
     client.stop(running.instance)
     host.ended(client, "actor", number=2)
-
-
-def test_an_image_that_is_gone_is_no_reason_to_start_anew(theatre, counter):
-    """Where nothing was restored yet the state would be lost without a word: it fails instead."""
-    directory = theatre.dump(counter)
-    image.remove(directory)
-    hold = theatre.run(theatre.hold_command(directory, then=["/bin/true"]))
-    assert hold.process.wait(TIMEOUT) == 125
-    assert "holds no complete image" in hold.log.read_text()
 
 
 # --- without a namespace ------------------------------------------------------------------------
@@ -558,8 +547,8 @@ def test_without_a_namespace_it_is_held_all_the_same(theatre, counter):
     assert again.process.wait(TIMEOUT) == 7
 
 
-def test_without_a_namespace_a_guard_ends_it_with_its_hold(theatre, counter):
-    """A SIGKILL of the hold's group reaches the restored process too."""
+def test_without_a_namespace_a_guard_ends_it_with_its_shim(theatre, counter):
+    """A SIGKILL of the shim's group reaches the restored process too."""
     restored = theatre.restore(theatre.dump(counter), "--no-namespace")
     os.killpg(restored.pid, signal.SIGKILL)
     eventually(
@@ -579,19 +568,7 @@ def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
 # --- what cannot be restored --------------------------------------------------------------------
 
 
-def test_a_damaged_image_is_refused(theatre, counter):
-    """A file cut short is seen before CRIU begins, named, and said to who waits and in the log."""
-    directory = theatre.dump(counter)
-    pages = max((directory / "criu").iterdir(), key=lambda path: path.stat().st_size)
-    os.truncate(pages, 1000)
-    hold = theatre.hold(directory)
-    assert hold.process.wait(TIMEOUT) == 125
-    wanted = f"damaged: criu/{pages.name} has 1000 bytes instead of"
-    assert wanted in hold.log.read_text()
-    assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
-
-
-@pytest.mark.parametrize("pattern", ["criu/pages-1.img", "criu/pstree.img", "files/*"])
+@pytest.mark.parametrize("pattern", ["criu/pages-1.img", "files/*"])
 def test_a_flipped_byte_is_refused(theatre, pattern):
     """The size is the same. Neither has CRIU begun, nor was a file put over what lies there."""
     actor = theatre.start(f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}")
@@ -601,11 +578,11 @@ def test_a_flipped_byte_is_refused(theatre, pattern):
     count.write_text("of somebody else")
     [damaged] = directory.glob(pattern)
     flip_a_bit(damaged)
-    hold = theatre.hold(directory)
-    assert hold.process.wait(TIMEOUT) == 125
+    shim = theatre.shim(directory)
+    assert shim.process.wait(TIMEOUT) == 125
     wanted = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
-    assert wanted in hold.log.read_text()
-    assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
+    assert wanted in shim.log.read_text()
+    assert wanted in json.loads((directory / "shim.json").read_text())["reason"]
     assert not (directory / "restore.log").exists()
     assert count.read_text() == "of somebody else"
 
@@ -664,13 +641,6 @@ def test_a_file_that_it_reads_has_to_be_there(theatre):
     table.unlink()
     with pytest.raises(CriuError, match=f"the file {table}, which the process has open, cannot"):
         theatre.restore(directory)
-
-
-def test_an_incomplete_image_is_refused(tmp_path):
-    """The manifest comes last: without it a dump or a transfer was cut off."""
-    image.create(tmp_path / "image")
-    with pytest.raises(CriuError, match=r"holds no complete image: there is no manifest\.json"):
-        image.read(tmp_path / "image")
 
 
 def test_an_image_that_others_may_read_is_refused(theatre, counter):

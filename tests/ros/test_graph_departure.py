@@ -12,9 +12,9 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rosrm_criu.node.graph_departure import (
-    Absence,
-    absence_of,
+    Departure,
     await_peers,
+    departure_of,
     others_of,
     peers_of,
     sees_again,
@@ -22,9 +22,9 @@ from rosrm_criu.node.graph_departure import (
 from tests.ros.nodes import RELIABLE
 
 
-def again(stage, absence: Absence, name: str = "again", **named) -> Node:
+def again(stage, departure: Departure, name: str = "again", **named) -> Node:
     """Return a node that starts with the parameters of a departed one."""
-    overrides = absence.overrides(named.pop("parameter_overrides", None))
+    overrides = departure.overrides(named.pop("parameter_overrides", None))
     return stage.add(Node(name, context=stage.context, parameter_overrides=overrides, **named))
 
 
@@ -45,7 +45,7 @@ def test_a_parameter_keeps_its_value(stage, node, value) -> None:
     value = [value] if isinstance(value, bytes) else value
     node.declare_parameter("p", default)
     node.set_parameters([Parameter("p", value=value)])
-    copy = again(stage, absence_of(node))
+    copy = again(stage, departure_of(node))
     assert copy.declare_parameter("p", default).value == node.get_parameter("p").value
 
 
@@ -55,9 +55,9 @@ def test_what_is_declared_elsewhere_is_declared_again(stage, node) -> None:
     node.declare_parameter("unset", Parameter.Type.DOUBLE)
     node.declare_parameter("free", None, ParameterDescriptor(dynamic_typing=True))
     node.set_parameters([Parameter("undeclared", value="here")])
-    absence = absence_of(node)
-    copy = again(stage, absence)
-    absence.declare_missing(copy)
+    departure = departure_of(node)
+    copy = again(stage, departure)
+    departure.declare_missing(copy)
     assert copy.get_parameter("limit").value == 3
     assert copy.describe_parameter("limit").description == "of all"
     assert copy.describe_parameter("limit").read_only
@@ -71,7 +71,7 @@ def test_a_later_value_goes_before_what_the_author_gave(stage, node) -> None:
     """A value set at run time precedes the override; an override never declared is kept."""
     node.declare_parameter("speed", 2.0)
     given = [Parameter("speed", value=1.0), Parameter("later", value=5)]
-    copy = again(stage, absence_of(node), parameter_overrides=given)
+    copy = again(stage, departure_of(node), parameter_overrides=given)
     assert copy.declare_parameter("speed", 0.0).value == 2.0
     assert copy.declare_parameter("later", 0).value == 5
 
@@ -82,12 +82,12 @@ def test_timers_go_on_in_their_period_and_only_the_same_ones(stage, node) -> Non
         node.create_timer(period, lambda: None)
     kept, cancelled, _ = node.timers
     cancelled.cancel()
-    absence = absence_of(node)
+    departure = departure_of(node)
     due = kept.time_until_next_call()
-    copy = again(stage, absence)
+    copy = again(stage, departure)
     for period in (50.0, 60.0, 80.0, 90.0):
         copy.create_timer(period, lambda: None)
-    absence.start_timers(copy)
+    departure.start_timers(copy)
     first, second, third, fourth = copy.timers
     assert 0 < first.time_until_next_call() <= due + 1_000_000
     assert second.is_canceled()
@@ -98,10 +98,10 @@ def test_timers_go_on_in_their_period_and_only_the_same_ones(stage, node) -> Non
 def test_a_timer_is_back_in_its_own_period_after_the_first(stage, node) -> None:
     """The first call comes when it was due; the next ones a full period later each."""
     node.create_timer(0.5, lambda: None)
-    absence = absence_of(node)
-    copy, calls = again(stage, absence), []
+    departure = departure_of(node)
+    copy, calls = again(stage, departure), []
     timer = copy.create_timer(0.5, lambda: calls.append(1))
-    absence.start_timers(copy)
+    departure.start_timers(copy)
     assert timer.timer_period_ns < 5e8
     stage.spin_until(lambda: len(calls) == 2, "two calls")
     assert timer.timer_period_ns == 5e8
@@ -110,10 +110,10 @@ def test_a_timer_is_back_in_its_own_period_after_the_first(stage, node) -> None:
 def test_a_rate_is_left_alone(stage, node) -> None:
     """The timer of a rate has no callback, and is not matched."""
     node.create_rate(10.0)
-    absence = absence_of(node)
-    copy = again(stage, absence)
+    departure = departure_of(node)
+    copy = again(stage, departure)
     copy.create_rate(10.0)
-    absence.start_timers(copy)
+    departure.start_timers(copy)
 
 
 def test_peers_are_counted_by_their_ends(stage, node) -> None:

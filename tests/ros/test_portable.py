@@ -18,15 +18,8 @@ from std_msgs.msg import Int64, Int64MultiArray
 from std_srvs.srv import Trigger
 
 from rosrm.errors import PortableError
-from rosrm_criu.control import (
-    VARIABLE,
-    State,
-    ask_prepare,
-    ask_resume,
-    await_joined,
-    await_left,
-    status_of,
-)
+from rosrm_criu.control.client import ask_prepare, ask_resume, await_joined, await_left, status_of
+from rosrm_criu.control.messages import VARIABLE, State
 from rosrm_examples.portable_counter import filled
 from tests.ros.clusters import wait_until
 from tests.ros.nodes import PATIENCE

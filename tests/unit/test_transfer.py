@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fcntl
 import io
 import os
@@ -14,18 +13,21 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.errors import TransferError
 from rosrm_criu.transfer import Offer, starting
-from rosrm_criu.transfer import archive as archive_module
 from rosrm_criu.transfer.addresses import nearest_first, own_addresses
-from rosrm_criu.transfer.archive import Archive
+from rosrm_criu.transfer.archive import Archive, Unpacker
 from rosrm_criu.transfer.form import DIGEST_SIZE, new_digest
 from rosrm_criu.transfer.landing import Landing
-from rosrm_criu.transfer.rate import Pace
-from rosrm_criu.transfer.unpacking import unpack
+from rosrm_criu.transfer.sending import Pace
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 OFFER = Offer(
     ("10.0.0.2", "127.0.0.1"), 4711, "ab" * 32, "secret-token", 10, 2, 2560, 30.0, to="cd" * 32
@@ -46,7 +48,7 @@ def test_the_token_is_in_no_representation():
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"version": 2}, "version 2 of the transfer, this host 1"),
+        ({"version": 1}, "version 1 of the transfer, this host 2"),
         ({"version": None}, "version None"),
         ({"port": 0}, "values"),
         ({"port": "4711"}, "values"),
@@ -91,6 +93,19 @@ def content(directory: Path) -> dict[str, bytes | None]:
     }
 
 
+class Chunks:
+    """Source of the bytes of a stream, some per call."""
+
+    def __init__(self, data: bytes) -> None:
+        self._file = io.BytesIO(data)
+
+    def __call__(self) -> bytes:
+        data = self._file.read(1000)
+        if not data:
+            raise TransferError("the stream ended too soon")
+        return data
+
+
 def test_what_is_packed_is_unpacked(tmp_path):
     """Names and contents, empty files and directories too; for the owner alone."""
     archive = Archive(tree(tmp_path / "from"))
@@ -101,55 +116,16 @@ def test_what_is_packed_is_unpacked(tmp_path):
     assert data[archive.length :] == digest.digest()
 
     (tmp_path / "to").mkdir()
-    files = unpack(io.BytesIO(data[: archive.length]), tmp_path / "to")
+    unpacker = Unpacker(Chunks(b"".join(archive.compressed())), archive.length)
+    files = unpacker.unpack(tmp_path / "to")
+
+    assert unpacker.check() == digest.hexdigest()
 
     assert files == archive.files == 6
     assert archive.size == 1000 + 600_000 + 1 + 512 + 1
     assert content(tmp_path / "to") == content(tmp_path / "from")
     for path in (tmp_path / "to").rglob("*"):
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)
-
-
-@pytest.fixture(scope="module")
-def archived(tmp_path_factory):
-    archive = Archive(tree(tmp_path_factory.mktemp("archived") / "from"))
-    return archive, b"".join(archive.pieces())
-
-
-@given(st.data())
-@settings(max_examples=40)
-def test_a_stream_goes_on_from_any_byte(archived, data):
-    """Its rest is the same, its checksum too."""
-    archive, whole = archived
-    start = data.draw(st.integers(0, len(whole)))
-    assert b"".join(archive.pieces(start)) == whole[start:]
-
-
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=5))
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_stream_goes_on_again_and_again(archived, monkeypatch, shares):
-    """Wherever it broke each time, and whatever was marked on the way: all of it is the same."""
-    monkeypatch.setattr(archive_module, "MARK", 5000)
-    monkeypatch.setattr(archive_module, "PIECE", 700)
-    archive, whole = archived
-    for share in shares:
-        start = int(share * len(whole))
-        assert b"".join(archive.pieces(start)) == whole[start:]
-
-
-def test_what_came_long_before_is_not_read_again(tmp_path, monkeypatch):
-    """Else a large directory is silent for as long as that takes, and given up. It could change."""
-    monkeypatch.setattr(archive_module, "MARK", 100_000)
-    monkeypatch.setattr(archive_module, "PIECE", 10_000)
-    for name in ("a", "b"):
-        (tmp_path / name).write_bytes(os.urandom(1_000_000))
-    archive = Archive(tmp_path)
-    whole = b"".join(archive.pieces())
-    (tmp_path / "a").write_bytes(bytes(1_000_000))
-    with (tmp_path / "b").open("r+b") as file:
-        file.write(bytes(700_000))
-    for start in (1_850_000, 1_950_000, len(whole) - 1):
-        assert b"".join(archive.pieces(start)) == whole[start:]
 
 
 def test_a_directory_with_something_else_than_files_is_not_offered(tmp_path):
@@ -180,7 +156,7 @@ def test_a_file_that_changed_since_it_was_offered_is_not_sent(tmp_path, data):
 # --- what may be written ----------------------------------------------------------------------
 
 
-def packed(*entries: tuple[str, bytes, str], content: bytes = b"12345") -> io.BytesIO:
+def packed(*entries: tuple[str, bytes, str], content: bytes = b"12345") -> bytes:
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar:
         for name, kind, link in entries:
@@ -189,7 +165,12 @@ def packed(*entries: tuple[str, bytes, str], content: bytes = b"12345") -> io.By
             entry.size = len(content) if kind == tarfile.REGTYPE else 0
             entry.mode = 0o6777
             tar.addfile(entry, io.BytesIO(content))
-    return io.BytesIO(out.getvalue())
+    return out.getvalue()
+
+
+def unpack(archive: bytes, directory: Path) -> None:
+    """Unpack an archive as if it came from a source."""
+    Unpacker(Chunks(zstd.compress(archive)), len(archive)).unpack(directory)
 
 
 REGULAR, FOLDER = tarfile.REGTYPE, tarfile.DIRTYPE
@@ -234,7 +215,7 @@ def test_a_file_of_more_than_its_archive_is_refused(tmp_path):
     entry.size = 1
     data = entry.tobuf(tarfile.PAX_FORMAT) + b"1" + bytes(511 + 1024)
     with pytest.raises(TransferError, match="neither a file nor a directory"):
-        unpack(io.BytesIO(data), tmp_path)
+        unpack(data, tmp_path)
 
 
 def test_modes_of_an_archive_count_for_nothing(tmp_path):
@@ -245,14 +226,14 @@ def test_modes_of_an_archive_count_for_nothing(tmp_path):
 
 @pytest.mark.parametrize("end", [0, 100, 512, 514])
 def test_an_archive_that_is_cut_is_refused(tmp_path, end):
-    data = packed(("file", REGULAR, "")).getvalue()[:end]
+    data = packed(("file", REGULAR, ""))[:end]
     with pytest.raises(TransferError, match=r"no sound archive|ends within 'file'"):
-        unpack(io.BytesIO(data), tmp_path)
+        unpack(data, tmp_path)
 
 
 def test_what_is_no_archive_is_refused(tmp_path):
     with pytest.raises(TransferError, match="no sound archive"):
-        unpack(io.BytesIO(b"no archive" * 1000), tmp_path)
+        unpack(b"no archive" * 1000, tmp_path)
 
 
 # --- where it is put together -----------------------------------------------------------------
@@ -354,7 +335,7 @@ def test_an_address_in_a_network_of_this_host_is_tried_first():
 
 
 def test_what_is_not_installed_is_said_with_what_to_do(monkeypatch):
-    monkeypatch.setattr(starting, "_NEEDED", ("aiohttp", "no_such_library"))
+    monkeypatch.setattr(starting, "_NEEDED", ("cryptography", "no_such_library"))
     assert starting.missing() == "no_such_library is not installed: pip install rosrm-criu"
     with pytest.raises(TransferError, match="no_such_library is not installed"):
         starting.Sender()
@@ -365,13 +346,9 @@ def test_who_starts_a_transfer_loads_nothing_of_its_libraries():
     code = "import sys, rosrm_criu.transfer; print(*sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = {name.split(".")[0] for name in run.stdout.split()}
-    assert not loaded & {"aiohttp", "asyncio", "backports", "cryptography", "ssl", "urllib3"}
+    assert not loaded & {"backports", "compression", "cryptography", "ssl"}
 
 
 def test_a_python_that_cannot_check_archives_is_refused(monkeypatch):
     monkeypatch.delattr(tarfile, "data_filter")
     assert "needs 3.10.12" in starting.missing()
-
-
-def test_every_field_of_an_offer_travels():
-    assert set(OFFER.as_json()) == {field.name for field in dataclasses.fields(Offer)}

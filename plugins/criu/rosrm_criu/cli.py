@@ -1,11 +1,10 @@
-"""`rosrm criu`: installation and check of CRIU, which the strategy `criu` uses."""
+"""`rosrm criu check`: check of CRIU, which the strategy `criu` uses."""
 
 # Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
 criu = typer.Typer(
     no_args_is_help=True,
-    help="Install or check CRIU, which moves a process with its whole memory.",
+    help="Check CRIU, which moves a process with its whole memory.",
 )
 
 Prefix = Annotated[
@@ -35,54 +34,7 @@ Prefix = Annotated[
 
 @criu.callback()
 def _group() -> None:
-    """Install or check CRIU, which moves a process with its whole memory."""
-
-
-@criu.command()
-def install(
-    prefix: Prefix = None,
-    given: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            metavar="PATH",
-            help="Packages (*.deb) instead of a download: a file, or a folder of them.",
-        ),
-    ] = None,
-    mirror: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--mirror",
-            metavar="URL",
-            help="Archive of the distribution to download from; default: apt's sources.",
-        ),
-    ] = None,
-) -> None:
-    """Install a working CRIU into a folder of its own; the system stays unchanged.
-
-    Needs no root. Does nothing if a working CRIU is found.
-    """
-    from rosrm_criu.engine import install as installer
-    from rosrm_criu.engine.binary import PREFIX_VARIABLE, PROGRAM_VARIABLE, default_prefix
-    from rosrm_criu.engine.probe import probe
-
-    where = (prefix or default_prefix()).absolute()
-    if given is None:
-        found, able = _tried(where)
-        if found and able.works:
-            typer.echo(f"CRIU {found.version} works here: {found.command[0]}; nothing to install")
-            return
-    new = installer.install(where, _say, given=given, mirrors=mirror or ())
-    typer.echo(f"CRIU {new.version} is installed: {new.command[0]}")
-    if where != default_prefix():
-        typer.echo(f"rosrm finds it there with {PREFIX_VARIABLE}={where}")
-    if os.environ.get(PROGRAM_VARIABLE):
-        _note(f"{PROGRAM_VARIABLE} is set, so that rosrm uses that program instead")
-    able = probe(new)
-    if able.works:
-        typer.echo("it works: a process was dumped and restored")
-    else:
-        _note(f"it does not work yet: {able.reason}")
+    """Check CRIU, which moves a process with its whole memory."""
 
 
 @criu.command()
@@ -148,11 +100,3 @@ def _lines(found: Criu | None, able: Ability) -> list[tuple[bool, str, str]]:
             f"Python {python}, {len(facts['cpu'].split())} processor features",
         ),
     ]
-
-
-def _say(step: str) -> None:
-    typer.echo(f"  {step}")
-
-
-def _note(text: str) -> None:
-    typer.echo(f"rosrm: note: {text}", err=True)

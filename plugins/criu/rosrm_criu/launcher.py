@@ -16,7 +16,8 @@ from rosrm import InstanceId, Launch, LauncherContext, ProcessSpec, options_of
 from rosrm.errors import CriuError, LaunchError, PortableError
 from rosrm.ros.names import token
 from rosrm.supervisor.spawn import SpawnError, find_executable
-from rosrm_criu.control import VARIABLE, State, control_root, directory_of, status_of
+from rosrm_criu.control.client import control_root, directory_of, status_of
+from rosrm_criu.control.messages import VARIABLE, State
 from rosrm_criu.engine import paths, process_tree, restart_from_image, restore_result, slots
 from rosrm_criu.engine.binary import find
 from rosrm_criu.options import NAME, CriuOptions, OwnCriuOptions

@@ -1,4 +1,4 @@
-"""Plans of checkpoints and restores, and common steps of all plans of `criu`.
+"""Plans of moves, checkpoints and restores by `criu`.
 
 A checkpoint stays on its host, and the process keeps its DDS participant, so its address and ports
 stay the same. A periodic checkpoint is one of a portable node that continues to run. The node
@@ -78,11 +78,63 @@ def execute(
 
 
 def suspend(move: Move, seconds: float) -> SetRestart:
-    """Return a step that disables the source's restarts; else it could run beside its successor."""
+    """Return a step that disables the source's restarts; else it could run beside its successor.
+
+    Args:
+        move: of the source.
+        seconds: for the slave to accept the step and its undo.
+    """
     give_back = SetRestart(move.source, move.source_host, move.spec.restart, seconds)
     return SetRestart(
         move.source, move.source_host, RestartPolicy("never"), seconds, undo=give_back
     )
+
+
+def move_plan(move: Move, options: CriuOptions) -> Plan:
+    """Return a plan: freeze, dump, fetch, restore, commit, join, end the source.
+
+    The preparation of the destination and the fetch have no undo, because an undo would wait for a
+    host that may be lost, and the source would wait too. Both are cleaned up after a timeout.
+
+    Args:
+        move: of a portable node, to another host.
+        options: of the process; all durations in seconds.
+    """
+    here, there, spec = move.source_host, move.destination_host, move.spec
+    start = options.start_timeout
+    until_dumped = start + options.leave_timeout + options.dump_timeout
+    seconds = {
+        "leave": options.leave_timeout, "dump": options.dump_timeout,
+        "offer": options.transfer_timeout + start,
+    }  # fmt: skip
+    return Plan(
+        (
+            suspend(move, start),
+            execute(
+                move, there, INTRODUCE, start, keep=until_dumped + 2 * start,
+                working_directory=spec.working_directory,
+            ),
+            execute(
+                move, here, CHECKPOINT, until_dumped,
+                undo=execute(move, here, GO_ON, options.join_timeout),
+                seconds=seconds, max_rate=options.max_rate,
+            ),
+            execute(
+                move, there, FETCH, options.transfer_timeout, reserve=options.reserve,
+                keep=start + options.restore_timeout,
+            ),
+            Start(
+                move.destination, there, start,
+                undo=Stop(move.destination, there, spec.stop.timeout), restored=True,
+            ),
+            execute(move, there, AWAIT_RESTORED, options.restore_timeout),
+            Commit(),
+            execute(move, there, JOIN, options.join_timeout),
+            SetRestart(move.destination, there, spec.restart, start),
+            execute(move, here, END, start),
+            Stop(move.source, here, spec.stop.timeout),
+        )
+    )  # fmt: skip
 
 
 def checkpoint_plan(move: Move, options: CriuOptions) -> Plan:
@@ -127,7 +179,7 @@ def periodic_step(
         spec: of the process.
         instance: of a portable node.
         host: where it runs.
-        now: unix time in whole seconds, so that each request is a new absence of the node.
+        now: unix time in whole seconds, so that each request is a new departure of the node.
         options: of this process.
     """
     seconds = {

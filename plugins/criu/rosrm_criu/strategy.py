@@ -8,37 +8,17 @@ destination owns the name, the source stays frozen and can continue.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-from rosrm import (
-    Commit,
-    Execute,
-    InstanceId,
-    Move,
-    Plan,
-    ProcessSpec,
-    SetRestart,
-    Start,
-    Stop,
-    options_of,
-)
+from rosrm import Execute, InstanceId, Move, Plan, ProcessSpec, options_of
 from rosrm_criu.engine.compatibility import mismatch
 from rosrm_criu.options import CriuOptions, OwnCriuOptions
 from rosrm_criu.plans import (
     ABILITY,
-    AWAIT_RESTORED,
-    CHECKPOINT,
-    END,
-    FETCH,
-    GO_ON,
-    INTRODUCE,
-    JOIN,
     SWEEP,
     checkpoint_plan,
-    execute,
+    move_plan,
     periodic_step,
     restore_plan,
-    suspend,
 )
 
 
@@ -78,7 +58,7 @@ class Criu:
         fault = self.spec_fault(move.spec)
         if fault:
             raise ValueError(fault)
-        return _Draft(move, move.options).plan()
+        return move_plan(move, move.options)
 
     def checkpoint(self, move: Move) -> Plan:
         """Return a plan to dump and end the process, ROS node or not; no node leaves the graph."""
@@ -103,78 +83,3 @@ class Criu:
 
     def _own(self, spec: ProcessSpec) -> OwnCriuOptions:
         return options_of(spec, self._options, OwnCriuOptions)
-
-
-class _Draft:
-    """Builder of one plan."""
-
-    def __init__(self, move: Move, options: CriuOptions) -> None:
-        self._move = move
-        self._options = options
-
-    def plan(self) -> Plan:
-        move, options = self._move, self._options
-        stop_there = Stop(move.destination, move.destination_host, move.spec.stop.timeout)
-        return Plan(
-            (
-                suspend(move, options.start_timeout),
-                self._introduce(),
-                self._checkpoint(),
-                self._fetch(),
-                Start(
-                    move.destination, move.destination_host, options.start_timeout,
-                    undo=stop_there, restored=True,
-                ),
-                self._there(AWAIT_RESTORED, options.restore_timeout),
-                Commit(),
-                self._there(JOIN, options.join_timeout),
-                SetRestart(
-                    move.destination, move.destination_host, move.spec.restart,
-                    options.start_timeout,
-                ),
-                self._here(END, options.start_timeout),
-                Stop(move.source, move.source_host, move.spec.stop.timeout),
-            )
-        )  # fmt: skip
-
-    # The preparation of the destination and the fetch have no undo, because an undo would wait for
-    # a host that may be lost, and the source would wait too. Both are cleaned up after a timeout.
-
-    def _introduce(self) -> Execute:
-        options = self._options
-        keep = self._until_dumped() + 2 * options.start_timeout
-        return self._there(
-            INTRODUCE, options.start_timeout, keep=keep,
-            working_directory=self._move.spec.working_directory,
-        )  # fmt: skip
-
-    def _checkpoint(self) -> Execute:
-        options = self._options
-        there = options.transfer_timeout + options.start_timeout
-        seconds = {"leave": options.leave_timeout, "dump": options.dump_timeout, "offer": there}
-        go_on = self._here(GO_ON, options.join_timeout)
-        return self._here(
-            CHECKPOINT, self._until_dumped(),
-            undo=go_on, seconds=seconds, max_rate=options.max_rate,
-        )  # fmt: skip
-
-    def _until_dumped(self) -> float:
-        options = self._options
-        return options.start_timeout + options.leave_timeout + options.dump_timeout
-
-    def _fetch(self) -> Execute:
-        options = self._options
-        return self._there(
-            FETCH, options.transfer_timeout, reserve=options.reserve,
-            keep=options.start_timeout + options.restore_timeout,
-        )  # fmt: skip
-
-    def _here(
-        self, executor: str, timeout: float, undo: Execute | None = None, **arguments: Any
-    ) -> Execute:
-        move = self._move
-        return execute(move, move.source_host, executor, timeout, undo, **arguments)
-
-    def _there(self, executor: str, timeout: float, **arguments: Any) -> Execute:
-        move = self._move
-        return execute(move, move.destination_host, executor, timeout, **arguments)

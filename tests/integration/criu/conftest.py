@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import fcntl
 import os
+import platform
 import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine import install, packages
 from rosrm_criu.engine.binary import Criu, default_prefix, find, opened
 from rosrm_criu.engine.probe import probe
 
@@ -23,8 +22,19 @@ ROOT = Path(__file__).parents[3]
 #: Older versions are downloaded once, into the virtual environment.
 OLDER = ROOT / ".venv" / "criu-older"
 
+#: Installs CRIU in a folder.
+SCRIPT = ROOT / "scripts" / "install_criu.sh"
+
 #: Uid of a user who owns nothing.
 NOBODY = 65534
+
+
+def install_criu(folder: Path, **environment: object) -> subprocess.CompletedProcess:
+    """Run the script that installs CRIU in a folder."""
+    variables = {**os.environ, **{name: str(value) for name, value in environment.items()}}
+    return subprocess.run(
+        [SCRIPT, folder], env=variables, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.fixture(scope="session")
@@ -50,46 +60,21 @@ def cached() -> Path:
 
 
 @pytest.fixture(scope="session")
-def older() -> Callable[[str], Path]:
-    """Return a function for the folder of a Debian release's own CRIU (in `tree`) and packages."""
+def old() -> Callable[[str], Criu]:
+    """Return a function for a Debian release's own CRIU: Debian 12 has 3.17, Debian 13 has 4.1."""
 
-    def of(suite: str) -> Path:
-        place = OLDER / suite
+    def of(suite: str) -> Criu:
+        if platform.freedesktop_os_release()["ID"] != "debian":
+            pytest.skip(f"only Debian has the release {suite}")
         OLDER.mkdir(parents=True, exist_ok=True)
         with (OLDER / "lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be downloading it
-            if not (place / "tree").is_dir():
-                with tempfile.TemporaryDirectory(dir=OLDER) as new:
-                    _fetch(suite, Path(new))
-                    shutil.rmtree(place, ignore_errors=True)
-                    Path(new, suite).rename(place)
-                install.bound(place / "tree")
-        return place
+            done = install_criu(OLDER / suite, SUITE=suite)
+        if done.returncode:
+            pytest.skip(f"no CRIU of {suite}: {done.stderr}")
+        return opened(OLDER / suite / "bin/criu")
 
     return of
-
-
-def _fetch(suite: str, new: Path) -> None:
-    (new / "apt").mkdir()
-    (new / suite / "tree").mkdir(parents=True)
-    try:
-        archive = packages.archive_here()
-        if "debian" not in archive.keyring.name:
-            pytest.skip(f"only Debian has the release {suite}")
-        wanted = ("criu", "patchelf")
-        files = packages.fetch(wanted, replace(archive, suite=suite), new / "apt", print)
-    except CriuError as error:
-        pytest.skip(f"no CRIU of {suite} to be had: {error}")
-    packages.unpack(files, new / suite / "tree")
-    (new / suite / "packages").mkdir()
-    for file in files:
-        file.rename(new / suite / "packages" / file.name)
-
-
-@pytest.fixture(scope="session")
-def old(older) -> Callable[[str], Criu]:
-    """Return a function for a Debian release's own CRIU: Debian 12 has 3.17, Debian 13 has 4.1."""
-    return lambda suite: opened(older(suite) / "tree/usr/sbin/criu")
 
 
 @pytest.fixture

@@ -48,7 +48,9 @@ def test_too_old_ones_are_told_apart(old, suite, version):
     able = probe(found)
     if able.works:
         pytest.skip(f"CRIU {found.version} works on this kernel")
-    assert able.reason.startswith(f"CRIU {found.version} is too old, 4.2 is needed: `rosrm criu ")
+    assert able.reason.startswith(
+        f"CRIU {found.version} is too old, 4.2 is needed: `scripts/install_criu"
+    )
     assert "could not dump: " in able.reason
     assert able.facts["version"] == found.version
 
@@ -61,7 +63,7 @@ def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
     assert (able.works, able.facts) == (False, {})
     assert able.reason == (
         f"there is no CRIU here (looked for: ROSRM_CRIU (not set), {tmp_path}/bin/criu, `criu` in "
-        "PATH). `rosrm criu install` brings one, without touching the system"
+        "PATH). `scripts/install_criu.sh` of rosrm's repository installs one in a folder"
     )
 
 

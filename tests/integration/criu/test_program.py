@@ -60,7 +60,7 @@ def test_where_none_starts_each_one_is_told(tmp_path):
     said = str(raised.value)
     assert "prefix/bin/criu cannot be started: the C library that it names is missing" in said
     assert "`--version` ended with code 127 and said 'libz is missing'" in said
-    assert said.endswith("`rosrm criu install` brings one, without touching the system")
+    assert said.endswith("`scripts/install_criu.sh` of rosrm's repository installs one in a folder")
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder", "other"])

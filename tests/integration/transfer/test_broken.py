@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import hashlib
-import io
 import itertools
 import os
 import queue
@@ -13,6 +10,7 @@ import random
 import signal
 import tarfile
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,9 +18,9 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm_criu.transfer import Offer, Sent, archive, serving
+from rosrm_criu.transfer import Offer, Sent
 from rosrm_criu.transfer.archive import Archive
-from rosrm_criu.transfer.serving import serve
+from rosrm_criu.transfer.sending import serve
 from tests.faults.disks import small_disk
 from tests.integration.transfer.trees import (
     PATIENCE,
@@ -39,61 +37,29 @@ from tests.integration.transfer.wires import Fault, wire
 # --- faults of the network -------------------------------------------------------------------
 
 
-def test_a_connection_that_was_cut_is_gone_on_with(source, target, sender, destination):
-    """A resumed transfer repeats only the bytes that were in flight."""
+@pytest.mark.parametrize("fault", [Fault(after=1_000_000), Fault(after=1_000_000, flips=True)])
+def test_a_broken_stream_fails_and_leaves_nothing(source, target, sender, destination, fault):
+    """A cut or damaged stream ends the fetch and the offer; both sides keep nothing of it."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
-    with wire(offer.port, Fault(after=1_000_000), Fault(after=2_000_000)) as cut:
-        fetched = destination.fetch(through(offer, cut.port), target)
-    assert digests(target) == digests(source)
-    assert fetched.resumed == 2
-    assert fetched.received < 5_500_000
-    assert sender.wait(PATIENCE).outcome == "taken"
-
-
-def test_a_source_goes_on_from_where_it_has_marked_its_checksum(source, target, monkeypatch):
-    """A resume starts at the last saved checksum: earlier files are not read, even if changed."""
-    monkeypatch.setattr(archive, "MARK", 300_000)
-    destination = Destination()
-    with (
-        lying(source, destination.certificate) as offer,
-        wire(offer.port, Fault(after=2_000_000), Fault(after=700_000)) as cut,
-        ThreadPoolExecutor() as threads,
-    ):
-        before = digests(source)
-        going = threads.submit(destination.fetch, through(offer, cut.port), target)
-        assert cut.broke.wait(PATIENCE)
-        (source / "inventory").write_bytes(b"2")  # the first file
-        assert going.result(PATIENCE).resumed == 2
-    assert digests(target) == before
-
-
-def test_a_source_that_is_gone_in_mid_transfer_leaves_nothing(source, target, sender, destination):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
-    why = rf"cut after \d{{5,}} of {offer.length} bytes \(the (TLS )?connection broke\).*refused"
-    with (
-        wire(offer.port, Fault(after=1_000_000), then_gone=True) as cut,
-        pytest.raises(TransferError, match=why),
-    ):
-        destination.fetch(through(offer, cut.port), target)
+    why = rf"the transfer was cut: .*; \d{{5,}} of {offer.length} bytes had come"
+    with wire(offer.port, fault) as broken, pytest.raises(TransferError, match=why):
+        destination.fetch(through(offer, broken.port), target)
     assert nothing_left(target)
+    assert sender.wait(PATIENCE).outcome == "broken"
+    assert not listens(offer.port)
 
 
-def test_a_byte_that_was_damaged_on_the_way_is_sent_again(source, target, sender, destination):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
-    with wire(offer.port, Fault(after=1_000_000, flips=True)) as damaging:
-        fetched = destination.fetch(through(offer, damaging.port), target)
+def test_a_cut_that_ends_is_bridged(source, target, sender, destination):
+    """A stream whose packets come late continues; nothing is sent twice."""
+    offer = slowly(sender, source, destination.certificate)
+    with ThreadPoolExecutor() as threads:
+        going = threads.submit(destination.fetch, offer, target)
+        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+        os.kill(sender._process.pid, signal.SIGSTOP)
+        time.sleep(1.0)
+        os.kill(sender._process.pid, signal.SIGCONT)
+        assert going.result(PATIENCE).received < 4_500_000
     assert digests(target) == digests(source)
-    assert fetched.resumed == 1
-
-
-def test_a_wire_that_damages_every_time_is_given_up(source, target, sender, destination):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
-    with (
-        wire(offer.port, for_each=lambda _: Fault(after=20_000, flips=True)) as damaging,
-        pytest.raises(TransferError, match=r"was cut after .* it broke again and again"),
-    ):
-        destination.fetch(through(offer, damaging.port), target)
-    assert nothing_left(target)
 
 
 def test_a_silent_source_is_given_up_in_time(source, target, sender, destination):
@@ -104,7 +70,7 @@ def test_a_silent_source_is_given_up_in_time(source, target, sender, destination
         try:
             until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
             os.kill(sender._process.pid, signal.SIGSTOP)
-            with pytest.raises(TransferError, match=r"was cut after|took longer than 3 s"):
+            with pytest.raises(TransferError, match=r"took longer than 3 s"):
                 going.result(PATIENCE)
         finally:
             os.kill(sender._process.pid, signal.SIGCONT)
@@ -113,7 +79,7 @@ def test_a_silent_source_is_given_up_in_time(source, target, sender, destination
 
 def test_a_transfer_that_takes_too_long_is_given_up(source, target, sender, destination):
     offer = sender.offer(source, seconds=PATIENCE, max_rate=500e3, to=destination.certificate)
-    with pytest.raises(TransferError, match=r"took longer than 1 s: \d+ of \d+ bytes had come"):
+    with pytest.raises(TransferError, match=r"took longer than 1 s; \d+ of \d+ bytes had come"):
         destination.fetch(offer, target, timeout=1.0)
     assert nothing_left(target)
 
@@ -139,7 +105,7 @@ def test_an_offer_ends_by_itself(source, target, sender, destination):
 
 def test_an_offer_that_ends_in_mid_transfer(source, target, sender, destination):
     offer = sender.offer(source, seconds=1.0, max_rate=500e3, to=destination.certificate)
-    with pytest.raises(TransferError, match=r"was cut after|cannot be reached"):
+    with pytest.raises(TransferError, match=r"the transfer was cut"):
         destination.fetch(offer, target)
     assert sender.close().outcome == "expired"
     assert nothing_left(target)
@@ -162,11 +128,6 @@ def test_a_directory_that_is_gone_since_it_was_offered(source, target, sender, d
         destination.fetch(offer, target)
 
 
-def test_a_directory_that_is_not_there_is_not_offered(tmp_path, sender, destination):
-    with pytest.raises(TransferError, match="is gone, or was never there"):
-        sender.offer(tmp_path / "none", seconds=PATIENCE, to=destination.certificate)
-
-
 # --- faults of the source --------------------------------------------------------------------
 
 
@@ -174,24 +135,15 @@ def test_a_directory_that_is_not_there_is_not_offered(tmp_path, sender, destinat
 def lying(directory: Path, to: str) -> Iterator[Offer]:
     """Serve in this process, where a test can replace parts of the server."""
     made: queue.Queue[Offer] = queue.Queue()
-
-    async def run() -> None:
-        stop = asyncio.Event()
-        ends.append((asyncio.get_running_loop(), stop))
-        await serve(
-            directory, seconds=PATIENCE, max_rate=0, to=to, announce=made.put, withdrawn=stop
-        )  # fmt: skip
-
-    ends: list = []
-    thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
+    over = threading.Event()
+    arguments = {"seconds": PATIENCE, "max_rate": 0, "to": to, "announce": made.put, "over": over}
+    thread = threading.Thread(target=serve, args=(directory,), kwargs=arguments, daemon=True)
     thread.start()
     try:
         offer = made.get(timeout=PATIENCE)
         yield through(offer, offer.port)
     finally:
-        loop, stop = ends[0]
-        with contextlib.suppress(RuntimeError):  # the loop has ended because the offer was taken
-            loop.call_soon_threadsafe(stop.set)
+        over.set()
         thread.join(PATIENCE)
 
 
@@ -203,20 +155,9 @@ def assert_refused(source: Path, target: Path, why: str) -> None:
 
 
 def test_a_wrong_checksum_is_noticed(source, target, monkeypatch):
-    monkeypatch.setattr(archive, "new_digest", lambda: hashlib.blake2b(b"other", digest_size=32))
+    honest = Archive.pieces
+    monkeypatch.setattr(Archive, "pieces", lambda self: [*[*honest(self)][:-1], bytes(32)])
     assert_refused(source, target, r"does not match its checksum")
-
-
-def test_an_archive_that_leaves_its_directory_is_refused(source, target, tmp_path, monkeypatch):
-    """A path outside the directory is refused, even if the checksum of the archive is right."""
-    made = io.BytesIO()
-    with tarfile.open(fileobj=made, mode="w") as tar:
-        entry = tarfile.TarInfo("../../outside")
-        entry.size = 5
-        tar.addfile(entry, io.BytesIO(b"12345"))
-    monkeypatch.setattr(Archive, "pieces", lambda self, start: iter([made.getvalue()]))
-    assert_refused(source, target, r"'\.\./\.\./outside', which lies outside")
-    assert not (tmp_path / "outside").exists()
 
 
 def test_no_more_is_taken_than_was_offered(source, target, monkeypatch):
@@ -224,7 +165,7 @@ def test_no_more_is_taken_than_was_offered(source, target, monkeypatch):
     offered = Archive(source)
     head = next(offered.pieces())
 
-    def endless(self, start):
+    def endless(self):
         entry = tarfile.TarInfo("endless")
         entry.size = 1 << 40
         return itertools.chain([entry.tobuf()], itertools.repeat(bytes(1 << 16)))
@@ -235,13 +176,14 @@ def test_no_more_is_taken_than_was_offered(source, target, monkeypatch):
 
 
 def test_a_stream_that_is_no_zstandard_is_refused(source, target, monkeypatch):
-    monkeypatch.setattr(serving, "compressed", lambda pieces: iter([b"plain" * 1000]))
-    assert_refused(source, target, r"what came from 127\.0\.0\.1 is damaged")
+    monkeypatch.setattr(Archive, "compressed", lambda self: iter([b"plain" * 1000]))
+    assert_refused(source, target, r"the received data is damaged")
 
 
-def test_a_stream_that_always_ends_too_soon_is_given_up(source, target, monkeypatch):
-    monkeypatch.setattr(Archive, "pieces", lambda self, start: iter([bytes(100)]))
-    assert_refused(source, target, r"the stream ended too soon|no sound archive")
+def test_a_part_that_is_too_large_is_refused(source, target, monkeypatch):
+    """A source cannot make the destination wait for a part without end."""
+    monkeypatch.setattr(Archive, "compressed", lambda self: iter([bytes(1 << 25)]))
+    assert_refused(source, target, r"a part of it is too large")
 
 
 # --- disks -----------------------------------------------------------------------------------
@@ -255,13 +197,6 @@ def test_what_has_no_room_is_not_begun(source, sender, tmp_path, destination):
             destination.fetch(offer, disk.place / "target", reserve=0)
         assert list(disk.place.iterdir()) == []
     destination.fetch(offer, tmp_path / "target")
-
-
-def test_a_reserve_stays_free(source, target, sender, destination):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
-    with pytest.raises(TransferError, match=r"are to stay free, and the file system"):
-        destination.fetch(offer, target, reserve=1 << 60)
-    assert nothing_left(target)
 
 
 def test_a_disk_that_is_full_meanwhile(sender, tmp_path, destination):

@@ -54,7 +54,7 @@ def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender, fetch
         until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
         assert sender.close().outcome == "withdrawn"
         assert not listens(offer.port)
-        with pytest.raises(TransferError, match=r"was cut after .*connection refused"):
+        with pytest.raises(TransferError, match=r"the transfer was cut"):
             going.result(PATIENCE)
     assert nothing_left(target)
 
@@ -148,13 +148,3 @@ def test_a_destination_that_was_not_introduced_fetches_nothing(source, target, s
     with Fetcher() as fetcher, pytest.raises(TransferError, match="was not introduced"):
         fetcher.fetch(offer, target, timeout=PATIENCE)
     assert nothing_left(target)
-
-
-def test_an_end_that_is_ready_works_as_any_other(source, target):
-    """An end that loaded its libraries in advance works like any other."""
-    with Sender() as sender, Fetcher() as fetcher:
-        for end in (sender, fetcher):
-            end.ready()
-        offer = sender.offer(source, seconds=PATIENCE, to=fetcher.introduce())
-        fetcher.fetch(offer, target, timeout=PATIENCE)
-    assert digests(target) == digests(source)

@@ -8,6 +8,7 @@ import json
 import socket
 import ssl
 import stat
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import psutil
@@ -22,9 +23,9 @@ from tests.integration.transfer.trees import (
     fill,
     listens,
     nothing_left,
-    through,
+    slowly,
+    until,
 )
-from tests.integration.transfer.wires import Fault, wire
 
 # --- successful transfers --------------------------------------------------------------------
 
@@ -33,13 +34,15 @@ def test_100_mb_arrive_as_they_were(tmp_path, target, sender, fetcher):
     """All files arrive unchanged, readable by their owner alone, and the port is closed then."""
     source = tmp_path / "source"
     fill(source, megabytes=100, random_share=0.5)
+    for end in (sender, fetcher):
+        end.ready()  # its libraries may be loaded in advance
     offer = sender.offer(source, seconds=PATIENCE, max_rate=0, to=fetcher.introduce())
     told = Offer.from_json(json.loads(json.dumps(offer.as_json())))
 
     fetched = fetcher.fetch(told, target, timeout=PATIENCE)
 
     assert digests(target) == digests(source)
-    assert (fetched.size, fetched.files, fetched.resumed) == (100_000_001, 5, 0)
+    assert (fetched.size, fetched.files) == (100_000_001, 5)
     assert 50_000_000 < fetched.received < 55_000_000, "compressed"
     for path in (target, *target.rglob("*")):
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)
@@ -89,16 +92,15 @@ def test_an_offer_is_taken_once(source, target, sender, tmp_path, destination):
         destination.fetch(offer, tmp_path / "second")
 
 
-def test_nobody_goes_on_where_another_reader_began(source, target, sender, tmp_path, destination):
-    """A second reader with the token learns only that it was used."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
-    with (
-        wire(offer.port, Fault(after=1_000_000), then_gone=True) as cut,
-        pytest.raises(TransferError, match="was cut after"),
-    ):
-        destination.fetch(through(offer, cut.port), target)
-    with pytest.raises(TransferError, match="another reader fetches it already"):
-        destination.fetch(offer, tmp_path / "second")
+def test_a_second_reader_is_refused(source, target, sender, tmp_path, destination):
+    """While one reader fetches, another one with the token learns only that it was used."""
+    offer = slowly(sender, source, destination.certificate)
+    with ThreadPoolExecutor() as threads:
+        going = threads.submit(destination.fetch, offer, target)
+        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+        with pytest.raises(TransferError, match="another reader fetches it already"):
+            destination.fetch(offer, tmp_path / "second")
+        going.result(PATIENCE)
     assert not (tmp_path / "second").exists()
 
 
@@ -109,7 +111,7 @@ def test_a_destination_that_was_introduced_is_the_only_one(source, target, sende
     with pytest.raises(TransferError, match="is for another destination than this one"):
         other.fetch(offer, target)
     forged = dataclasses.replace(offer, to=other.fingerprint)
-    with pytest.raises(TransferError, match=r"the (TLS )?connection broke"):
+    with pytest.raises(TransferError, match=r"the transfer was cut: "):
         other.fetch(forged, target, timeout=1.0)
     assert nothing_left(target)
     fetched = destination.fetch(offer, target)
@@ -120,14 +122,13 @@ def test_a_destination_that_was_introduced_is_the_only_one(source, target, sende
 def test_who_shows_no_certificate_is_not_spoken_with(source, sender, destination):
     """A client without a certificate gets no byte of an answer, even with a valid token."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
-    request = f"GET /archive HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {offer.token}\r\n\r\n"
     answer = b""
     with (
         socket.create_connection(("127.0.0.1", offer.port), timeout=PATIENCE) as plain,
         contextlib.suppress(ssl.SSLError, ConnectionError),
         trusting().wrap_socket(plain) as encrypted,
     ):
-        encrypted.sendall(request.encode())
+        encrypted.sendall(f"{offer.token}\n".encode())
         answer = encrypted.recv(1)
     assert answer == b""
 
@@ -142,7 +143,7 @@ def trusting() -> ssl.SSLContext:
 
 @pytest.mark.parametrize("to", ["", "-----BEGIN NOTHING-----"])
 def test_an_introduction_that_is_none_is_refused(source, sender, to):
-    with pytest.raises(TransferError, match="the destination's certificate is none"):
+    with pytest.raises(TransferError, match="the destination's certificate is no certificate"):
         sender.offer(source, seconds=PATIENCE, to=to)
 
 

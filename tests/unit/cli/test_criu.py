@@ -48,10 +48,15 @@ def test_one_that_works_is_told_line_by_line(rosrm, here):
 def test_without_the_libraries_of_a_transfer_no_image_can_be_sent(rosrm, here, monkeypatch):
     """A host with CRIU but without these libraries is neither source nor destination of a move."""
     here()
-    monkeypatch.setattr("rosrm_criu.transfer.missing", lambda: "aiohttp is not installed: pip ...")
+    monkeypatch.setattr(
+        "rosrm_criu.transfer.missing", lambda: "cryptography is not installed: pip ..."
+    )
     result = rosrm("criu", "check")
     assert result.code == 1
-    assert result.out.splitlines()[-1] == "NO  to other hosts    aiohttp is not installed: pip ..."
+    assert (
+        result.out.splitlines()[-1]
+        == "NO  to other hosts    cryptography is not installed: pip ..."
+    )
 
 
 def test_one_that_does_not_is_told_with_what_to_do(rosrm, here):
@@ -65,10 +70,10 @@ def test_one_that_does_not_is_told_with_what_to_do(rosrm, here):
 
 
 def test_none_is_told_in_one_line(rosrm, here):
-    here(missing="there is no CRIU here. `rosrm criu install` brings one")
+    here(missing="there is no CRIU here. `install_criu.sh` installs one")
     result = rosrm("criu", "check")
     assert (result.code, result.err) == (1, "")
-    said = "there is no CRIU here. `rosrm criu install` brings one"
+    said = "there is no CRIU here. `install_criu.sh` installs one"
     assert result.out.splitlines()[0] == f"NO  program           {said}"
 
 

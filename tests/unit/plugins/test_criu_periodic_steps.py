@@ -11,7 +11,8 @@ import sys
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.control import VARIABLE, control_directory
+from rosrm_criu.control.client import control_directory
+from rosrm_criu.control.messages import VARIABLE
 from rosrm_criu.engine import paths
 from rosrm_criu.executors import periodic
 from rosrm_criu.executors.freeze import owner_of

@@ -12,13 +12,7 @@ import time
 import pytest
 
 from rosrm.errors import PortableError
-from rosrm_criu.control import (
-    SIGNAL,
-    VARIABLE,
-    Request,
-    State,
-    Status,
-    Want,
+from rosrm_criu.control.client import (
     ask_prepare,
     ask_resume,
     await_joined,
@@ -30,7 +24,17 @@ from rosrm_criu.control import (
     status_of,
 )
 from rosrm_criu.control.listener import Listener
-from rosrm_criu.control.messages import read_request, write_request, write_status
+from rosrm_criu.control.messages import (
+    SIGNAL,
+    VARIABLE,
+    Request,
+    State,
+    Status,
+    Want,
+    read_request,
+    write_request,
+    write_status,
+)
 
 PATIENCE = 20.0
 

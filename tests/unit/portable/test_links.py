@@ -11,20 +11,16 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import PortableError
-from rosrm_criu.control import (
-    Request,
-    State,
-    Status,
-    Want,
+from rosrm_criu.control import client
+from rosrm_criu.control.client import (
     ask_resume,
-    client,
     control_directory,
     make_directory,
     remove_directory,
     status_of,
 )
 from rosrm_criu.control.listener import Listener
-from rosrm_criu.control.messages import write_request, write_status
+from rosrm_criu.control.messages import Request, State, Status, Want, write_request, write_status
 
 #: Uid of a user who owns nothing.
 NOBODY = 65534

@@ -21,7 +21,7 @@ from rosrm_criu.control.messages import (
     write_status,
 )
 
-#: Finished absences to remember; a late request of one of them has no effect.
+#: Finished departures to remember; a late request of one of them has no effect.
 _REMEMBERED: Final = 1000
 #: Seconds until the status is written again: cleaners of /tmp remove files that stay untouched.
 _FRESH: Final = 3600.0
@@ -81,11 +81,11 @@ class Listener:
             self._complain(f"{self._directory} cannot be written: {error.strerror}")
 
     def enter(self, state: State, request: str = "") -> None:
-        """Write the next state of an absence; its measured times are kept."""
+        """Write the next state of a departure; its measured times are kept."""
         self.say(replace(self.status, state=state, request=request or self.status.request))
 
     def done(self, status: Status) -> None:
-        """Write the final status of an absence, successful or not."""
+        """Write the final status of a departure, successful or not."""
         self._over.append(status.request)
         self.say(status)
 

@@ -62,7 +62,7 @@ class Request:
     """One request to a node.
 
     Attributes:
-        id: identifies one absence: the same for leaving and rejoining, and never reused.
+        id: identifies one departure: the same for leaving and rejoining, and never reused.
         want: the action.
     """
 
@@ -78,7 +78,7 @@ class Status:
         state: its relation to the ROS graph.
         request: id of the newest request that it has accepted; "": none yet.
         fault: why that request was refused, or why the node failed; "": neither.
-        seconds: durations of the steps of the last absence: "leave"; "enter", until the node sees
+        seconds: durations of the steps of the last departure: "leave"; "enter", until the node sees
             the other endpoints again; "join", until it has matched its peers. Besides these,
             "entries" is the number of attempts to enter the graph.
         missing: peers that it had before it left and did not match again in time.

@@ -1,7 +1,7 @@
 """The CRIU program: search and execution.
 
 Search order: the environment variable `ROSRM_CRIU` (a path), the private prefix that
-`rosrm criu install` fills, and PATH.
+`scripts/install_criu.sh` fills, and PATH.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine.log_reader import causes, first_words
+from rosrm_criu.engine.criu_log import causes, first_words
 
 #: Environment variable with the path of the program; if it is set, nothing else is searched.
 PROGRAM_VARIABLE: Final = "ROSRM_CRIU"
@@ -136,7 +136,7 @@ def find(prefix: Path | None = None) -> Criu:
 
 
 #: Remedy in error messages if there is no CRIU.
-REMEDY: Final = "`rosrm criu install` brings one, without touching the system"
+REMEDY: Final = "`scripts/install_criu.sh` of rosrm's repository installs one in a folder"
 
 
 def opened(program: Path) -> Criu:
@@ -176,7 +176,7 @@ def may_do_all() -> bool:
 
 
 def default_prefix() -> Path:
-    """Return the prefix of `rosrm criu install`: PREFIX_VARIABLE, or the user's data directory."""
+    """Return the prefix of `install_criu.sh`: PREFIX_VARIABLE, or the user's data directory."""
     told = os.environ.get(PREFIX_VARIABLE, "")
     if told:
         return Path(told).absolute()

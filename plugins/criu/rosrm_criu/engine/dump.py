@@ -19,7 +19,7 @@ from typing import Final, Literal
 from rosrm.errors import CriuError
 from rosrm.supervisor import paths, procfs
 from rosrm.supervisor.procfs import inner_pid
-from rosrm_criu.engine import external_resources, image, log_messages, open_files, process_tree
+from rosrm_criu.engine import criu_log, external_resources, image, open_files, process_tree
 from rosrm_criu.engine.binary import Criu
 from rosrm_criu.engine.image import Manifest
 
@@ -140,7 +140,7 @@ def _meaning(root: int, message: str) -> str:
     """Return CRIU's reason in plain words; the process still exists, so check its descriptors."""
     for one, kind in external_resources.odd_descriptors(process_tree.tree(root)):
         return f"its file descriptor {one.number} is {kind}, which cannot be dumped"
-    return log_messages.of_dump(message)
+    return criu_log.explain_dump(message)
 
 
 def _describe(root: int, directory: Path, manifest: Manifest) -> Manifest:

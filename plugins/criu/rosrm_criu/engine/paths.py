@@ -22,17 +22,17 @@ def incoming(state: Path, number: int) -> Path:
     return state / "images" / f"in-{number}"
 
 
-def kept(state: Path, number: int) -> Path:
+def checkpoint(state: Path, number: int) -> Path:
     """Return the path of the checkpoint of an instance; the image stays there until the restore."""
     return state / "images" / f"kept-{number}"
 
 
-def ports_of_kept(state: Path, number: int) -> Path:
+def checkpoint_ports(state: Path, number: int) -> Path:
     """Return the path of the file with the ports of a checkpointed instance, beside its image."""
     return state / "images" / f"kept-{number}.ports"
 
 
-def kept_numbers(state: Path) -> list[int]:
+def checkpoint_numbers(state: Path) -> list[int]:
     """Return the numbers of the instances that have a checkpoint."""
     names = [path.name.removeprefix("kept-") for path in (state / "images").glob("kept-*")]
     return sorted(int(name) for name in names if name.isdigit())

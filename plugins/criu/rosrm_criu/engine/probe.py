@@ -26,7 +26,7 @@ from typing import Final
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine.binary import OLDEST, REMEDY, Criu, find
-from rosrm_criu.engine.compatibility_facts import INTERPRETER, facts_of
+from rosrm_criu.engine.compatibility import INTERPRETER, facts_of
 
 #: Seconds for the whole test, which normally takes a few tenths.
 TIMEOUT: Final = 20.0

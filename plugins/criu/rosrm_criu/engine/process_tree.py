@@ -19,7 +19,7 @@ _NAMESPACES: Final = {
 }  # fmt: skip
 #: Parts of command lines: of the shim, and of the program that becomes either the shim or the
 #: process itself.
-HOLD: Final = "rosrm_criu/engine/shim.py"
+SHIM: Final = "rosrm_criu/engine/shim.py"
 _AGAIN: Final = "rosrm_criu/engine/restart_from_image.py"
 
 
@@ -46,10 +46,10 @@ def root_of(leader: int) -> int:
 
     While the restore runs, this is CRIU.
     """
-    if not is_hold(leader):
+    if not is_shim(leader):
         return leader
     for child in children(leader):
-        if not is_hold(child):
+        if not is_shim(child):
             return child
         held = children(child)
         if held:
@@ -57,9 +57,9 @@ def root_of(leader: int) -> int:
     return leader
 
 
-def is_hold(pid: int) -> bool:
+def is_shim(pid: int) -> bool:
     """Return True if a process is a shim."""
-    return _names(_words(pid), HOLD)
+    return _names(_words(pid), SHIM)
 
 
 def leads(pid: int) -> bool | None:
@@ -68,7 +68,7 @@ def leads(pid: int) -> bool | None:
     A process that was spawned just now has no command line yet, so it may become a shim.
     """
     words = _words(pid)
-    if _names(words, HOLD):
+    if _names(words, SHIM):
         return True
     return None if words == [""] or _names(words, _AGAIN) else False
 

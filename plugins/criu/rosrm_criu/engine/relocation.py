@@ -32,7 +32,13 @@ _NUMBER, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
 
 
 def moved(path: str, old: str, new: str) -> str:
-    """Return a path with the directory `old` replaced by `new`; unchanged if either is ""."""
+    """Return a path with one directory replaced by another.
+
+    Args:
+        path: absolute.
+        old: the directory to replace; "": none.
+        new: its replacement; "": none.
+    """
     if old and new and (path == old or path.startswith(f"{old}/")):
         return new + path[len(old) :]
     return path

@@ -71,7 +71,7 @@ def _options(words: list[str]) -> argparse.Namespace:
 
 def _restore(image: Path, rejoin: Rejoin, options: argparse.Namespace) -> NoReturn:
     """Become the shim; write the request to rejoin first, so that the node rejoins once it runs."""
-    from rosrm_criu.control import ask_resume, make_directory  # noqa: PLC0415 - likewise
+    from rosrm_criu.control.client import ask_resume, make_directory  # noqa: PLC0415 - likewise
     from rosrm_criu.engine import restore_result  # noqa: PLC0415 - for few of the starts
 
     control = Path(rejoin.control)

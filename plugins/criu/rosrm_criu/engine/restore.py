@@ -18,7 +18,7 @@ from typing import Final
 from rosrm.errors import CriuError
 from rosrm.supervisor import paths
 from rosrm.supervisor.procfs import SUPERVISOR_MARK
-from rosrm_criu.engine import image, log_messages, relocation
+from rosrm_criu.engine import criu_log, image, relocation
 from rosrm_criu.engine.binary import Criu
 from rosrm_criu.engine.dump import COMMON
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
@@ -182,7 +182,7 @@ def restore(
             criu.run(arguments, timeout=timeout, log=log_file, pass_fds=(log,))
         except CriuError as error:
             name = manifest.process or "the process"
-            meaning = log_messages.of_restore(str(error))
+            meaning = criu_log.explain_restore(str(error))
             if not meaning:
                 raise
             raise CriuError(

@@ -84,8 +84,8 @@ def main() -> None:
     os.chdir("/")
     task = _Restore(criu, directory, manifest, here, options.timeout, options.remove, began)
     if not options.no_namespace and _libc.unshare(_NEW_PIDS) == 0:
-        _hold_namespace(task)
-    _hold_child(task)
+        _restore_in_namespace(task)
+    _restore_as_child(task)
 
 
 def _split(words: list[str]) -> tuple[list[str], list[str]]:
@@ -187,7 +187,7 @@ def _fail(directory: Path, reason: str) -> NoReturn:
 # --- with a namespace ---------------------------------------------------------------------------
 
 
-def _hold_namespace(task: _Restore) -> NoReturn:
+def _restore_in_namespace(task: _Restore) -> NoReturn:
     """Fork the init of the new pid namespace, and represent it to the supervisor."""
     living, end_of_life = os.pipe()
     hearing, saying = os.pipe()
@@ -262,7 +262,7 @@ def _skip_ids(manifest: Manifest) -> None:
 # --- without a namespace ------------------------------------------------------------------------
 
 
-def _hold_child(task: _Restore) -> NoReturn:
+def _restore_as_child(task: _Restore) -> NoReturn:
     """Restore the process as a child of the shim itself."""
     _libc.prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     own = {name: os.environ.get(name, "") for name in (INSTANCE_MARK, SUPERVISOR_MARK)}

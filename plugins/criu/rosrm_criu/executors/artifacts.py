@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
-from rosrm_criu.engine.paths import incoming, kept, outgoing
+from rosrm_criu.engine.paths import checkpoint, incoming, outgoing
 from rosrm_criu.engine.restore_result import Outcome
 from rosrm_criu.executors.request import Asked, without_log_names
 from rosrm_criu.transfer import Fetcher, Sender
@@ -72,7 +72,16 @@ def once(step: str, attempt: str, work: Callable[[], Answer]) -> Answer:
 
 
 def after(step: str, attempt: str, timeout: float) -> None:
-    """Wait for the end of a step under way; raise CriuError after `timeout` seconds."""
+    """Wait for the end of a step under way.
+
+    Args:
+        step: its name.
+        attempt: id of the migration attempt.
+        timeout: seconds.
+
+    Raises:
+        CriuError: the step is still under way.
+    """
     with _changing:
         flight = _flights.get((step, attempt))
     if flight is None:
@@ -86,6 +95,10 @@ def after(step: str, attempt: str, timeout: float) -> None:
 @contextlib.contextmanager
 def alone(number: int, timeout: float) -> Iterator[None]:
     """Exclude other dumps of an instance.
+
+    Args:
+        number: of the instance.
+        timeout: seconds to wait for another dump.
 
     Raises:
         CriuError: another dump is still under way after `timeout` seconds.
@@ -122,7 +135,14 @@ def open_sender(number: int) -> Sender:
 
 
 def remove_when_over(state: Path, number: int, sender: Sender, seconds: float) -> None:
-    """Remove an offered image once it was fetched or its offer has expired."""
+    """Remove an offered image once it was fetched, or the fetch failed or came too late.
+
+    Args:
+        state: directory of the slave.
+        number: of the instance whose image it is.
+        sender: of the image.
+        seconds: validity of the offer.
+    """
 
     def wait() -> None:
         sender.wait(seconds + 5.0)
@@ -149,7 +169,12 @@ def withdraw(state: Path, number: int) -> None:
 
 
 def open_fetcher(number: int, keep: float) -> str:
-    """Open the receiving end for a future instance, and return its certificate."""
+    """Open the receiving end for a future instance, and return its certificate.
+
+    Args:
+        number: of the instance.
+        keep: seconds after which an unused end is closed.
+    """
     fetcher = Fetcher()
     try:
         certificate = fetcher.introduce()
@@ -272,7 +297,7 @@ def _is_awaited(state: Path, directory: Path) -> bool:
         origin = int((directory / _ORIGIN).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    return kept(state, origin).exists()
+    return checkpoint(state, origin).exists()
 
 
 def number_of(instance: str) -> int:

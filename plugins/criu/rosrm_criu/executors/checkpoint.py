@@ -21,7 +21,7 @@ from typing import Any, Final
 from rosrm.errors import CriuError
 from rosrm_criu.engine import dump, external_resources, image, process_tree, udp_ports
 from rosrm_criu.engine.binary import find
-from rosrm_criu.engine.paths import incoming, kept, kept_numbers, ports_of_kept
+from rosrm_criu.engine.paths import checkpoint, checkpoint_numbers, checkpoint_ports, incoming
 from rosrm_criu.executors import artifacts
 from rosrm_criu.executors.request import Asked, check_wanted, turn_back, without_log_names
 from rosrm_criu.plans import KEEP, TAKE
@@ -56,7 +56,7 @@ def _keep_alone(asked: Asked) -> Mapping[str, Any]:
     trouble = external_resources.shared_memory(pids)
     if trouble:
         raise CriuError(f"{asked.process} cannot be checkpointed: {trouble}")
-    directory, began = kept(asked.state, asked.source), time.monotonic()
+    directory, began = checkpoint(asked.state, asked.source), time.monotonic()
     artifacts.discard(directory)
     check_wanted(asked.attempt)
     try:
@@ -65,7 +65,7 @@ def _keep_alone(asked: Asked) -> Mapping[str, Any]:
                 find(), pid, directory, leave="stopped", timeout=asked.timeout,
                 process=asked.process, instance=asked.source,
             )  # fmt: skip
-        udp_ports.write(ports_of_kept(asked.state, asked.source), udp_ports.bound(pids))
+        udp_ports.write(checkpoint_ports(asked.state, asked.source), udp_ports.bound(pids))
     except BaseException:  # any error: the process continues, and nothing is left behind
         _discard(asked.state, asked.source)
         dump.resume(pid)
@@ -111,7 +111,7 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"taken": True}  # an earlier call took it, and the restore is under way
     if artifacts.was_restored(incoming(asked.state, asked.destination)):
         return {"taken": True}  # restored once already; the process has ended since
-    source, target = kept(asked.state, asked.source), incoming(asked.state, asked.destination)
+    source, target = checkpoint(asked.state, asked.source), incoming(asked.state, asked.destination)
     image.read(source)
     artifacts.discard(target)
     artifacts.forget_restored(asked.state, asked.instances)
@@ -148,7 +148,7 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     asked = Asked.of(arguments)
     directory = incoming(asked.state, asked.destination)
     if not directory.exists():
-        gone = not kept(asked.state, asked.source).exists()
+        gone = not checkpoint(asked.state, asked.source).exists()
         return {"active": True} if gone and TAKE in asked.results else {}
     pid = asked.pid(asked.destination)
     try:
@@ -177,21 +177,21 @@ def drop(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def reserve_all(state: Path) -> None:
     """Reserve the ports of all checkpointed processes again, after the start of a slave."""
-    for number in kept_numbers(state):
+    for number in checkpoint_numbers(state):
         _reserve(state, number)
 
 
 def _reserve(state: Path, number: int) -> None:
     with _changing:
         if number not in _reserved:
-            _reserved[number] = udp_ports.reserve(udp_ports.read(ports_of_kept(state, number)))
+            _reserved[number] = udp_ports.reserve(udp_ports.read(checkpoint_ports(state, number)))
 
 
 def _discard(state: Path, number: int) -> None:
     """Remove a checkpoint and release its ports."""
-    artifacts.discard(kept(state, number))
+    artifacts.discard(checkpoint(state, number))
     with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-        ports_of_kept(state, number).unlink()
+        checkpoint_ports(state, number).unlink()
     with _changing:
         for one in _reserved.pop(number, ()):
             one.close()

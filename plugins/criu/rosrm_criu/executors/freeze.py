@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from rosrm.errors import CriuError
-from rosrm_criu.control import (
-    State,
+from rosrm_criu.control.client import (
     ask_prepare,
     ask_resume,
     await_left,
@@ -17,6 +16,7 @@ from rosrm_criu.control import (
     make_directory,
     status_of,
 )
+from rosrm_criu.control.messages import State
 from rosrm_criu.engine import dump, process_tree
 from rosrm_criu.executors.request import check_wanted
 
@@ -43,6 +43,11 @@ def leave(pid: int, control: Path, attempt: str, timeout: float) -> float:
 
 def call_back(pid: int, control: Path, attempt: str) -> bool:
     """Continue the node on its host, and request a rejoin without waiting for it.
+
+    Args:
+        pid: the instance's leader.
+        control: the node's control directory.
+        attempt: id of the request to leave.
 
     Returns:
         False if the process does not handle requests. Then it is no portable node, and was never

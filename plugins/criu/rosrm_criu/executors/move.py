@@ -10,9 +10,7 @@ import time
 from pathlib import Path
 
 from rosrm.errors import CriuError, PortableError
-from rosrm_criu.control import (
-    State,
-    Status,
+from rosrm_criu.control.client import (
     ask_resume,
     await_joined,
     control_directory,
@@ -20,6 +18,7 @@ from rosrm_criu.control import (
     remove_directory,
     status_of,
 )
+from rosrm_criu.control.messages import State, Status
 from rosrm_criu.engine import dump, process_tree
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import incoming, outgoing

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import CriuError
-from rosrm_criu.control import await_joined
+from rosrm_criu.control.client import await_joined
 from rosrm_criu.engine import dump as dumping
 from rosrm_criu.engine import external_resources, image, paths, process_tree, slots
 from rosrm_criu.engine.binary import find
@@ -25,7 +25,7 @@ from rosrm_criu.executors import artifacts
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
 from rosrm_criu.executors.request import Asked, without_log_names
 
-#: File beside the images of an instance, with the id of its absence while the node is away.
+#: File beside the images of an instance, with the id of its departure while the node is away.
 _AWAY: Final = "away"
 #: Seconds for the end of a dump that a killed slave has begun, and between two polls of it.
 _PATIENCE: Final = 20.0

@@ -36,7 +36,7 @@ class Declared:
 
 
 @dataclass(frozen=True)
-class Absence:
+class Departure:
     """The state of a node at its graph departure.
 
     Attributes:
@@ -77,13 +77,13 @@ class Absence:
                 self.parameters[name].declare(node)
 
     def start_timers(self, node: Any) -> None:
-        """Resume each timer at its position in the period; the absence does not count.
+        """Resume each timer at its position in the period; the time away does not count.
 
         Timers are matched by order of creation; a timer with another period is a new one.
         """
         for timer, (period, due) in zip(list(node.timers), self.timers, strict=False):
             one = TimerOf(timer, True)
-            # Simulated time is independent of the absence; coroutines cannot be wrapped below.
+            # Simulated time is independent of the time away; coroutines cannot be wrapped below.
             if timer.timer_period_ns != period or one.follows_ros_time():
                 continue
             if due < 0:
@@ -104,14 +104,14 @@ def _first_in(one: TimerOf, due_ns: int) -> None:
     one.start_in(due_ns / 1e9)
 
 
-def absence_of(node: Any) -> Absence:
+def departure_of(node: Any) -> Departure:
     """Return the state of a node, between two of its callbacks."""
     parameters = {
         name: Declared(parameter, node.describe_parameter(name))
         for name, parameter in node.get_parameters_by_prefix("").items()
     }
     timers = tuple((one.timer_period_ns, TimerOf(one, True).due_ns()) for one in node.timers)
-    return Absence(parameters, timers, peers_of(node), others_of(node))
+    return Departure(parameters, timers, peers_of(node), others_of(node))
 
 
 def await_readers(node: Any, patience: float) -> None:

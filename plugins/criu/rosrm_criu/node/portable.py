@@ -15,8 +15,8 @@ from rclpy.event_handler import EventHandler
 
 from rosrm.ros.fast_dds import announcing
 from rosrm.ros.graph_remains import close_leaked, open_sockets
-from rosrm_criu.control import VARIABLE
-from rosrm_criu.node.graph_departure import Absence, absence_of, await_peers, await_readers
+from rosrm_criu.control.messages import VARIABLE
+from rosrm_criu.node.graph_departure import Departure, await_peers, await_readers, departure_of
 
 #: Seconds for published samples to reach their readers, before the node leaves.
 _READERS: Final = 0.5
@@ -79,9 +79,9 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         self._portable_declared = tuple(self.get_parameters_by_prefix(""))
         self.join()
 
-    def _portable_leave(self) -> tuple[Absence, str]:
+    def _portable_leave(self) -> tuple[Departure, str]:
         """Leave the graph; return the node's state, and the fault of `leave` ("": none)."""
-        absence = absence_of(self)
+        departure = departure_of(self)
         fault = ""
         try:
             self.leave()
@@ -90,25 +90,25 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         await_readers(self, _READERS)
         self.destroy_node()
         close_leaked(self._portable_sockets)
-        return absence, fault
+        return departure, fault
 
-    def _portable_enter_again(self, absence: Absence) -> None:
+    def _portable_enter_again(self, departure: Departure) -> None:
         """Enter the graph again, with only a name and parameters."""
         named = dict(self._portable_arguments[1])
         # Parameter files may be missing on the new host, so their values are passed as overrides.
         given = [*self._portable_given.values(), *(named.get("parameter_overrides") or ())]
-        named["parameter_overrides"] = absence.overrides(given)
+        named["parameter_overrides"] = departure.overrides(given)
         self._portable_enter(named)
 
-    def _portable_join_again(self, absence: Absence) -> None:
-        absence.declare_missing(self, self._portable_declared)
+    def _portable_join_again(self, departure: Departure) -> None:
+        departure.declare_missing(self, self._portable_declared)
         self.join()
-        absence.declare_missing(self)
+        departure.declare_missing(self)
 
-    def _portable_go_on(self, absence: Absence, patience: float) -> tuple[str, ...]:
+    def _portable_go_on(self, departure: Departure, patience: float) -> tuple[str, ...]:
         """Wait for the peers and start the timers; return the peers that are missing."""
-        missing = await_peers(self, absence.peers, patience)
-        absence.start_timers(self)
+        missing = await_peers(self, departure.peers, patience)
+        departure.start_timers(self)
         return missing
 
     def _portable_enter(self, named: dict[str, Any]) -> None:

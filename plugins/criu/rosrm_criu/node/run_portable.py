@@ -21,9 +21,9 @@ from rclpy.signals import uninstall_signal_handlers
 from rosrm.errors import PortableError
 from rosrm.ros import fast_dds_relocation
 from rosrm.ros.graph_remains import what_is_left
-from rosrm_criu.control import SIGNAL, VARIABLE, Request, State, Status, Want
 from rosrm_criu.control.listener import Listener
-from rosrm_criu.node.graph_departure import Absence, sees_again
+from rosrm_criu.control.messages import SIGNAL, VARIABLE, Request, State, Status, Want
+from rosrm_criu.node.graph_departure import Departure, sees_again
 from rosrm_criu.node.portable import PortableNode
 
 #: Seconds between two reads of the request file: while the node runs, and while it is away. The
@@ -103,7 +103,7 @@ class _Run:
         self._looked = 0.0
         self._node: Any = None
         self._is_in = False  # the node is in the graph
-        self._signals: dict[int, Any] = {}  # rclpy's handlers, while replaced during an absence
+        self._signals: dict[int, Any] = {}  # rclpy's handlers, while replaced: the node is away
         self._executor: Any = None
         if self._listener is not None:
             signal.signal(SIGNAL, self._wake)
@@ -128,10 +128,10 @@ class _Run:
         """Run, leave, wait and rejoin, until the context is shut down."""
         with contextlib.suppress(_Ended):
             while (request := self._spin()) is not None:
-                absence, fault = self._leave(request)
+                departure, fault = self._leave(request)
                 if not fault:
                     request = self._wait_away()
-                self._join(request, absence, fault)
+                self._join(request, departure, fault)
 
     def end(self) -> None:
         """Shut down; keep the control directory of a failed node, whose status has the fault."""
@@ -178,7 +178,7 @@ class _Run:
 
     # --- leaving ---------------------------------------------------------------------------
 
-    def _leave(self, request: Request) -> tuple[Absence | None, str]:
+    def _leave(self, request: Request) -> tuple[Departure | None, str]:
         """Leave the graph; return the node's state, and why it cannot stay away ("": it can).
 
         If that is known in advance, the node does not leave, and no state is returned.
@@ -191,12 +191,12 @@ class _Run:
             self._come_to_rest()
         except PortableError as error:
             return None, str(error)
-        absence, fault = self._depart()
+        departure, fault = self._depart()
         fault = fault or _not_clean()
         if not fault:
             seconds = {"leave": round(time.monotonic() - began, 6)}
             listener.say(Status(State.LEFT, request.id, seconds=seconds))
-        return absence, fault
+        return departure, fault
 
     def _come_to_rest(self) -> None:
         """Wait for the end of pending callbacks, so that the departure interrupts none."""
@@ -212,9 +212,9 @@ class _Run:
             else:
                 self._executor.spin_once(timeout_sec=0.01)
 
-    def _depart(self) -> tuple[Absence | None, str]:
+    def _depart(self) -> tuple[Departure | None, str]:
         node = self._node
-        absence, fault = node._portable_leave()  # noqa: SLF001 - the other half of one thing
+        departure, fault = node._portable_leave()  # noqa: SLF001 - the other half of one thing
         self._is_in = False
         ended = not self._executor.context.ok()  # by a signal, which ROS handles up to here
         self._executor.shutdown()
@@ -224,7 +224,7 @@ class _Run:
             raise _Ended
         uninstall_signal_handlers()  # they need a context; until the rejoin, `_end` is used
         self._signals = {one: signal.signal(one, _end) for one in _ENDING}
-        return absence, fault
+        return departure, fault
 
     def _give_signals_back(self) -> None:
         for one, handler in self._signals.items():
@@ -246,35 +246,35 @@ class _Run:
 
     # --- joining ---------------------------------------------------------------------------
 
-    def _join(self, request: Request, absence: Absence | None, fault: str) -> None:
+    def _join(self, request: Request, departure: Departure | None, fault: str) -> None:
         """Rejoin: on request, or because the node cannot leave.
 
         Args:
             request: the request that this answers.
-            absence: the node's state at its departure; None: it never left.
+            departure: the node's state at its departure; None: it never left.
             fault: why it cannot leave; "": it had left.
         """
         listener = self._its_listener()
         missing: tuple[str, ...] = ()
-        if absence is not None:
-            missing = self._arrive(request, absence)
+        if departure is not None:
+            missing = self._arrive(request, departure)
         if fault:
             self._node.get_logger().error(f"rosrm asked this node to leave; it stays: {fault}")
         seconds = listener.status.seconds
         listener.done(Status(State.RUNNING, request.id, fault, seconds, missing))
 
-    def _arrive(self, request: Request, absence: Absence) -> tuple[str, ...]:
+    def _arrive(self, request: Request, departure: Departure) -> tuple[str, ...]:
         listener = self._its_listener()
         began = time.monotonic()
         listener.enter(State.JOINING, request.id)
         guids_are_new = fast_dds_relocation.look_again()
-        entries = self._enter(absence)
+        entries = self._enter(departure)
         seen = time.monotonic()
         node = self._node
-        node._portable_join_again(absence)  # noqa: SLF001 - the other half of one thing
+        node._portable_join_again(departure)  # noqa: SLF001 - the other half of one thing
         self._add_executor()
         left = max(0.0, began + self._patience - time.monotonic())
-        missing: tuple[str, ...] = node._portable_go_on(absence, left)  # noqa: SLF001
+        missing: tuple[str, ...] = node._portable_go_on(departure, left)  # noqa: SLF001
         found = time.monotonic()
         times = {
             "enter": round(seen - began, 6), "entries": entries, "join": round(found - seen, 6),
@@ -289,7 +289,7 @@ class _Run:
             )
         return missing
 
-    def _enter(self, absence: Absence) -> int:
+    def _enter(self, departure: Departure) -> int:
         """Enter the graph until the other endpoints are visible; return the number of attempts.
 
         A neighbour answers a participant's first announcement within 0.1 ms. Fast DDS 2.14 may
@@ -303,9 +303,9 @@ class _Run:
             entries += 1
             self._give_signals_back()
             rclpy.init(args=without_parameter_files(self._args))
-            self._node._portable_enter_again(absence)  # noqa: SLF001 - the other half of one thing
+            self._node._portable_enter_again(departure)  # noqa: SLF001 - the other half of one thing
             last = entries == _ENTRIES or deadline - time.monotonic() <= _GREETED
-            if last or sees_again(self._node, absence.others, _GREETED):
+            if last or sees_again(self._node, departure.others, _GREETED):
                 self._is_in = True
                 return entries
             self._node.destroy_node()

@@ -1,4 +1,4 @@
-"""Transfer of a directory from one host to another: over TLS, compressed, checksummed, once.
+"""Transfer of a directory from one host to another: one TLS stream, compressed and checksummed.
 
 The contents of the files do not matter here. The source *offers* a directory: a separate process
 serves it to one known destination, until it is fetched or the offer expires; no port is open before
@@ -12,7 +12,8 @@ transfer affects neither a slave's memory nor its event loop. Both sides use JSO
     fetched = fetcher.fetch(Offer.from_json(told), target, timeout=30.0)
     sender.close()
 
-docs/decisions/0025-image-transfer.md gives the reasons for this design.
+If the stream breaks, the fetch fails, both sides remove what they have, and the offer is over.
+docs/decisions/0041-one-tls-stream.md gives the reasons for this design.
 """
 
 from rosrm_criu.transfer.form import Fetched, Offer, Sent

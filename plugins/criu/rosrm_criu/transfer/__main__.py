@@ -8,13 +8,12 @@ its parent.
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import signal
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ def main() -> int:
     work = {"send": _send, "fetch": _fetch}[sys.argv[1]]
     # Import early: a process that is started in advance has its libraries when work arrives.
     if sys.argv[1] == "send":
-        import rosrm_criu.transfer.serving  # noqa: PLC0415
+        import rosrm_criu.transfer.sending  # noqa: PLC0415
     else:
         import rosrm_criu.transfer.receiving  # noqa: F401, PLC0415
     line = sys.stdin.readline()
@@ -56,26 +55,13 @@ def _say(answer: Mapping[str, Any]) -> None:
 
 
 def _send(asked: dict[str, Any]) -> Mapping[str, Any]:
-    return asyncio.run(_serve(asked))
+    from rosrm_criu.transfer.sending import serve  # noqa: PLC0415
 
-
-async def _serve(asked: dict[str, Any]) -> Mapping[str, Any]:
-    from rosrm_criu.transfer.serving import serve  # noqa: PLC0415
-
-    withdrawn = asyncio.Event()
-
-    def read() -> None:
-        if not os.read(0, 1024):
-            loop.remove_reader(0)
-            withdrawn.set()
-
-    loop = asyncio.get_running_loop()
-    loop.add_signal_handler(signal.SIGTERM, withdrawn.set)
-    loop.add_reader(0, read)
+    over = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: over.set())
+    _when_input_ends(over.set)
     directory = Path(asked.pop("directory"))
-    sent = await serve(
-        directory, **asked, withdrawn=withdrawn, announce=lambda offer: _say(offer.as_json())
-    )
+    sent = serve(directory, **asked, over=over, announce=lambda offer: _say(offer.as_json()))
     return sent.as_json()
 
 
@@ -92,22 +78,27 @@ def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
 
     signal.signal(signal.SIGTERM, stop)
     if "introduce" not in asked:
-        raise TransferError("the destination was not introduced: nobody would speak with it")
+        raise TransferError("the destination was not introduced: the source would refuse it")
     identity = new_identity()
     _say({"certificate": identity.certificate})
     line = sys.stdin.readline()
     if not line:
         raise TransferError("the fetch was stopped before it began")
     asked = json.loads(line)
-    threading.Thread(target=_stop_when_input_ends, daemon=True).start()
+    _when_input_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
     offer, target = Offer.from_json(asked.pop("offer")), Path(asked.pop("target"))
     return receive(offer, target, **asked, identity=identity, before_placing=ignore).as_json()
 
 
-def _stop_when_input_ends() -> None:
-    while os.read(0, 1024):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
+def _when_input_ends(do: Callable[[], None]) -> None:
+    """Call a function, in another thread, when the parent closes the standard input or ends."""
+
+    def wait() -> None:
+        while os.read(0, 1024):
+            pass
+        do()
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import ipaddress
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rosrm.errors import TransferError
 
@@ -15,13 +15,17 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 #: Raised for a change that a peer of another version could not understand.
-VERSION: Final = 1
+VERSION: Final = 2
 #: Algorithm of the archive's checksum, whose bytes follow the archive in the stream.
 DIGEST: Final = "blake2b-256"
 DIGEST_SIZE: Final = 32
 
-#: Carries a random number of the reader: only the first reader of an offer is accepted.
-READER_HEADER: Final = "Rosrm-Reader"
+#: The stream consists of parts: each has a head with the number of its bytes, big-endian, and then
+#: compressed bytes. After a part of no bytes follows the reason why the source stops, up to the end
+#: of the connection.
+PART_HEAD: Final = 4
+#: Byte with which the destination confirms that it has received and verified everything.
+TAKEN: Final = b"\x01"
 
 _HEX: Final = re.compile(r"[0-9a-f]{64}")
 _MOST: Final = 1 << 60
@@ -112,12 +116,13 @@ class Sent:
     """Result of an offer.
 
     Attributes:
-        outcome: "taken": fetched and verified; "expired": not fetched in time; "withdrawn":
-            ended by the source; "failed": its process died.
-        bytes: compressed bytes that were sent, including those of broken connections.
+        outcome: "taken": fetched and verified; "broken": the connection broke before that;
+            "expired": not fetched in time; "withdrawn": ended by the source; "failed": its process
+            died.
+        bytes: compressed bytes that were sent.
     """
 
-    outcome: str
+    outcome: Literal["taken", "broken", "expired", "withdrawn", "failed"]
     bytes: int
 
     def as_json(self) -> dict[str, Any]:
@@ -130,11 +135,10 @@ class Fetched:
     """A directory that was fetched.
 
     Attributes:
-        address: last address of the source that was used.
+        address: of the source, as it was reached.
         size: bytes of all files.
         files: number of files.
         received: compressed bytes that were received.
-        resumed: number of broken connections that were resumed.
         seconds: from the request until the directory was in its place.
         checksum: of the archive, in hexadecimal digits.
     """
@@ -143,7 +147,6 @@ class Fetched:
     size: int
     files: int
     received: int
-    resumed: int
     seconds: float
     checksum: str
 

@@ -26,7 +26,7 @@ DEFAULT_RESERVE: Final = 256 << 20
 #: Seconds for a process to start and answer, and to end, on a busy machine.
 _START: Final = 30.0
 _END: Final = 10.0
-_NEEDED: Final = ("aiohttp", "cryptography", "urllib3")
+_NEEDED: Final = ("cryptography",)
 
 
 def missing() -> str:

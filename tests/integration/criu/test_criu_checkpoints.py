@@ -14,7 +14,7 @@ import pytest
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
-from rosrm_criu.engine.paths import incoming, kept, kept_numbers, ports_of_kept
+from rosrm_criu.engine.paths import checkpoint, checkpoint_numbers, checkpoint_ports, incoming
 from rosrm_criu.executors import artifacts, request
 from rosrm_criu.executors import checkpoint as steps
 from tests.criu_kit import TIMEOUT, eventually
@@ -63,9 +63,9 @@ class Slave:
             self.results[f"criu_{step}"] = answer
         return answer
 
-    def hold(self, number: int = 2) -> Any:
+    def shim(self, number: int = 2) -> Any:
         """Start the shim of an instance like the supervisor does."""
-        actor = self.theatre.hold(incoming(self.state, number), remove=True)
+        actor = self.theatre.shim(incoming(self.state, number), remove=True)
         self.pids[f"p#{number}"] = actor.pid
         return actor
 
@@ -114,17 +114,17 @@ def checkpointed(slave: Slave, counter: Any) -> list[int]:
 
 
 def nothing_left(slave: Slave) -> None:
-    assert kept_numbers(slave.state) == []
+    assert checkpoint_numbers(slave.state) == []
     assert not list((slave.state / "images").glob("kept-*"))
 
 
 def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
     """A restored process loses and repeats no number, and its port stays reserved until then."""
     before, port = checkpointed(slave, counter), port_of(counter)
-    assert kept_numbers(slave.state) == [1]
+    assert checkpoint_numbers(slave.state) == [1]
     assert not is_free(port)
     slave.ask("take", destination=3)
-    restored = slave.hold(3)
+    restored = slave.shim(3)
     assert slave.ask("await_kept", destination=3)["seconds"]["restore"] > 0.0
     restored.counts()
     assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
@@ -137,14 +137,14 @@ def test_it_can_be_checkpointed_again(slave, counter):
     """A restored process can be checkpointed as the instance of its shim."""
     before = checkpointed(slave, counter)
     slave.ask("take", destination=3)
-    restored = slave.hold(3)
+    restored = slave.shim(3)
     slave.ask("await_kept", destination=3)
     restored.counts()
     slave.ask("keep", source=3, destination=4)
     slave.ask("kill", source=3, destination=4)
     restored.process.wait(TIMEOUT)
     slave.ask("take", source=3, destination=5)
-    again = slave.hold(5)
+    again = slave.shim(5)
     slave.ask("await_kept", source=3, destination=5)
     again.counts()
     told = before + restored.numbers() + again.numbers()
@@ -202,13 +202,13 @@ def test_an_undone_restore_leaves_the_image_as_it_was(slave, counter):
     slave.ask("take")
     page = next((incoming(slave.state, 2) / image.PAGES).glob("core-*"))
     page.unlink()  # only the hard link
-    failed = slave.hold()
+    failed = slave.shim()
     with pytest.raises(CriuError, match="damaged"):
         slave.ask("await_kept")
     failed.process.wait(TIMEOUT)
     assert slave.ask("put_back") == {}
     slave.ask("take")
-    restored = slave.hold()
+    restored = slave.shim()
     slave.ask("await_kept")
     restored.counts()
     assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
@@ -218,17 +218,17 @@ def test_an_undone_restore_leaves_the_image_as_it_was(slave, counter):
 def test_an_image_that_changed_on_the_disk_is_not_restored(slave, counter):
     """A flipped bit in an image fails the restore with advice, and the image stays."""
     checkpointed(slave, counter)
-    pages = kept(slave.state, 1) / image.PAGES / "pages-1.img"
+    pages = checkpoint(slave.state, 1) / image.PAGES / "pages-1.img"
     content = bytearray(pages.read_bytes())
     content[len(content) // 2] ^= 1
     pages.write_bytes(content)
     slave.ask("take")
-    failed = slave.hold()
+    failed = slave.shim()
     with pytest.raises(CriuError, match=r"damaged: criu/pages-1\.img .* `rosrm restart p`"):
         slave.ask("await_kept")
     failed.process.wait(TIMEOUT)
     assert slave.ask("put_back") == {}
-    assert kept_numbers(slave.state) == [1]
+    assert checkpoint_numbers(slave.state) == [1]
     steps.drop({"numbers": [1], "here": {"state": str(slave.state)}})
 
 
@@ -236,7 +236,7 @@ def test_a_restored_process_is_not_put_back(slave, counter):
     """A successful restore is never undone, even if unreported or if the process has ended."""
     checkpointed(slave, counter)
     slave.ask("take")
-    restored = slave.hold()
+    restored = slave.shim()
     eventually(lambda: restore_result.read(incoming(slave.state, 2)), "the restore")
     assert slave.ask("put_back") == {"active": True}
     nothing_left(slave)
@@ -251,7 +251,7 @@ def test_a_restored_process_that_ended_at_once_is_not_put_back(slave, counter):
     """A process that ends right after its restore is not restored a second time."""
     checkpointed(slave, counter)
     slave.ask("take")
-    restored = slave.hold()
+    restored = slave.shim()
     eventually(lambda: restore_result.read(incoming(slave.state, 2)), "the restore")
     os.kill(process_tree.root_of(restored.pid), signal.SIGKILL)
     restored.process.wait(TIMEOUT)
@@ -263,7 +263,7 @@ def test_that_it_was_restored_is_known_as_long_as_its_image_is_kept(slave, count
     """A sweep keeps the result of a used image, so that a late `take` does not copy it again."""
     checkpointed(slave, counter)
     slave.ask("take")
-    restored = slave.hold()
+    restored = slave.shim()
     eventually(lambda: restore_result.read(incoming(slave.state, 2)), "the restore")
     slave.end(restored)
     artifacts.sweep(slave.state, [])
@@ -291,11 +291,11 @@ def test_a_slave_that_was_started_again_keeps_the_ports(slave, counter):
 def test_without_an_image_nothing_is_restored(slave, counter):
     """A missing image fails the restore, and its undo has no effect."""
     checkpointed(slave, counter)
-    shutil.rmtree(kept(slave.state, 1))
+    shutil.rmtree(checkpoint(slave.state, 1))
     with pytest.raises(CriuError, match="holds no complete image"):
         slave.ask("take")
     assert slave.ask("put_back") == {}
-    ports_of_kept(slave.state, 1).unlink()
+    checkpoint_ports(slave.state, 1).unlink()
     steps.drop({"numbers": [1], "here": {"state": str(slave.state)}})
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm_criu.engine.binary import Criu
-from rosrm_criu.engine.compatibility import FACTS, mismatch
-from rosrm_criu.engine.compatibility_facts import facts_of, features
+from rosrm_criu.engine.compatibility import FACTS, facts_of, features, mismatch
 from tests.criu_kit import HOST_FACTS as HERE
 
 

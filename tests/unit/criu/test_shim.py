@@ -1,6 +1,6 @@
 """Restarts of the shim, with real processes.
 
-None of them needs CRIU; tests/integration/criu/test_hold.py has those that do.
+None of them needs CRIU; tests/integration/test_criu_images.py has those that do.
 """
 
 from __future__ import annotations

@@ -56,16 +56,16 @@ def child_of(pid):
     raise AssertionError(f"process {pid} has no child in a session of its own")
 
 
-def test_a_hold_is_known_as_one_however_early_it_was_added(spawn):
+def test_a_shim_is_known_as_one_however_early_it_was_added(spawn):
     """A shim is recognised even if it was added before its execve set the command line."""
     table = SessionTable(launchers=BY_CRIU)
     for _ in range(ROUNDS):
-        hold = spawn("plugins/criu/rosrm_criu/engine/shim.py")
-        table.add(hold)
-        child = child_of(hold)
+        shim = spawn("plugins/criu/rosrm_criu/engine/shim.py")
+        table.add(shim)
+        child = child_of(shim)
         table.refresh(0.0)
-        assert table.members(hold) == (hold, child)
-        assert child in table.known_as(hold)
+        assert table.members(shim) == (shim, child)
+        assert child in table.known_as(shim)
 
 
 def test_of_any_other_program_a_daemon_is_no_member(spawn):
