@@ -35,6 +35,7 @@ OF_CRIU = {
     "rosrm.cli.options",
     "rosrm.cli.output",
     "rosrm.errors",
+    "rosrm.model.codec",
     "rosrm.ros",
     "rosrm.ros.fast_dds",
     "rosrm.ros.graph_remains",
