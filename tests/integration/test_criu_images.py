@@ -346,10 +346,10 @@ def test_who_ends_at_once_was_restored_all_the_same(theatre, option):
     assert process_tree.wait_until_stopped([actor.pid], TIMEOUT)
     directory = theatre.dump(actor)
     shim = theatre.shim(directory, *option)
-    eventually((directory / "shim.json").exists, "the end of the restore")
+    eventually((directory / "hold.json").exists, "the end of the restore")
     os.killpg(shim.pid, signal.SIGCONT)
     assert shim.process.wait(TIMEOUT) == 9
-    assert json.loads((directory / "shim.json").read_text())["reason"] == ""
+    assert json.loads((directory / "hold.json").read_text())["reason"] == ""
 
 
 def test_signals_come_through_the_shim(theatre, counter):
@@ -445,10 +445,10 @@ def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
     assert modes == {0}
     restored = theatre.restore(directory, remove=True)
-    eventually(lambda: [path.name for path in directory.iterdir()] == ["shim.json"], "a clean end")
+    eventually(lambda: [path.name for path in directory.iterdir()] == ["hold.json"], "a clean end")
     restored.process.terminate()
     restored.process.wait(TIMEOUT)
-    assert [path.name for path in directory.iterdir()] == ["shim.json"]
+    assert [path.name for path in directory.iterdir()] == ["hold.json"]
 
 
 @pytest.mark.parametrize("victim", ["the process", "its shim"])
@@ -481,7 +481,7 @@ def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     client = host.connect()
     client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
     before = host.running(client, "actor", number=2)
-    eventually((directory / "shim.json").exists, "the end of the restore")
+    eventually((directory / "hold.json").exists, "the end of the restore")
     log = host.log("actor", 2)
     host.kill_supervisor(client)
     client = host.connect()
@@ -505,7 +505,7 @@ def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
     client = host.connect()
     client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
     running = host.running(client, "actor", number=2)
-    eventually((directory / "shim.json").exists, "the end of the restore")
+    eventually((directory / "hold.json").exists, "the end of the restore")
     namespace = pid_namespace(process_tree.root_of(running.pid))
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
@@ -522,7 +522,7 @@ def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
     restart = RestartPolicy("on-failure", delay=0.01)
     client.start([host.order("actor", *command, number=2, restart=restart)])
     running = host.running(client, "actor", number=2)
-    eventually((directory / "shim.json").exists, "the end of the restore")
+    eventually((directory / "hold.json").exists, "the end of the restore")
     log = host.log("actor", 2)
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
@@ -582,7 +582,7 @@ def test_a_flipped_byte_is_refused(theatre, pattern):
     assert shim.process.wait(TIMEOUT) == 125
     wanted = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
     assert wanted in shim.log.read_text()
-    assert wanted in json.loads((directory / "shim.json").read_text())["reason"]
+    assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
     assert not (directory / "restore.log").exists()
     assert count.read_text() == "of somebody else"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.criu.conftest import old, older  # noqa: F401 - fixtures
+from tests.integration.criu.conftest import old  # noqa: F401 - a fixture
 from tests.ros.clusters import PATIENCE, host, node
 from tests.ros.portable_kit import NAME, ask, counter, nothing_left, two_hosts
 
