@@ -475,6 +475,19 @@ def host(tmp_path):
     host.clean_up()
 
 
+def test_below_a_supervisor(theatre, counter, host):
+    """The supervisor starts a shim like any process: it stops it, and sees its end."""
+    directory = theatre.dump(counter)
+    client = host.connect()
+    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
+    running = host.running(client, "actor", number=2)
+    eventually((directory / "hold.json").exists, "the end of the restore")
+    assert process_tree.root_of(running.pid) != running.pid
+    client.stop(running.instance)
+    ended = host.ended(client, "actor", number=2)
+    assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
+
+
 def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     """It runs on meanwhile, is known again, and is stopped like any other."""
     directory = theatre.dump(counter)
@@ -489,8 +502,7 @@ def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     seen = log.read_text()
     eventually(lambda: len(log.read_text()) > len(seen), "more numbers")
     client.stop(after.instance)
-    ended = host.ended(client, "actor", number=2)
-    assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
+    host.ended(client, "actor", number=2)
     assert (after.state, after.pid) == (before.state, before.pid)
     assert not process_tree.is_alive(before.pid)
 
