@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import pytest
 
 from rosrm.config import load_work
+from rosrm.config.process import ProcessInFile
 from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
-from rosrm.model.values import Kind, MigrationPolicy, Readiness, RestartPolicy, StopPolicy
+from rosrm.model.values import (
+    Kind,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+    RestartPolicy,
+    StopPolicy,
+)
 from tests.plugin_kit import registry_of
 
 RELAUNCH = MigrationOffer("relaunch", lambda options: options)
@@ -18,6 +26,12 @@ RELAUNCH = MigrationOffer("relaunch", lambda options: options)
 def one(path):
     (spec,) = load_work(path)
     return spec
+
+
+def test_every_key_of_a_process_reaches_its_spec():
+    """A key that is only in the form of the file would be accepted without an effect."""
+    in_file = {field.name for field in fields(ProcessInFile)}
+    assert in_file - {field.name for field in fields(ProcessSpec)} == {"labels"}
 
 
 def test_every_word_is_read(file):

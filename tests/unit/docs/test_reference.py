@@ -256,3 +256,8 @@ def test_every_field_of_the_json_is_documented(title, kinds):
         for f in fields(kind):
             if f.name != "description":  # fields of a host are documented beside the others
                 assert f"`{f.name}`" in found[0], f"{kind.__name__}.{f.name}"
+
+
+def test_the_protocol_page_has_the_protocol_version():
+    """The page and `PROTOCOL_VERSION` name one version."""
+    assert f"This is protocol version {rosrm.PROTOCOL_VERSION}." in page("protocol.md")

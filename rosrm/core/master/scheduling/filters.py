@@ -41,10 +41,11 @@ class Filter:
     Attributes:
         name: unique.
         mask: (n,) True: the host passes. None: every host passes.
-        reason: why the host of a row does not pass, without its name. Called only where `mask` is
-            False there.
+        reason: why the host of a row does not pass: a predicate of the host without its name, with
+            the setting that limits it, if there is one. Called only where `mask` is False there.
         lasts: how long a host fails it. A process is set aside, and does not block the queue, if
-            each host fails a permanent one. Hosts that are away count too, unless all hosts are.
+            each host fails a permanent one, judged as if the host were empty. Hosts that are away
+            count too, unless all hosts are.
         by_assignment: True if an assignment changes the mask. Mask and reason then read only the
             demand and the arrays of the candidates, because a decision keeps a copy of those and
             spells the reason out later.
