@@ -40,7 +40,7 @@ _NAME: Final = "portable_counter"
 _NS: Final = 1e9
 
 
-class Heard(NamedTuple):
+class ReceivedCount(NamedTuple):
     """One count as the observer received it.
 
     Attributes:
@@ -86,11 +86,11 @@ class Hop:
     began_anew: bool = False
 
 
-class Ear:
+class CountReceiver:
     """Receiver of all counts, in a thread of its own."""
 
     def __init__(self) -> None:
-        self.heard: list[Heard] = []
+        self.heard: list[ReceivedCount] = []
         rclpy.init()
         self._node = Node("criu_ear")
         self._node.create_subscription(Int64MultiArray, "count", self._take, QOS)
@@ -101,10 +101,10 @@ class Ear:
         self._thread.start()
 
     def _take(self, message: Int64MultiArray, info: Any) -> None:
-        self.heard.append(Heard(info["received_timestamp"] / _NS, *message.data))
+        self.heard.append(ReceivedCount(info["received_timestamp"] / _NS, *message.data))
 
     def _take_handed(self, message: Int64MultiArray, info: Any) -> None:
-        self.heard.append(Heard(info["received_timestamp"] / _NS, message.data[1]))
+        self.heard.append(ReceivedCount(info["received_timestamp"] / _NS, message.data[1]))
 
     def wait_for(self, counts: int, passes: int = 0) -> None:
         """Wait for so many more counts, and for so many complete reads of the memory."""
@@ -124,10 +124,10 @@ class Ear:
         rclpy.try_shutdown()
 
 
-class Desk:
+class MigrationDriver:
     """Driver of the migrations, one process after the other."""
 
-    def __init__(self, ear: Ear, client: MasterClient) -> None:
+    def __init__(self, ear: CountReceiver, client: MasterClient) -> None:
         self._ear, self._client = ear, client
 
     def play(self, strategy: str, mb: float, hops: int, options: Mapping[str, Any]) -> None:
@@ -215,10 +215,10 @@ def _spec(strategy: str, mb: float, options: Mapping[str, Any]) -> ProcessSpec:
 
 def main() -> None:
     """Carry out the arguments, one after the other."""
-    ear = Ear()
+    ear = CountReceiver()
     try:
         with MasterClient.connect(RosSettings(), name="criu desk", timeout=_PATIENCE) as client:
-            desk = Desk(ear, client)
+            desk = MigrationDriver(ear, client)
             for asked in map(json.loads, sys.argv[1:]):
                 options = asked.get("options", {})
                 desk.play(asked["strategy"], asked["mb"], asked["hops"], options)

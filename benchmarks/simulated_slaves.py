@@ -53,7 +53,7 @@ from rosrm.model.values import (
     ResourceDescription,
 )
 from rosrm.ros.participant import Participant
-from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
+from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.services import Duties, SlaveServices
 from rosrm.testing.loopback import settings_on_this_machine
 
@@ -126,7 +126,7 @@ class SimulatedSlave:
     @property
     def registered(self) -> bool:
         """Return True if the master has accepted its registration."""
-        return self.endpoint.link is Link.REGISTERED
+        return self.endpoint.link is MasterLink.REGISTERED
 
     def cycle(
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], now: float

@@ -26,7 +26,7 @@ from rosrm.model.values import RESOURCE_SLOTS, Kind, ProcessSpec, ResourceDescri
 from rosrm.recording.reader import Header
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 from rosrm_simulate.engine import Simulation
-from rosrm_simulate.workload import Curve, HostPlan, ProcessPlan, Workload
+from rosrm_simulate.workload import Curve, ProcessPlan, SimulatedHost, Workload
 
 _JOBS = 1_000
 _HOSTS = 50
@@ -43,7 +43,7 @@ def fleet(seed: int) -> Workload:
         ResourceDescription("memory", "B", 8.0 * 2**30),
         ResourceDescription("cpu", "core", 4.0),
     )
-    hosts = [HostPlan(f"h{n}", resources, {"memory": 0.8, "cpu": 0.9}) for n in range(_HOSTS)]
+    hosts = [SimulatedHost(f"h{n}", resources, {"memory": 0.8, "cpu": 0.9}) for n in range(_HOSTS)]
     plans = []
     for number in range(_JOBS):
         memory, cpu = random.uniform(1e8, 2e9), random.uniform(0.2, 2.0)

@@ -22,7 +22,7 @@ A plugin marks its hooks with `hookimpl` and returns offers::
 
 The public names, by what they are for:
 
-Client          Client, load_work, RosSettings; its answers: Snapshot, ProcessRow, HostRow,
+Client          Client, load_work, RosSettings; its answers: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health
@@ -131,10 +131,10 @@ if TYPE_CHECKING:
     from rosrm.model.rows import (
         EventRow,
         HostRow,
+        Listing,
         PluginRow,
         ProcessRow,
         ResourceRow,
-        Snapshot,
     )
     from rosrm.model.values import (
         Health,
@@ -157,19 +157,20 @@ if TYPE_CHECKING:
 __all__ = [
     "PROTOCOL_VERSION", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
-    "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count", "EventRow",
-    "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher", "HandoffPhase", "Health",
-    "HostChecking", "HostDescription", "HostLossPolicy", "HostRow", "HostView",
-    "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "Launch", "Launcher",
-    "LauncherContext", "LauncherOffer", "LogChunk", "MemoryPacing", "MemoryView",
-    "MigrationOffer", "MigrationPolicy", "MigrationStrategy", "Move", "NoMaster", "NoOptions",
-    "PeriodicImaging", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
-    "Probe", "ProbeContext", "ProbeOffer", "ProcessRow", "ProcessSpec", "ProcessTreeLauncher",
-    "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription", "ResourceName",
-    "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError", "Scores", "ScoringOffer",
-    "ScoringPolicy", "Seconds", "Sessions", "SetRestart", "SkipPlugin", "Snapshot",
-    "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop", "StopPolicy", "WaitResult",
-    "__version__", "hookimpl", "load_work", "options_of",
+    "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
+    "EventRow", "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher",
+    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
+    "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
+    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
+    "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
+    "MigrationStrategy", "Move", "NoMaster", "NoOptions", "PeriodicImaging", "Plan",
+    "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
+    "ProbeContext", "ProbeOffer", "ProcessRow", "ProcessSpec", "ProcessTreeLauncher",
+    "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
+    "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError",
+    "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
+    "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
+    "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
 #: The public names of each module below `rosrm`.
@@ -197,7 +198,7 @@ _NAMES: Final = {
         "SetRestart Start Step Stop"
     ),
     "model.ros_settings": "RosSettings",
-    "model.rows": "EventRow HostRow PluginRow ProcessRow ResourceRow Snapshot",
+    "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind MigrationPolicy "
         "ProcessSpec Readiness Reading ResourceDescription RestartPolicy StandbyPolicy StopPolicy"

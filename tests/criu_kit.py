@@ -21,9 +21,9 @@ import pytest
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine import dump, process_tree, restore_result
-from rosrm_criu.engine.binary import Criu, find
+from rosrm_criu.engine.binary import CriuBinary, find
 from rosrm_criu.engine.image import Manifest
-from rosrm_criu.engine.probe import Ability, probe
+from rosrm_criu.engine.probe import CriuSupport, probe
 from rosrm_criu.engine.restore_result import Outcome
 
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
@@ -44,18 +44,18 @@ HOST_FACTS = {
 
 
 @functools.cache
-def _found() -> tuple[Criu | None, str]:
+def _found() -> tuple[CriuBinary | None, str]:
     """The CRIU that works here, or why there is none."""
     try:
         criu = find()
     except CriuError as error:
         return None, str(error)
-    tried: Ability = probe(criu, timeout=TIMEOUT)
+    tried: CriuSupport = probe(criu, timeout=TIMEOUT)
     return (criu, "") if tried.works else (None, tried.reason)
 
 
 @pytest.fixture
-def criu() -> Criu:
+def criu() -> CriuBinary:
     """The CRIU that works here; the test is skipped where there is none."""
     working, reason = _found()
     if working is None:
@@ -79,7 +79,7 @@ class Theatre:
         folder: of the test.
     """
 
-    def __init__(self, criu: Criu, folder: Path):
+    def __init__(self, criu: CriuBinary, folder: Path):
         self.criu, self.folder = criu, folder
         self.work = folder / "work"
         self.work.mkdir()

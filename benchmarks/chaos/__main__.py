@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.chaos import clocks, work
+from benchmarks.chaos.client_load import ClientLoad
 from benchmarks.chaos.cluster import HOSTS, LEASE_S, Cluster
-from benchmarks.chaos.errands import Errands
+from benchmarks.chaos.event_log import EventLog
 from benchmarks.chaos.faults import Round, draw
-from benchmarks.chaos.story import Story
 from benchmarks.chaos.trial import Stuck, Tally, Trial
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
@@ -61,7 +61,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> None:
     """Run the rounds in one lab; start another lab where one gets stuck."""
-    story = Story(options.seed)
+    event_log = EventLog(options.seed)
     services = list(work.services())
     names = [service.name for service in services]
     movable = [service.name for service in services if service.sort.strategy]
@@ -73,10 +73,12 @@ def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> 
         lines.mkdir(parents=True, exist_ok=True)
         try:
             with (
-                Cluster(options.lab, folder, lambda text: story.tell(text, aloud=True)) as cluster,
-                Errands(cluster.lab, folder / "desk.log", story.tell) as errands,
+                Cluster(
+                    options.lab, folder, lambda text: event_log.tell(text, aloud=True)
+                ) as cluster,
+                ClientLoad(cluster.lab, folder / "desk.log", event_log.tell) as client_load,
             ):
-                trial = Trial(cluster, errands, lines, out, story, tally)
+                trial = Trial(cluster, client_load, lines, out, event_log, tally)
                 trial.begin()
                 say(f"all is well: {len(names)} services on {len(HOSTS)} hosts")
                 for drawn in _while(rounds, options.faults, deadline, tally):

@@ -1,7 +1,7 @@
 """Judge of a lab by its live processes and their output; imports nothing from rosrm.
 
-`Oracle.amiss` returns the deviations at this moment. `Oracle.history` (by `rules`) returns those
-since the last time that there was none.
+`Oracle.deviations` returns the deviations at this moment. `Oracle.history` (by `rules`) returns
+those since the last time that there was none.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.chaos import rules
-from benchmarks.chaos.excuses import Harm, Promise
+from benchmarks.chaos.allowances import Disturbance, Guarantees
 from benchmarks.chaos.outputs import Outputs
 from benchmarks.chaos.reality import Member, members
 from benchmarks.chaos.rules import Judgement
@@ -24,7 +24,7 @@ FRESH: Final = 1.0
 
 
 @dataclass
-class Wanted:
+class AcceptedRequests:
     """The accepted requests.
 
     Attributes:
@@ -34,14 +34,14 @@ class Wanted:
         canaries: by host, the job that only it can take, submitted after all faults were undone.
     """
 
-    services: dict[str, Promise] = field(default_factory=dict)
+    services: dict[str, Guarantees] = field(default_factory=dict)
     jobs: dict[str, float] = field(default_factory=dict)
     line: list[str] = field(default_factory=list)
     canaries: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Amiss:
+class Deviation:
     """A deviation at this moment."""
 
     kind: str
@@ -61,10 +61,10 @@ class Oracle:
         counts: number of live processes, at each look.
     """
 
-    def __init__(self, lab: str, folder: Path, wanted: Wanted) -> None:
+    def __init__(self, lab: str, folder: Path, wanted: AcceptedRequests) -> None:
         self._lab = lab
         self._outputs = Outputs(folder)
-        self._wanted = wanted
+        self._accepted = wanted
         self._done: set[str] = set()
         self.counts: list[int] = []
 
@@ -76,67 +76,67 @@ class Oracle:
 
     # --- at this moment -----------------------------------------------------------------------
 
-    def amiss(self) -> list[Amiss]:
+    def deviations(self) -> list[Deviation]:
         """Return the deviations at this moment; empty: all is well."""
         now = time.monotonic()
         there: dict[str, list[Member]] = {}
         for member in self.look():
             there.setdefault(member.process, []).append(member)
-        found: list[Amiss] = []
-        for name, promise in self._wanted.services.items():
-            found += self._about_service(name, promise, there.pop(name, []), now)
-        for name in self._wanted.jobs:
+        found: list[Deviation] = []
+        for name, guarantees in self._accepted.services.items():
+            found += self._about_service(name, guarantees, there.pop(name, []), now)
+        for name in self._accepted.jobs:
             found += self._about_job(name, there.pop(name, []))
         found += [
-            Amiss("orphans", name, f"{name} is not wanted, and runs: {_told(left)}")
+            Deviation("orphans", name, f"{name} is not wanted, and runs: {_told(left)}")
             for name, left in there.items()
         ]
         return found
 
     def _about_service(
-        self, name: str, promise: Promise, there: list[Member], now: float
-    ) -> Iterator[Amiss]:
+        self, name: str, guarantees: Guarantees, there: list[Member], now: float
+    ) -> Iterator[Deviation]:
         runs = [run for run in self._outputs.read(name) if run.last > now - FRESH]
         owners = {run.instance for run in runs}
         if not runs:
-            yield Amiss("lost", name, f"{name}: nobody is active; there: {_told(there)}")
+            yield Deviation("lost", name, f"{name}: nobody is active; there: {_told(there)}")
         elif len(runs) > 1:
             active = "; ".join(map(str, runs))
-            yield Amiss("doubled", name, f"{name}: more than one is active: {active}")
+            yield Deviation("doubled", name, f"{name}: more than one is active: {active}")
         sizes = Counter(one.instance for one in there)
         extra = {instance for instance in sizes if instance not in owners}
-        allowed = int(promise.standby)
+        allowed = int(guarantees.standby)
         if len(extra) > allowed:
-            yield Amiss("orphans", name, f"{name}: not its owner, and there: {_told(there)}")
+            yield Deviation("orphans", name, f"{name}: not its owner, and there: {_told(there)}")
         elif len(extra) < allowed:
-            yield Amiss("standby", name, f"{name} has no standby: {_told(there)}")
-        elif promise.standby and len({one.host for one in there}) < 2:
-            yield Amiss("standby", name, f"{name}: its standby is on the same host")
-        if any(size != promise.members for size in sizes.values()):
-            text = f"{name}: an instance has {promise.members} processes; there: {_told(there)}"
-            yield Amiss("orphans", name, text)
+            yield Deviation("standby", name, f"{name} has no standby: {_told(there)}")
+        elif guarantees.standby and len({one.host for one in there}) < 2:
+            yield Deviation("standby", name, f"{name}: its standby is on the same host")
+        if any(size != guarantees.members for size in sizes.values()):
+            text = f"{name}: an instance has {guarantees.members} processes; there: {_told(there)}"
+            yield Deviation("orphans", name, text)
 
-    def _about_job(self, name: str, there: list[Member]) -> Iterator[Amiss]:
+    def _about_job(self, name: str, there: list[Member]) -> Iterator[Deviation]:
         if name not in self._done and any(run.told == "done" for run in self._outputs.read(name)):
             self._done.add(name)
         if name not in self._done:
-            yield Amiss("lost", name, f"the job {name} is not done; there: {_told(there)}")
+            yield Deviation("lost", name, f"the job {name} is not done; there: {_told(there)}")
         elif there:
-            yield Amiss("orphans", name, f"the job {name} is done, and runs: {_told(there)}")
+            yield Deviation("orphans", name, f"the job {name} is done, and runs: {_told(there)}")
 
-    def left(self) -> list[Amiss]:
+    def left(self) -> list[Deviation]:
         """Return the processes that still run after everything was ended."""
         found: dict[str, list[Member]] = {}
         for member in members(self._lab):
             found.setdefault(member.process, []).append(member)
         return [
-            Amiss("orphans", name, f"{name} runs on after the end: {_told(those)}")
+            Deviation("orphans", name, f"{name} runs on after the end: {_told(those)}")
             for name, those in found.items()
         ]
 
     # --- since the last time ------------------------------------------------------------------
 
-    def history(self, harms: list[Harm]) -> Judgement:
+    def history(self, disturbances: list[Disturbance]) -> Judgement:
         """Judge the time since the last call; to be called when all is well.
 
         Args:
@@ -145,27 +145,27 @@ class Oracle:
         judged = Judgement()
         reached = {
             host: runs[0].born
-            for host, name in self._wanted.canaries.items()
+            for host, name in self._accepted.canaries.items()
             if (runs := self._outputs.read(name))
         }
-        for name, promise in self._wanted.services.items():
+        for name, guarantees in self._accepted.services.items():
             chain = rules.chain(self._outputs.read(name))
-            judged.add(rules.judge_service(name, promise, chain, harms, reached))
+            judged.add(rules.judge_service(name, guarantees, chain, disturbances, reached))
             if chain:
                 self._outputs.forget(name, before=chain[-1].told_at)
-        for name, accepted in self._wanted.jobs.items():
-            judged.add(rules.judge_job(name, accepted, self._outputs.read(name), harms))
+        for name, accepted in self._accepted.jobs.items():
+            judged.add(rules.judge_job(name, accepted, self._outputs.read(name), disturbances))
         judged.violations += rules.judge_line(
-            {name: self._outputs.read(name) for name in self._wanted.line}
+            {name: self._outputs.read(name) for name in self._accepted.line}
         )
         self._forget_jobs()
         return judged
 
     def _forget_jobs(self) -> None:
         """Forget the judged jobs; a process of theirs that still appears is an orphan."""
-        self._wanted.jobs.clear()
-        self._wanted.line.clear()
-        self._wanted.canaries.clear()
+        self._accepted.jobs.clear()
+        self._accepted.line.clear()
+        self._accepted.canaries.clear()
 
     def told(self, names: list[str]) -> Mapping[str, list[str]]:
         """Return the newest runs of some processes as text, for a story."""

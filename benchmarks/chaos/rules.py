@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Final
 
-from benchmarks.chaos.excuses import (
+from benchmarks.chaos.allowances import (
     LAST_CYCLES,
     MEETING,
     OVERLOAD,
     STARTING,
-    Harm,
-    Promise,
+    Disturbance,
+    Guarantees,
     is_struck,
     may_be_lost,
     may_end,
@@ -66,7 +66,7 @@ def chain(runs: Iterable[Run]) -> list[Run]:
 
 
 def judge_service(
-    name: str, promise: Promise, chained: Sequence[Run], harms: Sequence[Harm],
+    name: str, guarantees: Guarantees, chained: Sequence[Run], disturbances: Sequence[Disturbance],
     reached: Mapping[str, float] = MappingProxyType({}),
 ) -> Judgement:  # fmt: skip
     """Judge the runs of a service.
@@ -88,12 +88,12 @@ def judge_service(
     for index, (one, following) in enumerate(itertools.pairwise(chained)):
         for other in chained[index + 1 :]:
             if _overlap(one, other) > _CROSSING:
-                judged.add(_judge_overlap(name, promise, one, other, harms, reached))
-        if not may_end(name, promise, one, harms):
+                judged.add(_judge_overlap(name, guarantees, one, other, disturbances, reached))
+        if not may_end(name, guarantees, one, disturbances):
             text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
             judged.violations.append(Violation("touched", name, text))
-        if promise.stateful:
-            judged.add(_judge_state(name, promise, one, following, harms))
+        if guarantees.stateful:
+            judged.add(_judge_state(name, guarantees, one, following, disturbances))
     return judged
 
 
@@ -103,62 +103,74 @@ def _overlap(one: Run, other: Run) -> float:
 
 
 def _judge_overlap(
-    name: str, promise: Promise, one: Run, other: Run, harms: Sequence[Harm],
+    name: str, guarantees: Guarantees, one: Run, other: Run, disturbances: Sequence[Disturbance],
     reached: Mapping[str, float],
 ) -> Judgement:  # fmt: skip
     """Judge two runs active at once: allowed in a relaunch migration, and in a partition."""
-    if any(harm.kind == "overlap" and harm.process == name for harm in harms):
+    if any(
+        disturbance.kind == "overlap" and disturbance.process == name
+        for disturbance in disturbances
+    ):
         return Judgement(allowed=Counter(overlaps=1))
     parting = [
-        harm
-        for harm in harms
-        if harm.hides and (harm.concerns(one.host) or harm.concerns(other.host))
+        disturbance
+        for disturbance in disturbances
+        if disturbance.hides
+        and (disturbance.concerns(one.host) or disturbance.concerns(other.host))
     ]
     # A fault explains it, or else an overload, which may last to the end.
-    parting = [harm for harm in parting if harm.kind != OVERLOAD] or parting
-    until = [harm.ended + _OVERLAP + (STARTING if harm.restarts else MEETING) for harm in parting]
+    parting = [disturbance for disturbance in parting if disturbance.kind != OVERLOAD] or parting
+    until = [
+        disturbance.ended + _OVERLAP + (STARTING if disturbance.restarts else MEETING)
+        for disturbance in parting
+    ]
     # On a busy machine a restarted part comes up late; the first order that it received tells when.
     until += [reached[host] + _OVERLAP for host in (one.host, other.host) if host in reached]
-    parted = promise.elsewhere and not promise.isolated
+    parted = guarantees.elsewhere and not guarantees.isolated
     if parted and parting and one.last <= max(until):
-        healed = max(harm.ended for harm in parting)
+        healed = max(disturbance.ended for disturbance in parting)
         return Judgement(allowed=Counter(partitioned=1), parted=[max(0.0, one.last - healed)])
     text = f"{name}: both active for {_overlap(one, other):.2f} s: {one} and {other}"
     return Judgement([Violation("doubled", name, text)])
 
 
 def _judge_state(
-    name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
+    name: str, guarantees: Guarantees, one: Run, following: Run, disturbances: Sequence[Disturbance]
 ) -> Judgement:
     """Judge the continuity of the numbers; a deviation gets the title of its allowance."""
     behind = one.last_number + 1 - following.first_number
     if behind == 0:
         return Judgement()
-    if behind > 0 and is_struck(name, promise, one, harms):
+    if behind > 0 and is_struck(name, guarantees, one, disturbances):
         if behind <= LAST_CYCLES:
             return Judgement(allowed=Counter(state_cycles_repeated=1))
-        if behind <= most_behind(name, promise, one, following, harms):
+        if behind <= most_behind(name, guarantees, one, following, disturbances):
             return Judgement(allowed=Counter(state_seconds_repeated=1))
-        if following.first_number == 1 and may_be_lost(promise, one, following, harms):
+        if following.first_number == 1 and may_be_lost(guarantees, one, following, disturbances):
             return Judgement(allowed=Counter(state_from_nothing=1))
-        if behind <= unkept(one, following, harms):
+        if behind <= unkept(one, following, disturbances):
             return Judgement(allowed=Counter(state_older_disk_full=1))
     text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
     return Judgement([Violation("state", name, text)])
 
 
-def judge_job(name: str, accepted: float, runs: Sequence[Run], harms: Sequence[Harm]) -> Judgement:
+def judge_job(
+    name: str, accepted: float, runs: Sequence[Run], disturbances: Sequence[Disturbance]
+) -> Judgement:
     """Judge a job: it runs at least once, and more than once only where its host was struck."""
     if len(runs) <= 1:
         return Judgement()
     hosts = {run.host for run in runs}
     excused = any(
-        harm.ended >= accepted
+        disturbance.ended >= accepted
         and (
-            harm.process == name
-            or ((harm.kills or harm.forgets) and any(harm.concerns(one) for one in hosts))
+            disturbance.process == name
+            or (
+                (disturbance.kills or disturbance.forgets)
+                and any(disturbance.concerns(one) for one in hosts)
+            )
         )
-        for harm in harms
+        for disturbance in disturbances
     )
     if excused:
         return Judgement(allowed=Counter(jobs_repeated=1))

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.chaos import work
+from benchmarks.chaos.allowances import MOVES, OVERLOAD, Disturbance, Guarantees
+from benchmarks.chaos.client_load import ClientLoad, ClientRequest
 from benchmarks.chaos.cluster import HOSTS, Cluster
-from benchmarks.chaos.errands import Errand, Errands
-from benchmarks.chaos.excuses import MOVES, OVERLOAD, Harm, Promise
+from benchmarks.chaos.event_log import EventLog
+from benchmarks.chaos.fault_injector import FaultInjector
 from benchmarks.chaos.faults import Fault, Move, Round
-from benchmarks.chaos.harm import Harmer
-from benchmarks.chaos.oracle import Amiss, Oracle, Wanted
+from benchmarks.chaos.oracle import AcceptedRequests, Deviation, Oracle
 from benchmarks.chaos.rules import Violation
-from benchmarks.chaos.story import Story
 from benchmarks.machine import say
 
 #: Seconds after the last fault was undone within which all must be well.
@@ -90,19 +90,20 @@ class Trial:
     """
 
     def __init__(
-        self, cluster: Cluster, errands: Errands, lines: Path, out: Path, story: Story,
+        self, cluster: Cluster, client_load: ClientLoad, lines: Path, out: Path,
+        event_log: EventLog,
         tally: Tally,
     ) -> None:  # fmt: skip
         self._cluster = cluster
-        self._errands = errands
+        self._client_load = client_load
         self._lines = lines
         self._out = out
-        self._story = story
+        self._event_log = event_log
         self._tally = tally
-        self._wanted = Wanted()
-        self._harmer = Harmer(cluster)
-        self._oracle = Oracle(cluster.lab.name, lines, self._wanted)
-        self._harms: list[Harm] = []
+        self._accepted = AcceptedRequests()
+        self._fault_injector = FaultInjector(cluster)
+        self._oracle = Oracle(cluster.lab.name, lines, self._accepted)
+        self._disturbances: list[Disturbance] = []
         self._services = {service.name: service for service in work.services()}
         self._guests = self._works = 0
 
@@ -111,18 +112,18 @@ class Trial:
     def begin(self) -> None:
         """Submit the services, and wait until all is well."""
         entries = [one.entry(self._lines) for one in self._services.values()]
-        promises = {name: promise_of(service) for name, service in self._services.items()}
-        self._submit(entries, lambda _: self._wanted.services.update(promises))
+        promises = {name: guarantees_of(service) for name, service in self._services.items()}
+        self._submit(entries, lambda _: self._accepted.services.update(promises))
         self._await_well(0, "the beginning", _BEGIN_S)
         self._oracle.history([])
         self._oracle.counts = self._tally.counts
 
     def end(self) -> None:
         """Cancel everything, stop the slaves, and look for orphans."""
-        names = list(self._wanted.services)
-        self._wanted.services.clear()
+        names = list(self._accepted.services)
+        self._accepted.services.clear()
         self._oracle.counts = []
-        self._errands.send(Errand({"do": "cancel", "names": names}))
+        self._client_load.send(ClientRequest({"do": "cancel", "names": names}))
         self._await_well(0, "everything was cancelled", SETTLE_S)
         self._cluster.shut_down()
         if left := self._oracle.left():
@@ -145,12 +146,16 @@ class Trial:
         self._submit_canaries(drawn.number)
         healed = time.monotonic()
         well = self._await_well(number, f"fault {number} was undone", SETTLE_S)
-        self._harms += self._harmer.take_done()
+        self._disturbances += self._fault_injector.take_done()
         self._note_load(begun)
-        judged = self._oracle.history(self._harms)
+        judged = self._oracle.history(self._disturbances)
         # A migration may outlast its round.
         recent = time.monotonic() - _MOVE
-        self._harms = [harm for harm in self._harms if harm.kind in MOVES and harm.begun > recent]
+        self._disturbances = [
+            disturbance
+            for disturbance in self._disturbances
+            if disturbance.kind in MOVES and disturbance.begun > recent
+        ]
         self._tally.allowed += judged.allowed
         self._tally.parted += judged.parted
         if judged.violations:
@@ -169,15 +174,17 @@ class Trial:
         if load > _OVERLOAD * len(os.sched_getaffinity(0)):
             self._tally.overloaded += 1
             times, everywhere = (begun, time.monotonic()), frozenset({"*"})
-            self._harms.append(Harm(OVERLOAD, *times, everywhere, hides=True, deafens=True))
+            self._disturbances.append(
+                Disturbance(OVERLOAD, *times, everywhere, hides=True, deafens=True)
+            )
 
     def _do(self, drawn: Round, begun: float) -> list[Fault]:
         """Do everything of a round at its time; return the faults that were done."""
         done: list[Fault] = []
 
         def begin(fault: Fault) -> None:
-            why_not = self._harmer.begin(fault)
-            self._story.tell(f"{fault}{': not done, ' + why_not if why_not else ''}")
+            why_not = self._fault_injector.begin(fault)
+            self._event_log.tell(f"{fault}{': not done, ' + why_not if why_not else ''}")
             if why_not:
                 self._tally.missed[f"{fault.kind}: {why_not}"] += 1
                 return
@@ -186,8 +193,8 @@ class Trial:
             due.append((begun + fault.at + fault.lasts, lambda: end(fault)))
 
         def end(fault: Fault) -> None:
-            if self._harmer.end(fault):
-                self._story.tell(f"fault {fault.number} was undone")
+            if self._fault_injector.end(fault):
+                self._event_log.tell(f"fault {fault.number} was undone")
             else:
                 due.append((time.monotonic() + _LOOK, lambda: end(fault)))
 
@@ -208,7 +215,7 @@ class Trial:
 
     def _tend(self) -> bool:
         self._cluster.tend()
-        return self._errands.collect()
+        return self._client_load.collect()
 
     def _await_well(self, number: int, what: str, timeout: float) -> float:
         """Wait until all is well; return the time since which it has been."""
@@ -216,25 +223,29 @@ class Trial:
         while steady < _STEADY:
             answered = self._tend()
             looked = time.monotonic()
-            amiss = self._oracle.amiss()
-            if answered and not amiss:
+            deviations = self._oracle.deviations()
+            if answered and not deviations:
                 since = since or looked
                 steady += 1
             else:
                 since, steady = 0.0, 0
                 if looked >= deadline:
-                    self._stuck(number, what, timeout, amiss, answered=answered)
+                    self._stuck(number, what, timeout, deviations, answered=answered)
             time.sleep(_LOOK_AT_ALL)
         return since
 
     # --- what is asked for ----------------------------------------------------------------
 
-    def _submit(self, entries: list[dict[str, Any]], accepted: Callable[[Errand], None]) -> None:
+    def _submit(
+        self, entries: list[dict[str, Any]], accepted: Callable[[ClientRequest], None]
+    ) -> None:
         self._works += 1
         # Not on the disk of the desk, which may be full.
         work_file = self._cluster.folder / f"work{self._works}.yaml"
         work_file.write_text(json.dumps({"processes": entries}))  # JSON is YAML too
-        self._errands.send(Errand({"do": "submit", "work": str(work_file)}, done=accepted))
+        self._client_load.send(
+            ClientRequest({"do": "submit", "work": str(work_file)}, done=accepted)
+        )
 
     def _submit_jobs(self, drawn: Round) -> None:
         jobs = [
@@ -252,7 +263,7 @@ class Trial:
         entries = [
             work.job(f"canary{number}_{host}", self._lines, _CANARY, host=host) for host in HOSTS
         ]
-        self._wanted.canaries.update(
+        self._accepted.canaries.update(
             {host: entry["name"] for host, entry in zip(HOSTS, entries, strict=True)}
         )
         self._submit(entries, self._accept(entries, []))
@@ -261,28 +272,34 @@ class Trial:
         """Cancel the guest, and submit the next one."""
         if self._guests:
             old = work.guest(self._guests).name
-            self._story.tell(f"{old} is cancelled")
+            self._event_log.tell(f"{old} is cancelled")
 
-            def cancelled(_: Errand) -> None:
-                self._wanted.services.pop(old)
+            def cancelled(_: ClientRequest) -> None:
+                self._accepted.services.pop(old)
 
-            self._errands.send(Errand({"do": "cancel", "names": [old]}, done=cancelled))
+            self._client_load.send(ClientRequest({"do": "cancel", "names": [old]}, done=cancelled))
         self._guests += 1
         service = work.guest(self._guests)
-        promise = {service.name: promise_of(service)}
-        self._submit([service.entry(self._lines)], lambda _: self._wanted.services.update(promise))
+        guarantees = {service.name: guarantees_of(service)}
+        self._submit(
+            [service.entry(self._lines)], lambda _: self._accepted.services.update(guarantees)
+        )
 
     def _accept(
         self, jobs: list[dict[str, Any]], line: list[dict[str, Any]]
-    ) -> Callable[[Errand], None]:
+    ) -> Callable[[ClientRequest], None]:
         sent = time.monotonic()
 
-        def accept(errand: Errand) -> None:
+        def accept(client_request: ClientRequest) -> None:
             for job in jobs:
-                self._wanted.jobs[job["name"]] = sent
-                if errand.unsure:  # a master that did not answer may have accepted them earlier
-                    self._harms.append(Harm("unsure", sent, time.monotonic(), process=job["name"]))
-            self._wanted.line += [job["name"] for job in line]
+                self._accepted.jobs[job["name"]] = sent
+                if (
+                    client_request.unsure
+                ):  # a master that did not answer may have accepted them earlier
+                    self._disturbances.append(
+                        Disturbance("unsure", sent, time.monotonic(), process=job["name"])
+                    )
+            self._accepted.line += [job["name"] for job in line]
 
         return accept
 
@@ -290,46 +307,47 @@ class Trial:
         sort = self._services[move.process].sort
         kind = "overlap" if sort.strategy == "relaunch" else "move"
         now = time.monotonic()
-        self._harms.append(Harm(kind, now, now, process=move.process))
-        self._story.tell(f"{move.process} is asked to move to {move.host}")
+        self._disturbances.append(Disturbance(kind, now, now, process=move.process))
+        self._event_log.tell(f"{move.process} is asked to move to {move.host}")
 
-        def told(errand: Errand) -> None:
-            self._story.tell(f"of the move of {move.process}: {errand.answer}")
+        def told(client_request: ClientRequest) -> None:
+            self._event_log.tell(f"of the move of {move.process}: {client_request.answer}")
 
         request = {"do": "migrate", "process": move.process, "host": move.host}
-        self._errands.send(Errand(request, persistent=False, done=told))
+        self._client_load.send(ClientRequest(request, persistent=False, done=told))
 
     # --- what went wrong ------------------------------------------------------------------
 
     def _stuck(
-        self, number: int, what: str, timeout: float, amiss: list[Amiss], *, answered: bool
+        self, number: int, what: str, timeout: float, deviations: list[Deviation], *, answered: bool
     ) -> None:
         words = f"not within {timeout:g} s after {what}"
-        violations = [Violation(one.kind, one.name, f"{one.text} ({words})") for one in amiss] or [
-            Violation("lost", "", f"the master has not answered every request, {words}")
-        ]
-        if answered or amiss:
-            self._story.tell(f"stuck: {words}")
+        violations = [
+            Violation(one.kind, one.name, f"{one.text} ({words})") for one in deviations
+        ] or [Violation("lost", "", f"the master has not answered every request, {words}")]
+        if answered or deviations:
+            self._event_log.tell(f"stuck: {words}")
         self._violated(number, violations)
         raise Stuck(words)
 
     def _violated(self, number: int, violations: list[Violation]) -> None:
         for one in violations:
             self._tally.violations[one.kind] += 1
-            self._story.tell(f"VIOLATION ({one.kind}): {one.text}", aloud=True)
+            self._event_log.tell(f"VIOLATION ({one.kind}): {one.text}", aloud=True)
         folder = self._out / f"violation-{number}-{self._tally.violations.total()}"
         names = list({one.name for one in violations if one.name})
         seen: Mapping[str, Any] = {
-            "runs": self._oracle.told(names), "harms": [_plain(harm) for harm in self._harms],
+            "runs": self._oracle.told(names),
+            "harms": [_plain(disturbance) for disturbance in self._disturbances],
             "master": self._ask_master(),
         }  # fmt: skip
-        self._story.keep(folder, self._cluster, [asdict(one) for one in violations], seen)
+        self._event_log.keep(folder, self._cluster, [asdict(one) for one in violations], seen)
         say(f"the story is in {folder}")
 
     def _ask_master(self) -> dict[str, Any]:
         """Return the master's view, for the story alone."""
-        answers: list[Errand] = []
-        self._errands.send(Errand({"do": "look"}, persistent=False, done=answers.append))
+        answers: list[ClientRequest] = []
+        self._client_load.send(ClientRequest({"do": "look"}, persistent=False, done=answers.append))
         deadline = time.monotonic() + 20.0
         while not answers and time.monotonic() < deadline:
             self._tend()
@@ -337,14 +355,14 @@ class Trial:
         return answers[0].answer if answers else {"no_master": "no answer in 20 s"}
 
 
-def promise_of(service: work.Service) -> Promise:
+def guarantees_of(service: work.Service) -> Guarantees:
     """Return the promises by which the oracle judges a service."""
     sort = service.sort
-    return Promise(
+    return Guarantees(
         sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated,
         kept=sort.stateful, copied=work.COPIED if sort.stateful else 0,
     )  # fmt: skip
 
 
-def _plain(harm: Harm) -> dict[str, Any]:
-    return {**asdict(harm), "hosts": sorted(harm.hosts)}
+def _plain(disturbance: Disturbance) -> dict[str, Any]:
+    return {**asdict(disturbance), "hosts": sorted(disturbance.hosts)}

@@ -91,7 +91,7 @@ class LabCluster:
         self._parts: list[Part] = []
         self._works = 0
         self._opened = ExitStack()
-        self._desk: Desk | None = None
+        self._desk: LabClient | None = None
 
     def __enter__(self) -> Self:
         """Make the hosts, and start master and desk."""
@@ -99,7 +99,7 @@ class LabCluster:
             opened.enter_context(self.lab)
             settings = self._write("cluster.yaml", self._settings)
             self._start("master", DESK, [_ROSRM, "master", "--config", settings])
-            self._desk = opened.enter_context(Desk(self._start_desk, self._check))
+            self._desk = opened.enter_context(LabClient(self._start_desk, self._check))
             self._opened = opened.pop_all()
         return self
 
@@ -299,7 +299,7 @@ def _shown(look: Look) -> bool:
     )
 
 
-class Desk:
+class LabClient:
     """The program on the desk that is a client of the master.
 
     Args:

@@ -34,7 +34,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from rosrm import Snapshot
+from rosrm import Listing
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,
@@ -148,7 +148,7 @@ def _carry_out(live: LiveDrive, record: Record, directory: Path, stage: Stage) -
     with closing(Observer(cluster.ros)) as observer:
         script = MigrationScript(live, observer)
 
-        def line(view: Snapshot) -> str:
+        def line(view: Listing) -> str:
             return f"{memory_line(view)}   {script.progress(view)}"
 
         screen = screen_for(stage.console, script.progress, line)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm import EventRow, ProcessRow, Snapshot
+from rosrm import EventRow, Listing, ProcessRow
 
 SAMPLES_FILE: Final = "samples.json"
 EVENTS_FILE: Final = "events.jsonl"
@@ -64,7 +64,7 @@ class Record:
     samples: list[Sample] = field(default_factory=list)
     events: list[EventRow] = field(default_factory=list)
 
-    def add(self, view: Snapshot) -> None:
+    def add(self, view: Listing) -> None:
         """Add a view with hosts, processes and the events since the last one."""
         self.samples.append(sample_of(view))
         self.events.extend(view.events)
@@ -134,7 +134,7 @@ class Record:
         )
 
 
-def sample_of(view: Snapshot) -> Sample:
+def sample_of(view: Listing) -> Sample:
     """Return the usages and the counts of a view."""
     usage: dict[str, dict[str, float | None]] = {}
     for host in view.hosts:

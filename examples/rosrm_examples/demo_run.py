@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, Protocol
 
-from rosrm import Client, InstanceId, ProcessRow, RosrmError, Snapshot
+from rosrm import Client, InstanceId, Listing, ProcessRow, RosrmError
 from rosrm.supervisor.client import log_path
 from rosrm.testing.local_cluster import LocalCluster, Part
 from rosrm_examples.demo_job import Arrival
@@ -66,7 +66,7 @@ class Script(Protocol):
     def act(self, client: Client, elapsed: float) -> None:
         """Do the actions that are due, `elapsed` seconds after the beginning; called repeatedly."""
 
-    def is_over(self, view: Snapshot) -> bool:
+    def is_over(self, view: Listing) -> bool:
         """Return True if nothing is left to do or to wait for, by hosts and processes."""
 
 
@@ -81,7 +81,7 @@ class Arrivals:
         while self._left and self._left[0].at <= elapsed:
             client.submit(self._left.pop(0).specs)
 
-    def is_over(self, view: Snapshot) -> bool:
+    def is_over(self, view: Listing) -> bool:
         """Return True if all processes have been submitted and have ended."""
         return not self._left and all(row.state in OVER for row in view.processes)
 
@@ -126,7 +126,7 @@ class Demo:
             self._cluster.start_slave(host)
         self._cluster.wait_until("every host accepting work", self._all_accept, _START_S)
 
-    def _all_accept(self, view: Snapshot) -> bool:
+    def _all_accept(self, view: Listing) -> bool:
         self._signals.check()
         return sum(row.accepting for row in view.hosts) == len(self._cluster.hosts)
 
@@ -148,7 +148,7 @@ class Demo:
                 next_look = max(next_look + _SAMPLE_S, elapsed)
             self._cluster.client.spin(_SPIN_S)
 
-    def _look(self, elapsed: float) -> Snapshot:
+    def _look(self, elapsed: float) -> Listing:
         view = self._cluster.client.list(
             hosts=True, processes=True, events=True, after=self.record.last_sequence
         )

@@ -10,7 +10,7 @@ from typing import Final, Protocol, TypeAlias
 from rich.console import Console
 from rich.live import Live
 
-from rosrm import EventRow, ProcessRow, Snapshot
+from rosrm import EventRow, Listing, ProcessRow
 from rosrm.cli.output.top import render
 from rosrm_examples.demo_job import count_by_kind
 from rosrm_examples.demo_record import RUNNING, sample_of
@@ -25,7 +25,7 @@ _LINE_EVERY_S: Final = 3.0
 class Screen(Protocol):
     """A display of the progress of a demo."""
 
-    def show(self, view: Snapshot, elapsed: float) -> None:
+    def show(self, view: Listing, elapsed: float) -> None:
         """Show a view, `elapsed` seconds after the beginning."""
 
     def close(self) -> None:
@@ -33,7 +33,7 @@ class Screen(Protocol):
 
 
 #: Text for a view, in one line.
-Words: TypeAlias = Callable[[Snapshot], str]
+Words: TypeAlias = Callable[[Listing], str]
 
 
 def screen_for(console: Console, note: Words | None = None, line: Words | None = None) -> Screen:
@@ -57,7 +57,7 @@ class LiveScreen:
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._events: deque[EventRow] = deque(maxlen=_EVENTS)
 
-    def show(self, view: Snapshot, elapsed: float) -> None:  # noqa: ARG002 - the table has a clock
+    def show(self, view: Listing, elapsed: float) -> None:  # noqa: ARG002 - the table has a clock
         """Update the table."""
         self._events.extend(view.events)
         rows = max(_FEWEST_ROWS, self._console.height - _OTHER_LINES)
@@ -79,7 +79,7 @@ class LineScreen:
         self._line = line
         self._next = 0.0
 
-    def show(self, view: Snapshot, elapsed: float) -> None:
+    def show(self, view: Listing, elapsed: float) -> None:
         """Print new migrations, and the line when it is due."""
         for event in view.events:
             if event.kind in ("migration_begun", "over_limit"):
@@ -95,7 +95,7 @@ class LineScreen:
         """Do nothing: printed lines stay."""
 
 
-def note_of(view: Snapshot) -> str:
+def note_of(view: Listing) -> str:
     """Return the phase of the demo, in a few words."""
     runs = count_by_kind([row.name for row in view.processes if row.state in RUNNING])
     if runs["piece"]:
@@ -107,14 +107,14 @@ def note_of(view: Snapshot) -> str:
     return ""
 
 
-def line_of(view: Snapshot) -> str:
+def line_of(view: Listing) -> str:
     """Return the line `memory 41 40 42 %   9 pieces and 8 holders run, 3 wait, 12 finished`."""
     waiting = sum(row.state == "queued" for row in view.processes)
     finished = sum(row.state == "finished" for row in view.processes)
     return f"{memory_line(view)}   {_run(view.processes)}, {waiting} wait, {finished} finished"
 
 
-def memory_line(view: Snapshot) -> str:
+def memory_line(view: Listing) -> str:
     """Return `memory 41 40 42 %`, in the order of the hosts."""
     memory = sample_of(view).usage.get("memory", {})
     used = " ".join("  ?" if value is None else f"{100 * value:3.0f}" for value in memory.values())

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from rosrm import Client, Kind, MigrationPolicy, ProcessRow, ProcessSpec, Snapshot
+from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessRow, ProcessSpec
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
 from rosrm_examples.demo_job import MEMORY_LIMIT
 from rosrm_examples.drives import Drive
@@ -190,7 +190,7 @@ class MigrationScript:
         slam = self._rows.get(SLAM)
         return slam is not None and slam.state == "running" and self._observer.publishers() > 0
 
-    def is_over(self, view: Snapshot) -> bool:
+    def is_over(self, view: Listing) -> bool:
         """Return True if the player has ended, and all poses were received or no more come."""
         self._rows = {row.name: row for row in view.processes}
         player = self._rows.get(PLAYER)
@@ -199,7 +199,7 @@ class MigrationScript:
         quiet = self._elapsed - self._quiet_since
         return self._heard >= len(self._live.drive) or quiet >= _QUIET_S
 
-    def progress(self, view: Snapshot) -> str:
+    def progress(self, view: Listing) -> str:
         """Return the progress of the drive, and the host that maps it."""
         slam = next((row for row in view.processes if row.name == SLAM), None)
         if slam is None:

@@ -13,7 +13,7 @@ from rosrm_examples.arrays import Floats, Keys
 from rosrm_examples.drives import Drive
 from rosrm_examples.map_part import MapPart
 from rosrm_examples.merge import end_error_percent
-from rosrm_examples.observer import Heard
+from rosrm_examples.observer import ReceivedPose
 from rosrm_examples.slam import Slam
 from rosrm_examples.stamps import nanoseconds_of, seconds_of, stamp_of
 
@@ -35,7 +35,7 @@ class LiveRun:
 
     drive: Drive
     sent: int
-    heard: Sequence[Heard]
+    heard: Sequence[ReceivedPose]
     parts: Sequence[MapPart]
     period: float
 
@@ -48,9 +48,9 @@ class LiveRun:
         played = np.array([seconds_of(stamp_of(float(t))) for t in self.drive.times])
         return np.searchsorted(played, part.times).astype(np.int64)
 
-    def by_stamp(self) -> dict[int, Heard]:
+    def by_stamp(self) -> dict[int, ReceivedPose]:
         """Return the first received pose of each scan."""
-        first: dict[int, Heard] = {}
+        first: dict[int, ReceivedPose] = {}
         for one in self.heard:
             first.setdefault(one.stamp, one)
         return first

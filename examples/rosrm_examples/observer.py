@@ -23,7 +23,7 @@ _LOOK_S: Final = 0.1
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReceivedPose:
     """One pose that was published.
 
     Attributes:
@@ -49,7 +49,7 @@ class Observer:
     def __init__(self, ros: RosSettings) -> None:
         """Subscribe."""
         os.environ.update(ros.environment())
-        self.heard: list[Heard] = []
+        self.heard: list[ReceivedPose] = []
         self._context = rclpy.Context()
         rclpy.init(
             context=self._context,
@@ -78,7 +78,7 @@ class Observer:
     def _take(self, message: Odometry, information: dict[str, Any]) -> None:
         arrived = information["received_timestamp"] / 1e9
         stamp = nanoseconds_of(message.header.stamp)
-        self.heard.append(Heard(arrived, stamp, pose_of(message)))
+        self.heard.append(ReceivedPose(arrived, stamp, pose_of(message)))
 
     def close(self) -> None:
         """Unsubscribe, and end the thread."""

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 from rosrm.cli import early
-from rosrm.cli.options import Common
+from rosrm.cli.options import CommonOptions
 from rosrm.cli.process import BEGUN
 from rosrm.client import connecting
 from rosrm.model.ros_settings import RosSettings
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
-    from rosrm.model.rows import Snapshot
+    from rosrm.model.rows import Listing
     from rosrm.ros.client import MasterClient
 
 #: Seconds from the start of the command until the message that there is no master: less than 3,
@@ -32,7 +32,7 @@ def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
 
     The option of the command comes before the common options, and these before the file.
     """
-    common = ctx.obj if isinstance(ctx.obj, Common) else Common()
+    common = ctx.obj if isinstance(ctx.obj, CommonOptions) else CommonOptions()
     chosen = common.domain if domain is None else domain
     return connecting.ros_settings(chosen, common.cluster)
 
@@ -51,7 +51,7 @@ def note(text: str) -> None:
     typer.echo(f"rosrm: {text}", err=True)
 
 
-def say_trouble(snapshot: Snapshot) -> None:
+def say_trouble(snapshot: Listing) -> None:
     """Print beside the listing that the master accepts no new work, and why."""
     if snapshot.trouble:
         note(snapshot.trouble)

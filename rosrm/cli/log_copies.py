@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from rosrm.cli.output.log_lines import Piece, Stream, show
+from rosrm.cli.output.log_lines import LogStream, Piece, show
 from rosrm.client.logs import PERIOD, LogReader, LogSelection
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.units import Quantity
@@ -29,7 +29,7 @@ def since_of(text: str) -> float:
     return time.time() - ago if ago else 0.0
 
 
-def copy_logs(client: Client, streams: Sequence[Stream], selection: LogSelection) -> None:
+def copy_logs(client: Client, streams: Sequence[LogStream], selection: LogSelection) -> None:
     """Copy the logs of processes to standard output by the times of their lines; follow all.
 
     An unreachable log is reported at once, and the others are copied.
@@ -42,7 +42,7 @@ def copy_logs(client: Client, streams: Sequence[Stream], selection: LogSelection
     # `merge` takes the earliest of the next pieces; one without a time follows its predecessor.
     show(merge(*(copy.begin() for copy in copies), key=itemgetter(0)))
     if selection.follow:
-        _follow([copy for copy in copies if not copy.reader.over])
+        _follow([copy for copy in copies if not copy.reader.at_end])
     if exit_code := max(copy.exit_code for copy in copies):
         raise typer.Exit(exit_code)
 
@@ -53,10 +53,10 @@ def _follow(copies: Sequence[_Copy]) -> None:
         news = False
         for copy in copies:
             news = copy.poll() or news
-            if copy.reader.over:
+            if copy.reader.at_end:
                 copy.stream.close()
             show(copy.stream.take())
-        copies = [copy for copy in copies if not copy.reader.over]
+        copies = [copy for copy in copies if not copy.reader.at_end]
         if copies and not news:
             time.sleep(PERIOD)
 
@@ -72,7 +72,7 @@ class _Copy:
     """
 
     reader: LogReader
-    stream: Stream
+    stream: LogStream
     exit_code: int = 0
 
     def begin(self) -> Iterator[Piece]:
@@ -83,7 +83,7 @@ class _Copy:
                 yield from self.stream.take()
         except RosrmError as error:
             self._fail(error)
-        if self.reader.over or not self.reader.selection.follow:
+        if self.reader.at_end or not self.reader.selection.follow:
             self.stream.close()
         yield from self.stream.take()
 
@@ -100,5 +100,5 @@ class _Copy:
 
     def _fail(self, error: RosrmError) -> None:
         """Report that the log cannot be read any further."""
-        self.reader.over, self.exit_code = True, error.exit_code
+        self.reader.at_end, self.exit_code = True, error.exit_code
         typer.echo(f"rosrm: {error}", err=True)

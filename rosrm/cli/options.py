@@ -12,7 +12,7 @@ from rosrm.model.ros_settings import HIGHEST_DOMAIN
 
 
 @dataclass(frozen=True)
-class Common:
+class CommonOptions:
     """Options given before the command's name."""
 
     domain: int | None = None

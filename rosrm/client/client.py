@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from rosrm.client.logs import LogChunk, LogReader, LogSelection
     from rosrm.client.waiting import OnChange, Until, WaitResult
-    from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, Snapshot
+    from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
     from rosrm.ros.client import MasterClient
 
 #: A work file by its path, a process as a work file has it, or a spec.
@@ -139,7 +139,7 @@ class Client:
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
         host: str = "", after: int = 0, newest: int = 0,
-    ) -> Snapshot:  # fmt: skip
+    ) -> Listing:  # fmt: skip
         """Return the listings that are asked for, in one request.
 
         Args:
@@ -239,11 +239,11 @@ class Client:
         selection = logs.LogSelection(tail, since, host, follow)
         (reader,) = self.log_readers([process], selection)
         yield from reader.read()
-        while follow and not reader.over and time.monotonic() < deadline:
+        while follow and not reader.at_end and time.monotonic() < deadline:
             chunk = reader.poll()
             if chunk is not None:
                 yield chunk
-            elif not reader.over:
+            elif not reader.at_end:
                 time.sleep(logs.PERIOD)
 
     def log_readers(self, processes: Sequence[str], selection: LogSelection) -> Sequence[LogReader]:

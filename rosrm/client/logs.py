@@ -17,7 +17,7 @@ from rosrm.errors import NoMaster, Refused
 from rosrm.wording import duration, listed, no_such, standing, standing_for
 
 if TYPE_CHECKING:
-    from rosrm.model.rows import HostRow, LogPart, ProcessRow, Snapshot
+    from rosrm.model.rows import HostRow, Listing, LogPart, ProcessRow
     from rosrm.ros.client import MasterClient
 
 _PART: Final = 256 * 1024
@@ -82,7 +82,7 @@ class LogReader:
         selection: of the log.
         notify: takes messages about unreachable parts, and about a log without output.
         silent: hosts that did not answer, with the error; readers that share it ask each once.
-        over: no more output can follow.
+        at_end: no more output can follow.
     """
 
     master: MasterClient
@@ -90,7 +90,7 @@ class LogReader:
     selection: LogSelection
     notify: Notify
     silent: dict[str, str] = field(default_factory=dict)
-    over: bool = False
+    at_end: bool = False
     _host: str = ""
     _number: int = 0
     _offset: int = 0
@@ -226,7 +226,7 @@ class LogReader:
 
     def _ask(self) -> tuple[str, ProcessRow | None, dict[str, HostRow], list[str]]:
         name = self.process
-        listed: Snapshot = self.master.list(
+        listed: Listing = self.master.list(
             hosts=True, processes=True, events=True, process=name, newest=_EVENTS
         )
         row = next((row for row in listed.processes if row.name == name), None)
@@ -268,7 +268,7 @@ class LogReader:
         """Return the beginning of the next instance; None if there is none, or none yet."""
         _, row, _, _ = self._ask()
         if row is None or row.state in ENDED or self.selection.host:
-            self.over = True
+            self.at_end = True
             return None
         if not row.number or not row.host or (row.host, row.number) == (self._host, self._number):
             return None
@@ -287,7 +287,7 @@ def _up_to(end: int, part: LogPart) -> LogPart:
     return replace(part, content=part.content[: end - part.offset], next_offset=end)
 
 
-def _hosts_of(listed: Snapshot) -> list[str]:
+def _hosts_of(listed: Listing) -> list[str]:
     """Return the hosts that the events of a process name, the newest first."""
     hosts: list[str] = []
     for event in reversed(listed.events):

@@ -72,7 +72,7 @@ class ScoringChoice:
 
 
 @dataclass(frozen=True, slots=True)
-class CheckpointChoice:
+class CheckpointPolicySettings:
     """Name and options of the policy for replicas on other hosts; None: no replication."""
 
     policy: str | None = "other-host"
@@ -217,7 +217,7 @@ class ClusterConfig:
     control: ControlSettings = field(default_factory=ControlSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
-    checkpoint: CheckpointChoice = field(default_factory=CheckpointChoice)
+    checkpoint: CheckpointPolicySettings = field(default_factory=CheckpointPolicySettings)
     delivery_timeout: PositiveSeconds = _CORE.delivery_timeout
 
     def __post_init__(self) -> None:

@@ -60,7 +60,7 @@ _log = logging.getLogger("rosrm.plugins")
 
 
 @dataclass(frozen=True)
-class Source:
+class PluginSource:
     """Origin of a plugin: its entry point's name, its distribution's name and version."""
 
     plugin: str
@@ -76,14 +76,14 @@ class Offered:
 
     kind: PluginKind
     offer: Offer
-    source: Source
+    source: PluginSource
 
 
 @dataclass(frozen=True)
 class Broken:
     """A fault of a plugin or offer; `kind` and `name` are "" where unknown."""
 
-    source: Source
+    source: PluginSource
     reason: str
     kind: PluginKind | Literal[""] = ""
     name: str = ""
@@ -101,7 +101,7 @@ def load_addresses(addresses: Iterable[PluginAddress]) -> Loaded:
     """Load every plugin of an installation."""
     loaded = Loaded([], [])
     for address in addresses:
-        source = Source(address.name, address.distribution)
+        source = PluginSource(address.name, address.distribution)
         _load(loaded, source, address.target, partial(resolve_name, address.target))
     return loaded
 
@@ -110,7 +110,7 @@ def load_objects(plugins: Mapping[str, object]) -> Loaded:
     """Load modules or objects as plugins, by name, without an installation (for tests)."""
     loaded = Loaded([], [])
     for name, plugin in plugins.items():
-        _load(loaded, Source(name), name, lambda plugin=plugin: plugin)  # type: ignore[misc]
+        _load(loaded, PluginSource(name), name, lambda plugin=plugin: plugin)  # type: ignore[misc]
     return loaded
 
 
@@ -123,7 +123,7 @@ def definition(function: object) -> str:
         return ""
 
 
-def _in_time(source: Source, what: str, call: Callable[[], T]) -> T:
+def _in_time(source: PluginSource, what: str, call: Callable[[], T]) -> T:
     """Return the answer of plugin code; name it in the log when it is slow, end it when it hangs.
 
     Raises:
@@ -146,7 +146,7 @@ def _in_time(source: Source, what: str, call: Callable[[], T]) -> T:
         timer.cancel()
 
 
-def _load(loaded: Loaded, source: Source, target: str, load: Callable[[], object]) -> None:
+def _load(loaded: Loaded, source: PluginSource, target: str, load: Callable[[], object]) -> None:
     try:
         plugin = _in_time(source, f"the import of {target}", load)
         marked = _marked(plugin)
@@ -186,7 +186,7 @@ def _misspelt(plugin: object, marked: Mapping[str, Callable[..., Any]]) -> Itera
             yield f"{hook} ({where}) lacks the mark @hookimpl of rosrm.extensions.hookspecs"
 
 
-def _take(loaded: Loaded, source: Source, hook: str, function: Callable[..., Any]) -> None:
+def _take(loaded: Loaded, source: PluginSource, hook: str, function: Callable[..., Any]) -> None:
     kind, wanted = HOOKS[hook]
     place = f"{hook} ({definition(function)})"
     try:

@@ -5,7 +5,7 @@ plugin state  recorded event, and the next state
 ============  ============================================================================
 selected      a call raises, is late, or breaks the contract by its answer: `failing`
 failing       a call fails with an error other than the last recorded one: at most one record in
-              `TOLD_AGAIN` seconds
+              `RECORD_PERIOD` seconds
 failing       a call is good, and no call has failed for `WORKS_AFTER` seconds: `selected`
 ============  ============================================================================
 """
@@ -41,7 +41,7 @@ TITLES: Final[Mapping[PluginKind, str]] = {
 #: that fails for every second process would be recorded with each of them.
 WORKS_AFTER: Final = 10.0
 #: Seconds between two records of one plugin's errors. An error may name what differs in each call.
-TOLD_AGAIN: Final = 60.0
+RECORD_PERIOD: Final = 60.0
 
 
 @dataclass(slots=True)
@@ -57,15 +57,15 @@ class Failing:
     error: str = ""
     count: int = 0
     last: float = -inf
-    _told: str = ""
-    _told_at: float = -inf
+    _recorded: str = ""
+    _recorded_at: float = -inf
 
     def note(self, error: str, count: int, now: float) -> bool:
         """Note the newest error; return True if it is to be recorded."""
         self.error, self.count, self.last = error, self.count + count, now
-        if error == self._told or now - self._told_at < TOLD_AGAIN:
+        if error == self._recorded or now - self._recorded_at < RECORD_PERIOD:
             return False
-        self._told, self._told_at = error, now
+        self._recorded, self._recorded_at = error, now
         return True
 
     @property

@@ -37,7 +37,7 @@ from rosrm.extensions.discovery import (
     Loaded,
     Offer,
     Offered,
-    Source,
+    PluginSource,
     definition,
     load_addresses,
     load_objects,
@@ -573,7 +573,7 @@ class Registry:
         return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
 
 
-def _is_named_like(source: Source, name: str) -> bool:
+def _is_named_like(source: PluginSource, name: str) -> bool:
     """Return True if a broken plugin without known offers may have one of this name."""
     words = {word for text in (source.plugin, source.distribution) for word in _words(text)}
     return bool(words & set(_words(name))) or bool(get_close_matches(name, [source.plugin], 1))

@@ -14,28 +14,29 @@ _OTHER_STATE = "give the master another `state:`"
 def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
     """Return the error for the user; a `JournalBlocked` where the failure may pass."""
     text = str(error)
-    said = f"the journal {path} cannot be used ({text}); "
+    beginning = f"the journal {path} cannot be used ({text}); "
     if path.is_dir():
-        return JournalError(f"{said}it is a directory: move it away, or {_OTHER_STATE}")
+        return JournalError(f"{beginning}it is a directory: move it away, or {_OTHER_STATE}")
     if "full" in text or "No space" in text or "quota" in text:
         where = room_for(path)
         where = f" ({where})" if where else ""
-        return JournalBlocked(f"{said}the disk is full{where}: make room; {_NOTHING_LOST}")
+        return JournalBlocked(f"{beginning}the disk is full{where}: make room; {_NOTHING_LOST}")
     if "I/O" in text:
         return JournalBlocked(
-            f"{said}writing to the disk fails: make room, check quotas and the "
+            f"{beginning}writing to the disk fails: make room, check quotas and the "
             f"disk itself; {_NOTHING_LOST}"
         )
     if "unable to open" in text or "readonly" in text or isinstance(error, OSError):
         return JournalBlocked(
-            f"{said}check owner and permissions of the file, its folder and the files beside "
+            f"{beginning}check owner and permissions of the file, its folder and the files beside "
             f"it (-wal, -shm), or {_OTHER_STATE}"
         )
     if "locked" in text:
         return JournalBlocked(
-            f"{said}another program has it open: does a second master use this state directory?"
+            f"{beginning}another program has it open: does a second master use this state "
+            "directory?"
         )
-    return JournalError(said + DAMAGED)
+    return JournalError(beginning + DAMAGED)
 
 
 _NOTHING_LOST = "no acknowledged request is lost"

@@ -200,7 +200,7 @@ def _put_right(found: _Found) -> None:
     """Restore the rows that the remaining intents depend on and that may be lost."""
     hosts = {key for table, key in found.intents if table == "host"}
     ids = [int(found.intents["host", name].get("host_id", 0)) for name in hosts]
-    largest = _largest_told(found)
+    largest = _largest_reported(found)
     for (table, _), process in list(found.intents.items()):
         if table != "process":
             continue
@@ -216,7 +216,7 @@ def _put_right(found: _Found) -> None:
     epoch["boot"] = "recovered"  # as after a reboot: all hosts report before work is assigned
 
 
-def _largest_told(found: _Found) -> int:
+def _largest_reported(found: _Found) -> int:
     """Return the largest instance number in the events, those of ended instances included.
 
     A supervisor that has forgotten the end of a number refuses to start any number up to it.
@@ -225,8 +225,8 @@ def _largest_told(found: _Found) -> int:
     for event in found.events.values():
         with contextlib.suppress(ValueError, TypeError):
             facts = dict(json.loads(event[7]))
-            told = [facts[name] for name in _NUMBERS if type(facts.get(name)) is int]
-            largest = max([largest, *(number for number in told if number < _NO_NUMBER)])
+            reported = [facts[name] for name in _NUMBERS if type(facts.get(name)) is int]
+            largest = max([largest, *(number for number in reported if number < _NO_NUMBER)])
     return largest
 
 

@@ -12,7 +12,7 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import sys
 
-from rosrm.config.settings import CheckpointChoice, ClusterConfig
+from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
 from rosrm.extensions.registry import Registry
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
@@ -41,7 +41,7 @@ def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:
     A policy that a file names was checked before, but the default may be missing.
     """
     policy = config.checkpoint.policy
-    is_default = policy == CheckpointChoice().policy
+    is_default = policy == CheckpointPolicySettings().policy
     return None if is_default and policy not in registry.names("checkpoint") else policy
 
 

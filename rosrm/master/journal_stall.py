@@ -36,7 +36,7 @@ _DROPPED: Final = (happened.TimePassed, happened.UsagesReceived, happened.PeerRe
 
 
 @dataclass(slots=True)
-class Standstill:
+class JournalStall:
     """Journal stall, from the first failed write of a group until the write succeeds.
 
     Attributes:

@@ -40,16 +40,16 @@ class Deadlines:
 
     def __call__(self, plugin: Plugin, call: Callable[[], T]) -> T:
         """Return the answer of a call; raises `PluginError` or the plugin's own exception."""
-        late_at, told = self._late.get(plugin, (float("-inf"), ""))
+        late_at, fault_text = self._late.get(plugin, (float("-inf"), ""))
         began = time.monotonic()
         if began - late_at < self._pause:
-            raise PluginError(told)
+            raise PluginError(fault_text)
         try:
             return limited(self._seconds, call, partial(self._expired, plugin))
         except TimeoutError as fault:
             if plugin in self._late:  # name the code that was running at the deadline
-                told = describe_plugin_fault(fault)
-                self._late[plugin] = (self._late[plugin][0], told)
+                fault_text = describe_plugin_fault(fault)
+                self._late[plugin] = (self._late[plugin][0], fault_text)
             raise
         except KeyboardInterrupt as fault:  # of the plugin: Ctrl-C raises nothing in a master
             raise PluginError(describe_plugin_fault(fault)) from fault

@@ -12,12 +12,12 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.extensions.contracts import StoredRecord
 from rosrm.journal.sqlite import SqliteJournal
-from rosrm.model.rows import EventRow, PluginRow, Snapshot
+from rosrm.model.rows import EventRow, Listing, PluginRow
 
 _DEFAULT_EVENTS: Final = 1000
 
 
-class Reading:
+class MasterQueries:
     """Answers to read-only requests.
 
     Args:
@@ -42,11 +42,11 @@ class Reading:
         self._core_now = core_now
         self._trouble = trouble
 
-    def snapshot(self, request: Any) -> Snapshot:
+    def snapshot(self, request: Any) -> Listing:
         """Return the requested listings."""
         now = self._core_now()
         state = self._state
-        return Snapshot(
+        return Listing(
             master=self._master,
             uptime=self._uptime(),
             last_sequence=self._journal.last_sequence,

@@ -118,7 +118,7 @@ class Recorder:
                 self._file.write(frame(FrameKind.END, self._why.encode()))
         except Exception as fault:  # noqa: BLE001 - whatever it is, it must not go unseen
             self._why = self._why or "failed"
-            _log.warning("the record %s ends here: %s", self.path, _told(fault))
+            _log.warning("the record %s ends here: %s", self.path, _describe(fault))
         finally:
             self._forget()
 
@@ -128,7 +128,7 @@ class Recorder:
             try:
                 written = _encoded(noted)
             except Exception as fault:  # noqa: BLE001 - a bug in here is no reason to lose the rest
-                self._end(f"failed: {_told(fault)}, at {type(noted.event).__name__}")
+                self._end(f"failed: {_describe(fault)}, at {type(noted.event).__name__}")
                 return
             if self._size + len(written) > self._max_size:
                 self._end(f"full: it has reached `record.max_size`, {self._max_size} bytes")
@@ -168,7 +168,7 @@ def _encoded(noted: _Noted) -> bytes:
     return written
 
 
-def _told(fault: Exception) -> str:
+def _describe(fault: Exception) -> str:
     """Return a description of an exception."""
     if isinstance(fault, OSError):
         return fault.strerror or str(fault)

@@ -42,16 +42,16 @@ from rosrm.extensions.contracts import (
 from rosrm.extensions.declared_fields import Declared
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
-from rosrm.master.journal_stall import Standstill
+from rosrm.master.journal_stall import JournalStall
 from rosrm.master.plugin_deadline import Deadlines
-from rosrm.master.queries import Reading
+from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.client import find_master
 from rosrm.ros.master.endpoint import MasterEndpoint
-from rosrm.ros.master.services import Identity
+from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.participant import Participant
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
@@ -114,7 +114,7 @@ class MasterRuntime:
         self._started = time.monotonic()
         self._stopping = ""
         self._recorder: Recorder | None = None
-        self._held: Standstill | None = None
+        self._held: JournalStall | None = None
         self._deadlines = Deadlines()
         self._behind = 0.0  # seconds that the core's clock is behind, after blocked time
         self._closing = contextlib.ExitStack()
@@ -157,14 +157,14 @@ class MasterRuntime:
         )  # fmt: skip
         state.plugins.limit = self._deadlines
         state.wall = time.time()
-        state.keeping.policy = self._checkpoint
-        state.keeping.policy_name = self._config.checkpoint.policy or ""
+        state.replication.policy = self._checkpoint
+        state.replication.policy_name = self._config.checkpoint.policy or ""
         now = self._now()
         try:
             restore.restore(state, self._journal.intents, now)
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
-        journal_gap.begin(state, newest, now, fell=fell)
+        journal_gap.begin(state, newest, now, machine_rebooted=fell)
         started = f"master {self._config.name} started, epoch {epoch}"
         self._journal.write(
             [Record(EventKind.MASTER_STARTED, message=started)],
@@ -193,8 +193,8 @@ class MasterRuntime:
         if wanted.directory == Path():
             return
         intents = {table: self._journal.intents(table) for table in TABLES}
-        tail = {"newest": state.tail.newest, "fell": state.tail.fell}
-        intents["cluster"] = {**intents["cluster"], "tail": tail}
+        gap = {"newest": state.journal_gap.newest, "fell": state.journal_gap.machine_rebooted}
+        intents["cluster"] = {**intents["cluster"], "tail": gap}
         header = Header(
             __version__, config.name, json.loads(config.to_json()), state.epoch, now, intents
         )
@@ -206,12 +206,12 @@ class MasterRuntime:
             self._recorder.close(f"the master stopped: {self._stopping or 'it failed'}")
 
     def _new_endpoint(self) -> MasterEndpoint:
-        identity = Identity(
+        identity = MasterIdentity(
             self._config.name, socket.gethostname(), os.getpid(), self._state.epoch,
             int.from_bytes(os.urandom(7), "big") | 1,
         )  # fmt: skip
         control = self._config.control
-        reading = Reading(
+        reading = MasterQueries(
             self._config.name, self._state, self._journal, self._plugins,
             uptime=lambda: self._now() - self._started,
             core_now=lambda: self._core_now(self._now()),
@@ -241,7 +241,7 @@ class MasterRuntime:
                 if now >= next_beat:
                     next_beat = now + self._config.control.beat_period
                     self._endpoint.beat(
-                        now - self._started, self._state.hosts.unheard(),
+                        now - self._started, self._state.hosts.silent_hosts(),
                         self._journal.last_sequence,
                     )  # fmt: skip
                 self._take_in(now)
@@ -323,14 +323,14 @@ class MasterRuntime:
         try:
             stored = self._write(records, intents) if records or intents else ()
         except JournalBlocked as fault:
-            self._held = Standstill(commands, str(fault), now, self._core_now(now), now)
+            self._held = JournalStall(commands, str(fault), now, self._core_now(now), now)
             _log.error(
                 "%s. Running processes continue; the master accepts no new work until then", fault
             )
             return
         self._act_on(commands, stored, now)
 
-    def _write_held(self, held: Standstill, now: float) -> bool:
+    def _write_held(self, held: JournalStall, now: float) -> bool:
         """Retry to write the commands of a journal stall; return False if that fails again."""
         if now - held.tried < _TRY_AGAIN:
             return False
@@ -403,18 +403,18 @@ def what_runs(state: MasterState) -> str:
             if instance.state is not None and not instance.state.ended:
                 stopping.append(instance)
         else:
-            running += instance.runs
-    said = []
+            running += instance.is_running
+    phrases = []
     if stopping:
         hosts = sorted({instance.host.name for instance in stopping})
         slaves = f"slave{'s' * (len(hosts) > 1)} of {listed(hosts)}"
         count = counted(len(stopping), "process is", "processes are")
-        said.append(f"{count} still being stopped by the {slaves}")
+        phrases.append(f"{count} still being stopped by the {slaves}")
     if running or not stopping:
-        said.append(f"{counted(running, 'process keeps', 'processes keep')} running")
+        phrases.append(f"{counted(running, 'process keeps', 'processes keep')} running")
     if running:
-        said.append("start the master again to manage them")
-    return "; ".join(said)
+        phrases.append("start the master again to manage them")
+    return "; ".join(phrases)
 
 
 def _boot() -> str:

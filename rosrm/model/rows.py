@@ -129,7 +129,7 @@ class PluginRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class Listing:
     """An answer to a listing; parts that the client did not request are empty.
 
     Attributes:

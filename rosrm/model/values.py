@@ -360,7 +360,7 @@ class InstanceStatus:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptState:
+class SnapshotReport:
     """A snapshot of a process on a host.
 
     Attributes:

@@ -22,7 +22,7 @@ _SMALL: Final = 32
 
 
 @dataclass(slots=True)
-class Gate:
+class PublisherGate:
     """The switch of the author's publishers: messages are sent while it is open."""
 
     is_open: bool
@@ -31,7 +31,7 @@ class Gate:
 class GatedPublisher(Publisher):  # type: ignore[misc]  # rclpy brings no types
     """A publisher that sends nothing while its node is a shadow or silent."""
 
-    gate: Gate
+    gate: PublisherGate
 
     def publish(self, msg: Any) -> None:
         """Send a message if this node is active; otherwise drop it."""
@@ -185,7 +185,7 @@ class TimerOf:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class DeferredAnswer:
     """A placeholder for an answer: the request reached a node that is not active."""
 
     request: Any
@@ -204,7 +204,7 @@ class ServiceOf:
         create: makes the server, for a callback.
         destroy: destroys the server.
         name: as the author gave it.
-        serve: answers a request, or returns it as `Held`.
+        serve: answers a request, or returns it as `DeferredAnswer`.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class ServiceOf:
         self._serve = serve
         self._service: Any = None
         self._send: Callable[[Any, Any], None] = _drop
-        self._held: deque[tuple[Any, Held]] = deque()
+        self._held: deque[tuple[Any, DeferredAnswer]] = deque()
         self.srv_name = name
 
     def open(self) -> None:
@@ -230,7 +230,7 @@ class ServiceOf:
 
     def _answer(self, answer: Any, header: Any) -> None:
         """Send an answer of `serve`, or hold the request; called by rclpy."""
-        if isinstance(answer, Held):
+        if isinstance(answer, DeferredAnswer):
             self._held.append((header, answer))
         else:
             self._send(answer, header)

@@ -12,7 +12,7 @@ KEEP_EVERY: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class NodeIdentity:
     """Identity of a node within rosrm.
 
     Attributes:
@@ -38,14 +38,14 @@ class Identity:
     keep_every: float = KEEP_EVERY
 
 
-def identity_from(environment: Mapping[str, str]) -> Identity | None:
+def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
     """Return the identity set by a slave; None: rosrm did not start this process."""
     process, _, number = environment.get("ROSRM_INSTANCE", "").rpartition("#")
     topic = environment.get("ROSRM_STATE_CONFIG", "")
     if not process or not number.isdecimal() or not topic:
         return None
     epoch = environment.get("ROSRM_EPOCH", "")
-    return Identity(
+    return NodeIdentity(
         process=process,
         instance=int(number),
         node=environment.get("ROSRM_NODE", ""),

@@ -17,11 +17,11 @@ from typing import Any, Final
 from rclpy.executors import MultiThreadedExecutor
 
 from rosrm.node.entities import (
-    Gate,
+    DeferredAnswer,
     GatedPublisher,
-    Held,
     Input,
     OpeningOf,
+    PublisherGate,
     ServiceOf,
     TimerOf,
     refuse_coroutine,
@@ -31,8 +31,8 @@ from rosrm.node.entities import (
     wants_info,
 )
 from rosrm.node.handoff.buffer import InputBuffer, Sent
-from rosrm.node.handoff.replay import Replay
-from rosrm.node.identity import Identity
+from rosrm.node.handoff.replay import InputReplay
+from rosrm.node.identity import NodeIdentity
 
 #: Most messages of one input, and most bytes of all inputs, that are buffered for a successor: a
 #: silent source with a stuck destination may have to buffer half a minute of a fast sensor.
@@ -53,7 +53,7 @@ class Mode(Enum):
     SILENT = "silent"
 
 
-class Member:
+class NodeEntities:
     """The author's entities of one node.
 
     Args:
@@ -70,7 +70,7 @@ class Member:
         on_overflow: called with the topic of an input whose buffer is full.
     """
 
-    def __init__(self, node: Any, plain: Any, identity: Identity, *, resting: bool) -> None:
+    def __init__(self, node: Any, plain: Any, identity: NodeIdentity, *, resting: bool) -> None:
         self.node = node
         self.plain = plain
         self.identity = identity
@@ -84,9 +84,9 @@ class Member:
         self.timers: list[TimerOf] = []
         self.on_cycle: Callable[[], None] = _nothing
         self.on_overflow: Callable[[str], None] = _ignore
-        self._gate = Gate(self.mode is Mode.ACTIVE)
+        self._gate = PublisherGate(self.mode is Mode.ACTIVE)
         self._openings: list[ServiceOf | OpeningOf] = []
-        self._replay = Replay(plain, self.turn, self._serve_next)
+        self._replay = InputReplay(plain, self.turn, self._serve_next)
         self.buffer = self._new_buffer()
 
     @property
@@ -186,7 +186,7 @@ class Member:
         def serve(request: Any, response: Any) -> Any:
             with self.turn:
                 if self.mode is not Mode.ACTIVE:
-                    return Held(request, response)
+                    return DeferredAnswer(request, response)
                 return self._cycle(callback, request, response)
 
         service = ServiceOf(
@@ -294,9 +294,9 @@ class Member:
             return False
         if time.monotonic() < self._late_until:
             self.catch_up()  # afterwards only the reader's depth bounds a busy node's backlog
-        kept = self.buffer.take()
-        if kept is not None:
-            one, message, info = kept.item
+        buffered = self.buffer.take()
+        if buffered is not None:
+            one, message, info = buffered.item
             self._cycle(one.serve, message, info)
             return True
         return any(one.serve_held() for one in self._openings if isinstance(one, ServiceOf))

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 import rclpy.node
 
 from rosrm.node.entities import ServiceOf
-from rosrm.node.handoff.session import Handoff
-from rosrm.node.identity import Identity, identity_from
+from rosrm.node.handoff.session import HandoffSession
+from rosrm.node.identity import NodeIdentity, identity_from
 from rosrm.ros.fast_dds import announcing
 
 if TYPE_CHECKING:
@@ -38,20 +38,20 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     rosrm refuses `async` callbacks, because a state lies between two callbacks.
     """
 
-    _rosrm: Handoff | None = None
+    _rosrm: HandoffSession | None = None
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         identity = identity_from(os.environ)
         if identity is not None:
             self._be_the_only_one(identity)
-            self._rosrm = Handoff(self, super(), identity)
+            self._rosrm = HandoffSession(self, super(), identity)
         profile = announcing(os.environ, "steady", udp=False)
         with contextlib.nullcontext() if identity is None else profile:
             super().__init__(*arguments, **named)
         if self._rosrm is not None:
             self._rosrm.begin()
 
-    def _be_the_only_one(self, identity: Identity) -> None:
+    def _be_the_only_one(self, identity: NodeIdentity) -> None:
         """Register the one migratable node of this process: an instance has one state.
 
         Raises:
@@ -96,7 +96,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         destroys the result (`.destroy()`) when it falls silent, and creates it again if it resumes.
         """
         if self._rosrm is not None:
-            self._rosrm.member.when_active(create)
+            self._rosrm.entities.when_active(create)
         else:
             create()
 
@@ -106,7 +106,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """Create a publisher as rclpy's; messages of a shadow or a silent node are dropped."""
         if self._rosrm is None:
             return super().create_publisher(msg_type, topic, qos_profile, **named)
-        return self._rosrm.member.create_publisher(msg_type, topic, qos_profile, **named)
+        return self._rosrm.entities.create_publisher(msg_type, topic, qos_profile, **named)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], qos_profile: Any, *,
@@ -121,7 +121,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """
         if self._rosrm is None:
             return super().create_subscription(msg_type, topic, callback, qos_profile, **named)
-        return self._rosrm.member.create_subscription(
+        return self._rosrm.entities.create_subscription(
             msg_type, topic, callback, qos_profile, buffer=buffer, **named
         )
 
@@ -134,7 +134,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
             return super().create_timer(
                 timer_period_sec, callback, *rest, autostart=autostart, **named
             )
-        return self._rosrm.member.create_timer(
+        return self._rosrm.entities.create_timer(
             timer_period_sec, callback, *rest, autostart=autostart, **named
         )
 
@@ -144,12 +144,12 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """Create a service as rclpy's; the server exists while this node is active."""
         if self._rosrm is None:
             return super().create_service(srv_type, srv_name, callback, **named)
-        return self._rosrm.member.create_service(srv_type, srv_name, callback, **named)
+        return self._rosrm.entities.create_service(srv_type, srv_name, callback, **named)
 
     def create_client(self, srv_type: Any, srv_name: str, **named: Any) -> Any:
         """Create a client as rclpy's; a name below `~` uses the node name that peers know."""
         if self._rosrm is not None:
-            srv_name = self._rosrm.member.visible(srv_name, self.resolve_service_name)
+            srv_name = self._rosrm.entities.visible(srv_name, self.resolve_service_name)
         return super().create_client(srv_type, srv_name, **named)
 
     def destroy_service(self, service: Any) -> bool:
@@ -184,7 +184,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
 
     def _forget(self, entity: Any) -> None:
         if self._rosrm is not None:
-            self._rosrm.member.destroyed(entity)
+            self._rosrm.entities.destroyed(entity)
 
 
 class Node(Migratable, rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types

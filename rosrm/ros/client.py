@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rosrm.errors import NoMaster, Refused
 from rosrm.model.ros_settings import RosSettings
-from rosrm.model.rows import LogPart, Snapshot
+from rosrm.model.rows import Listing, LogPart
 from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, check_answer
@@ -168,7 +168,7 @@ class MasterClient:
     ) -> None:
         self._participant = participant
         self._master = hello
-        self._heard = time.monotonic()
+        self._last_contact = time.monotonic()
         self._timeout = timeout
         self._names = names.Names(participant.settings.namespace)
         self._control = ControlClient(participant, f"client {name}")
@@ -254,7 +254,7 @@ class MasterClient:
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
         host: str = "", after: int = 0, newest: int = 0,
-    ) -> Snapshot:  # fmt: skip
+    ) -> Listing:  # fmt: skip
         """Return the requested listings; `plugins="failing"` limits plugins to failing ones.
 
         The arguments after `events` narrow the events.
@@ -265,7 +265,7 @@ class MasterClient:
             host=host, after_sequence=after, max_events=newest,
         )  # fmt: skip
         answer = self._call(srv.List, self._names(names.LIST), request, _MASTER)
-        return Snapshot(
+        return Listing(
             master=answer.master, uptime=answer.uptime, last_sequence=answer.last_sequence,
             trouble=answer.trouble,
             hosts=[convert.host_row_from_msg(row) for row in answer.host_list],
@@ -312,11 +312,11 @@ class MasterClient:
 
     def _envelope(self) -> Any:
         """Return a request's envelope; renew the beat before the master would reject it as old."""
-        if time.monotonic() - self._heard > 1.0:
+        if time.monotonic() - self._last_contact > 1.0:
             hello = find_master(self._participant, self._control.sender, self._timeout)
             if hello is None:
                 raise self._silent(_MASTER)
-            self._master, self._heard = hello, time.monotonic()
+            self._master, self._last_contact = hello, time.monotonic()
         return self._control.envelope(self._master.beat, self._master.epoch)
 
     def _ask(self, kind: Any, name: str, request: Any) -> Any:
@@ -327,7 +327,9 @@ class MasterClient:
             except Refused as refusal:
                 if greeted_anew or refusal.code != "stale":
                     raise
-                self._heard = -math.inf  # another run of the master than the one that greeted
+                self._last_contact = (
+                    -math.inf
+                )  # another run of the master than the one that greeted
         raise AssertionError("the second time it is answered or raised")
 
     def _silent(self, who: str, trouble: str = "", unknown: str = "") -> NoMaster:

@@ -56,7 +56,7 @@ def check_answer(answer: Answer, who: str) -> None:
         raise Refused(answer.message, answer.code)
 
 
-class Gate:
+class RequestGate:
     """Admits or refuses requests at their receiver, and remembers answers.
 
     Args:
@@ -133,7 +133,10 @@ class ControlServer:
     """
 
     def __init__(
-        self, participant: Participant, gate: Gate, epoch: Callable[[], int | None] = lambda: None
+        self,
+        participant: Participant,
+        gate: RequestGate,
+        epoch: Callable[[], int | None] = lambda: None,
     ) -> None:
         self._participant = participant
         self._gate = gate

@@ -312,7 +312,7 @@ def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
     return _from_msg(values.InstanceStatus, message)
 
 
-def kept_to_msg(kept: values.KeptState) -> msg.KeptState:
+def snapshot_to_msg(kept: values.SnapshotReport) -> msg.KeptState:
     """Return the description of a snapshot on a host as a message."""
     return msg.KeptState(
         process=kept.instance.process, number=kept.instance.number, sequence=kept.sequence,
@@ -320,10 +320,10 @@ def kept_to_msg(kept: values.KeptState) -> msg.KeptState:
     )  # fmt: skip
 
 
-def kept_from_msg(message: msg.KeptState) -> values.KeptState:
-    """Return the inverse of `kept_to_msg`."""
+def snapshot_from_msg(message: msg.KeptState) -> values.SnapshotReport:
+    """Return the inverse of `snapshot_to_msg`."""
     instance = values.InstanceId(message.process, message.number)
-    return values.KeptState(instance, message.sequence, message.size)
+    return values.SnapshotReport(instance, message.sequence, message.size)
 
 
 # --- rows -------------------------------------------------------------------------------------

@@ -69,7 +69,7 @@ class Decoded:
 
     readings: ReadingsReceived | None = None
     runs: Runs | None = None
-    strangers: tuple[str, ...] = ()
+    refusals: tuple[str, ...] = ()
     received: int = 0
 
 
@@ -97,24 +97,24 @@ def decode(messages: Sequence[bytes]) -> Decoded:
     Messages of another size, byte order or protocol version are refused, never misread.
     """
     fit = [raw for raw in messages if len(raw) == LAYOUT.itemsize and raw[1] == 1]
-    strangers = []
+    refusals = []
     if len(fit) < len(messages):
-        strangers.append("a resource_info of another size than ours: another version of rosrm?")
+        refusals.append("a resource_info of another size than ours: another version of rosrm?")
     if not fit:
-        return Decoded(strangers=tuple(strangers))
+        return Decoded(refusals=tuple(refusals))
     rows = np.frombuffer(b"".join(fit), LAYOUT)
     ours = rows["protocol_version"] == PROTOCOL_VERSION
     if not ours.all():
-        strangers += [
+        refusals += [
             f"a resource_info of protocol version {version}; this side speaks {PROTOCOL_VERSION}"
             for version in np.unique(rows["protocol_version"][~ours])
         ]
         rows = rows[ours]
         if not len(rows):
-            return Decoded(strangers=tuple(strangers))
+            return Decoded(refusals=tuple(refusals))
     order, begins = _by_run(rows)
     newest = rows[order[np.append(begins[1:], len(rows)) - 1]]
-    return Decoded(_event(newest), _runs(rows[order], begins, newest), tuple(strangers), len(rows))
+    return Decoded(_event(newest), _runs(rows[order], begins, newest), tuple(refusals), len(rows))
 
 
 def _by_run(rows: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -107,7 +107,7 @@ class Executors:
             min(timeout, threading.TIMEOUT_MAX), self._post, [partial(self._fail, strategy, late)]
         )
         timer.daemon = True
-        told = {**arguments, "here": here.as_json()}
+        given = {**arguments, "here": here.as_json()}
 
         def settle(outcome: ExecutorOutcome) -> None:
             if outcome.code in ("", "unable"):
@@ -118,7 +118,7 @@ class Executors:
             done(outcome)
 
         def work() -> None:
-            outcome = _outcome(name, function, told)
+            outcome = _outcome(name, function, given)
             timer.cancel()
             self._post(partial(settle, outcome))
 

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from rosrm.core.slave.events import LookedAt
-from rosrm.core.slave.state import Held
-from rosrm.core.slave.watches import Look, Watch
+from rosrm.core.slave.state import HeldInstance
+from rosrm.core.slave.watches import Observation, Watch
 from rosrm.model.values import InstanceId
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave.graph import GraphWatch
-from rosrm.ros.slave.health import HealthEar
+from rosrm.ros.slave.health import HealthMonitor
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 from rosrm.supervisor.procfs import read_stat
@@ -44,9 +44,9 @@ class HealthWatch:
         self._launchers = launchers
         self.watches = False
         self._node: Any = None
-        self._ears: dict[tuple[InstanceId, int], HealthEar] = {}
+        self._monitors: dict[tuple[InstanceId, int], HealthMonitor] = {}
 
-    def look(self, watched: Mapping[InstanceId, Held], now: float) -> Iterator[LookedAt]:
+    def look(self, watched: Mapping[InstanceId, HeldInstance], now: float) -> Iterator[LookedAt]:
         """Yield the result of one check of each watched instance.
 
         Args:
@@ -55,27 +55,27 @@ class HealthWatch:
         """
         self.watches = bool(watched)
         runs = {(instance, held.status.pid) for instance, held in watched.items()}
-        for run in [run for run in self._ears if run not in runs]:
-            self._ears.pop(run).close()
+        for run in [run for run in self._monitors if run not in runs]:
+            self._monitors.pop(run).close()
         for instance, held in watched.items():
             watch = held.watched
             if watch is not None and not self._launchers.has_departed(held.status.pid):
                 look = self._look(instance, held.status.pid, watch, now)
                 yield LookedAt(instance, held.status.pid, look)
 
-    def _look(self, instance: InstanceId, pid: int, watch: Watch, now: float) -> Look:
+    def _look(self, instance: InstanceId, pid: int, watch: Watch, now: float) -> Observation:
         stat = read_stat(self._launchers.root(pid))
         stopped = stat is not None and stat.state == _STOPPED
         if not watch.topics and not watch.services:
-            return Look(stopped)
-        ear = self._ears.get((instance, pid))
-        if ear is None:
-            ear = self._ears[instance, pid] = self._listen(watch, now)
-        heard, trouble = ear.topic(self._sessions.known_as(pid), now)
-        return Look(stopped, heard, trouble, ear.state(now))
+            return Observation(stopped)
+        monitor = self._monitors.get((instance, pid))
+        if monitor is None:
+            monitor = self._monitors[instance, pid] = self._listen(watch, now)
+        messages, trouble = monitor.topic(self._sessions.known_as(pid), now)
+        return Observation(stopped, messages, trouble, monitor.state(now))
 
-    def _listen(self, watch: Watch, now: float) -> HealthEar:
+    def _listen(self, watch: Watch, now: float) -> HealthMonitor:
         if self._node is None:
             name = f"{self._participant.node.get_name()}_health"
             self._node = self._participant.unwatched_node(name)
-        return HealthEar(self._node, self._graph, watch, now)
+        return HealthMonitor(self._node, self._graph, watch, now)

@@ -37,10 +37,10 @@ from rosrm.model.values import (
 )
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
-from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
+from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
-from rosrm.ros.slave.journal_watermark import JournalSeen
-from rosrm.ros.slave.replication import KeptEndpoint
+from rosrm.ros.slave.journal_watermark import JournalWatermark
+from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
@@ -49,10 +49,10 @@ from rosrm.slave.health import HealthWatch
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
-from rosrm.slave.replication.service import Keeping
+from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sampler import ProbeReport, Sampler
 from rosrm.slave.sessions import SessionTable
-from rosrm.slave.shutdown import STOP_ALL, Ending
+from rosrm.slave.shutdown import STOP_ALL, Shutdown
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.usage import UsageWatch
 from rosrm.version import __version__
@@ -65,7 +65,7 @@ _LOOK_AT_GRAPH: Final = 0.05
 #: Seconds between two measurements of the usage of each instance.
 _USAGE_PERIOD: Final = 1.0
 #: Seconds between two messages to the user that no master was found yet.
-_PATIENCE_TOLD: Final = 10.0
+_LOG_PERIOD: Final = 10.0
 #: Periods of readings for which a request stays valid at slow rates.
 _BEATS_MISSED: Final = 3
 
@@ -139,8 +139,8 @@ class SlaveRuntime:
             self._limit = self._limits()
             self._endpoint = SlaveEndpoint(
                 self._participant, self._description(probes.absent), self._state, take=self._take,
-                kept_states=lambda: self._keeping.states(),  # noqa: PLW0108 - made later
-                seen=JournalSeen(config.state / "journal_seen"),
+                kept_states=lambda: self._replication.states(),  # noqa: PLW0108 - made later
+                seen=JournalWatermark(config.state / "journal_seen"),
             )  # fmt: skip
             self._note_probes(first)
             self._endpoint.failing.update(self._executors.failing_plugins())
@@ -149,23 +149,25 @@ class SlaveRuntime:
             for strategy, reason in self._executors.failing.items():
                 _log.info("migration strategy %s is broken: %s", strategy, reason)
             kept = config.state / "kept"
-            self._keeping = Keeping(
+            self._replication = ReplicationService(
                 kept, config.host, config.keep,
-                KeptEndpoint(self._participant, config.host),
+                ReplicationEndpoint(self._participant, config.host),
                 post=self._post, publish=self._endpoint.publish_kept,
             )  # fmt: skip
             duties = Duties(
-                self._take, self._set_restart, self._keeping.keep, self._drop_kept, self._execute,
+                self._take, self._set_restart, self._replication.keep, self._drop_kept,
+                self._execute,
                 self._read_log,
             )  # fmt: skip
             SlaveServices(
                 self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch
             )
             self._starter = Starter(
-                config, kept, self._state, self._supervisor, self._endpoint, self._keeping, graph,
+                config, kept, self._state, self._supervisor, self._endpoint, self._replication,
+                graph,
                 sessions, launchers, take=self._take,
             )  # fmt: skip
-            self._ending = Ending(
+            self._ending = Shutdown(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
                 serve=self._serve,
             )  # fmt: skip
@@ -199,12 +201,12 @@ class SlaveRuntime:
         live, states = self._state.live(), [one.state for one in self._state.statuses()]
         waiting = states.count(InstanceState.BACKOFF) + states.count(InstanceState.STARTING)
         running, ended = live - waiting, held - live
-        said = [f"{counted(running, 'process', 'processes')} still run{'s' * (running == 1)}"]
+        phrases = [f"{counted(running, 'process', 'processes')} still run{'s' * (running == 1)}"]
         if waiting:
-            said.append(f"{waiting} {'is' if waiting == 1 else 'are'} started again")
+            phrases.append(f"{waiting} {'is' if waiting == 1 else 'are'} started again")
         if ended > 0:
-            said.append(f"{ended} {'has' if ended == 1 else 'have'} ended")
-        return ", ".join(said)
+            phrases.append(f"{ended} {'has' if ended == 1 else 'have'} ended")
+        return ", ".join(phrases)
 
     # --- the loop ------------------------------------------------------------------------
 
@@ -244,12 +246,12 @@ class SlaveRuntime:
 
     @property
     def _is_registered(self) -> bool:
-        return self._endpoint.link is Link.REGISTERED
+        return self._endpoint.link is MasterLink.REGISTERED
 
     def _serve(self, goes_on: Callable[[], bool]) -> None:
         now = time.monotonic()
         next_sample = next_usage = next_graph = next_health = now
-        told = now - _PATIENCE_TOLD
+        logged_at = now - _LOG_PERIOD
         while goes_on():
             if now >= next_sample:
                 next_sample = max(next_sample + self._config.period, now)
@@ -265,9 +267,9 @@ class SlaveRuntime:
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
                 self._events.extend(self._health.look(self._state.watched(), now))
-            searches = self._endpoint.link is Link.SEARCHING and not self._ending.has_begun
-            if searches and now - told >= _PATIENCE_TOLD:
-                told = now
+            searches = self._endpoint.link is MasterLink.SEARCHING and not self._ending.has_begun
+            if searches and now - logged_at >= _LOG_PERIOD:
+                logged_at = now
                 _log.info("looking for a master on %s", self._config.ros.describe())
             self._work(now)
             wake = min(next_sample, next_usage, next_graph if awaited else next_sample)
@@ -286,7 +288,7 @@ class SlaveRuntime:
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
         self._endpoint.go_on(now)
-        self._keeping.tick(now)
+        self._replication.tick(now)
         sample = self._sampler.latest(now)
         if sample.reports:
             self._note_probes(sample.reports)
@@ -336,7 +338,7 @@ class SlaveRuntime:
         """Queue an event for the core."""
         self._events.append(event)
         if isinstance(event, Registered):
-            self._keeping.say_again()
+            self._replication.report_again()
             if self._endpoint.failing:
                 self._endpoint.publish_statuses((), complete=False)
 
@@ -404,7 +406,7 @@ class SlaveRuntime:
             for one, held in self._state.held.items()
             if not held.status.state.ended
         )
-        self._keeping.drop(instance, lives=lives)
+        self._replication.drop(instance, lives=lives)
 
     def _read_log(self, query: LogQuery) -> LogPart:
         """Return a part of a log; raises `Refused`."""

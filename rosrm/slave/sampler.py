@@ -152,7 +152,7 @@ class Sampler:
         reports: list[ProbeReport] = []
         for watched in self._watched:
             if watched.busy:
-                self._mind_running(watched, now)
+                self._check_running_read(watched, now)
             elif watched.outcome is not None:
                 self._take_outcome(watched, watched.outcome)
             reports += watched.report(now)
@@ -209,7 +209,7 @@ class Sampler:
             lane.join(max(0.0, end - time.monotonic()))
         return tuple(watched.name for watched in self._watched if not watched.closed)
 
-    def _mind_running(self, watched: _Watched, now: float) -> None:
+    def _check_running_read(self, watched: _Watched, now: float) -> None:
         """Check a running read: move the queue behind a slow one, and mark a late one."""
         if watched.running(now) > QUICK and watched.lane is self._shared:
             stuck, self._shared = self._shared, self._shared.succeed()

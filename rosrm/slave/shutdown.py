@@ -28,7 +28,7 @@ _LONGEST_STOP: Final = 600.0
 
 
 @dataclass
-class Ending:
+class Shutdown:
     """Shutdown of one slave, also without its master or its supervisor.
 
     Attributes:

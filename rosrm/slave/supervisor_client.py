@@ -22,7 +22,7 @@ from rosrm.supervisor.client import (
     SupervisorGone,
     SupervisorSilent,
 )
-from rosrm.supervisor.client_values import Amended, LaunchOrder, Told
+from rosrm.supervisor.client_values import Amended, LaunchOrder, SupervisorMessage
 from rosrm.supervisor.logs import LogLimits
 from rosrm.wording import counted
 
@@ -66,7 +66,7 @@ class SupervisorLink:
         self._post, self._take, self._follow, self._ended = post, take, follow, ended
         self._is_shutting_down = False
         self._is_closed = False
-        self._told_waits = False
+        self._logged_waits = False
         self._unanswered: dict[InstanceId, LaunchOrder] = {}
         self._client = SupervisorClient.connect(state, log=self._limits)
 
@@ -98,13 +98,13 @@ class SupervisorLink:
 
     def _say_if_it_waits(self) -> None:
         waits = self._client.waits
-        if waits > _TOLD_AFTER and not self._told_waits:
+        if waits > _TOLD_AFTER and not self._logged_waits:
             _log.info(
                 "the supervisor (pid %d) has accepted no order for %.0f s: is it stopped? Orders "
                 "wait until it continues",
                 self._client.pid, waits,
             )  # fmt: skip
-        self._told_waits = waits > _TOLD_AFTER
+        self._logged_waits = waits > _TOLD_AFTER
 
     def _tell(self, command: commands.Command) -> None:
         client = self._client
@@ -140,27 +140,27 @@ class SupervisorLink:
     def listen(self) -> None:
         """Start the thread that receives messages."""
         thread = threading.Thread(
-            target=self._hear_all, args=[self._client], name="supervisor", daemon=True
+            target=self._receive_all, args=[self._client], name="supervisor", daemon=True
         )
         thread.start()
 
-    def _hear_all(self, client: SupervisorClient) -> None:
+    def _receive_all(self, client: SupervisorClient) -> None:
         """Pass the messages of all successive supervisors to the loop, in a thread of its own."""
         try:
             while True:
-                self._hear(client)
+                self._receive(client)
                 client = self._next()
                 self._post(partial(self._replace, client))
         except SupervisorError as error:
             if not self._is_closed:
                 self._post(partial(self._end, error))
 
-    def _hear(self, client: SupervisorClient) -> None:
+    def _receive(self, client: SupervisorClient) -> None:
         """Receive until the supervisor must be replaced; raises `SupervisorError` at the end."""
         try:
             while True:
-                told = client.receive(None)
-                self._post(partial(self._take_told, told))
+                messages = client.receive(None)
+                self._post(partial(self._take_messages, messages))
         except (SupervisorGone, SupervisorEnded) as gone:  # ended: by a SIGTERM to it alone
             if self._is_shutting_down or self._is_closed:
                 raise
@@ -168,24 +168,24 @@ class SupervisorLink:
 
     def _next(self) -> SupervisorClient:
         """Return a connection to the next supervisor, or to the same one if it was silent."""
-        told = False
+        logged = False
         while True:
             try:
                 return SupervisorClient.connect(self.state, log=self._limits, timeout=_PATIENCE)
             except SupervisorSilent as silence:
                 if self._is_closed:
                     raise
-                if not told:
+                if not logged:
                     _log.info("%s; waiting until it does", silence)
-                told = True
+                logged = True
 
-    def _take_told(self, told: Sequence[Told]) -> None:
-        statuses = tuple(one for one in told if isinstance(one, InstanceStatus))
+    def _take_messages(self, messages: Sequence[SupervisorMessage]) -> None:
+        statuses = tuple(one for one in messages if isinstance(one, InstanceStatus))
         for status in statuses:
             self._unanswered.pop(status.instance, None)
             self._follow(status)
         self._take(events.SupervisorReported(statuses))
-        for one in told:
+        for one in messages:
             if isinstance(one, Amended):
                 self._take(events.RestartPolicyRecorded(one.instance, one.restart))
 

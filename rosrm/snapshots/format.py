@@ -57,7 +57,7 @@ class Head:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class Listing:
     """A complete snapshot.
 
     Attributes:
@@ -70,7 +70,7 @@ class Kept:
     path: Path
 
 
-class Part(NamedTuple):
+class TransferPart(NamedTuple):
     """A part of a snapshot in transfer to another host.
 
     Attributes:
@@ -150,11 +150,11 @@ def checked(data: bytes) -> tuple[Head, int]:
     return head, start
 
 
-def decoded(data: bytes, path: Path = Path()) -> Kept:
+def decoded(data: bytes, path: Path = Path()) -> Listing:
     """Return the snapshot in a complete file; raises `Damaged`."""
     head, at = checked(data)
     blocks = []
     for size, _ in head.blocks:
         blocks.append(data[at : at + size])
         at += size
-    return Kept(head, tuple(blocks), path)
+    return Listing(head, tuple(blocks), path)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from rosrm.snapshots.format import LARGEST, Damaged, Head, Kept, checked, decoded, decoded_head
+from rosrm.snapshots.format import LARGEST, Damaged, Head, Listing, checked, decoded, decoded_head
 
 #: Written by the node, in turn.
 SLOTS: Final = ("state.0", "state.1")
@@ -51,7 +51,7 @@ def newest_head(directory: Path) -> Head | None:
     return found[0][1] if found else None
 
 
-def read(path: Path) -> Kept:
+def read(path: Path) -> Listing:
     """Return the snapshot in a file; raises `Damaged`."""
     return decoded(content_of(path), path)
 
@@ -66,7 +66,7 @@ def content_of(path: Path) -> bytes:
         raise Damaged(f"it cannot be read: {error.strerror}") from None
 
 
-def newest(directory: Path, up_to: int) -> tuple[Kept | None, list[str]]:
+def newest(directory: Path, up_to: int) -> tuple[Listing | None, list[str]]:
     """Return the newest complete snapshot of a directory, and the faults of damaged files.
 
     Args:

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Final
 
 from rosrm.core.supervisor.events import (
     AmendOrdered,
+    ContactReported,
     FailOrdered,
     FenceOrdered,
-    Forgotten,
-    Heard,
     RestartOrdered,
     ShutdownOrdered,
+    StatusStored,
     StopOrdered,
 )
 from rosrm.errors import SupervisorError
@@ -26,7 +26,7 @@ from rosrm.supervisor import json_lines, messages, paths
 from rosrm.supervisor.client_values import (
     Amended,
     LaunchOrder,
-    Told,
+    SupervisorMessage,
     fence_rule,
     key_of,
     restart_rule,
@@ -83,8 +83,8 @@ class SupervisorClient:
         self._peer = peer
         self._outgoing = Outgoing(peer)
         self._state = state_directory
-        self._lines = json_lines.Lines()
-        self._received: list[Told] = []
+        self._lines = json_lines.LineSplitter()
+        self._received: list[SupervisorMessage] = []
         self._failure: SupervisorError | None = None
         self._ending = False
         self._sending = threading.Lock()
@@ -154,7 +154,7 @@ class SupervisorClient:
         Skipped while the supervisor does not read (it is stopped), because a newer renewal follows.
         """
         if self._outgoing.is_free:
-            self._order(Heard(at, alive))
+            self._order(ContactReported(at, alive))
 
     def restart(self, instance: InstanceId) -> None:
         """Stop an instance, then start it again; the restart policy does not count this."""
@@ -187,7 +187,7 @@ class SupervisorClient:
 
     def forget(self, instances: Iterable[InstanceId]) -> None:
         """Let the supervisor forget final statuses that the caller has stored."""
-        forgotten = tuple(Forgotten(key_of(instance)) for instance in instances)
+        forgotten = tuple(StatusStored(key_of(instance)) for instance in instances)
         if forgotten:
             self._order(messages.Forget(forgotten))
 
@@ -206,7 +206,7 @@ class SupervisorClient:
         """Return the descriptor for a selector; readable when `receive` has something."""
         return self._peer.fileno()
 
-    def receive(self, timeout: float | None = None) -> list[Told]:
+    def receive(self, timeout: float | None = None) -> list[SupervisorMessage]:
         """Return the supervisor's messages, oldest first; [] when none came in time.
 
         Raises:
@@ -315,21 +315,21 @@ class SupervisorClient:
             self._fail(SupervisorGone(reason))
 
     def _take(self, fields: Mapping[str, object]) -> None:
-        told = fields["tell"]
-        if told == "status":
+        kind = fields["tell"]
+        if kind == "status":
             self._received.append(status_from(fields["status"]))
-        elif told == "amended":
+        elif kind == "amended":
             instance = InstanceId(*messages.read_key(fields["instance"]))
             rule = messages.read_restart(fields["restart"])  # type: ignore[arg-type]
             self._received.append(Amended(instance, RestartPolicy(*rule)))
-        elif told == "welcome":
+        elif kind == "welcome":
             self._take_welcome(fields)
-        elif told == "refused":
+        elif kind == "refused":
             self._fail(SupervisorError(str(fields["message"])))
-        elif told == "ended":
+        elif kind == "ended":
             self._ending = True
         else:
-            raise ValueError(f"it tells {told!r}, which this version does not know")
+            raise ValueError(f"it tells {kind!r}, which this version does not know")
 
     def _take_welcome(self, fields: Mapping[str, object]) -> None:
         number, pid = fields["protocol"], fields["pid"]

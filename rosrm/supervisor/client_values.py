@@ -50,7 +50,7 @@ class Amended:
 
 
 #: Messages of the supervisor about an instance.
-Told = InstanceStatus | Amended
+SupervisorMessage = InstanceStatus | Amended
 
 
 def key_of(instance: InstanceId) -> tuple[str, int]:

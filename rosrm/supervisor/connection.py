@@ -7,7 +7,7 @@ import struct
 from typing import Final
 
 from rosrm.supervisor import own_log
-from rosrm.supervisor.json_lines import Lines
+from rosrm.supervisor.json_lines import LineSplitter
 
 #: Unread bytes at which a client is disconnected; it receives all statuses when it reconnects.
 MOST_UNREAD: Final = 8 << 20
@@ -33,7 +33,7 @@ class Connection:
         self.gone = False
         self.environment = ""
         self._peer = peer
-        self._lines = Lines()
+        self._lines = LineSplitter()
         self._unsent = b""
 
     def fileno(self) -> int:

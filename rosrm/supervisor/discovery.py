@@ -53,17 +53,19 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
     )
     assert process.stdout is not None
     with process.stdout as output:
-        said = b""
-        while not said.startswith(b"ready\n"):
+        answer = b""
+        while not answer.startswith(b"ready\n"):
             if not readable(output, max(0.0, deadline - time.monotonic())):
-                said += b"it was not ready in time"
+                answer += b"it was not ready in time"
                 break
             part = os.read(output.fileno(), _CHUNK)
             if not part:
                 break
-            said += part
+            answer += part
     process.wait()
-    return "" if said == b"ready\n" else said.decode(errors="replace").strip() or "it said nothing"
+    return (
+        "" if answer == b"ready\n" else answer.decode(errors="replace").strip() or "it said nothing"
+    )
 
 
 def readable(file: socket.socket | object, timeout: float | None) -> bool:

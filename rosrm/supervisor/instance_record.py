@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
 from rosrm.core.supervisor.instance import Instance
-from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
@@ -34,7 +34,7 @@ COMPACT_FACTOR: Final = 4
 _APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
 
 
-class RecordError(Exception):
+class InstanceRecordError(Exception):
     """The record exists, but cannot be read."""
 
 
@@ -68,7 +68,7 @@ def read(state: str) -> Recorded:
     except FileNotFoundError:
         return recorded
     except OSError as error:
-        raise RecordError(f"{path} cannot be read: {error.strerror}") from None
+        raise InstanceRecordError(f"{path} cannot be read: {error.strerror}") from None
     if tail:
         recorded.notes.append(f"{path}: the last {len(tail)} bytes, a torn line, were left out")
     for number, line in enumerate(written, 1):
@@ -133,7 +133,7 @@ _PLAIN_FIELDS: Final = tuple(
 _NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by", "withdrawn"})
 
 
-class Record:
+class InstanceRecord:
     """Appends to the record; while the disk is full, lines are delayed but not lost.
 
     Attributes:
@@ -193,7 +193,7 @@ class Record:
 
     def rewrite(
         self,
-        supervision: Supervision,
+        core_state: SupervisorState,
         launches: Mapping[Key, Launch],
         environments: Mapping[str, Mapping[str, str]],
         birth: Callable[[Key], int],
@@ -207,7 +207,7 @@ class Record:
         waiting = self._waiting
         self._waiting = []
         self._add({"record": "header", "version": VERSION, "boot": procfs.boot_id()})
-        for process, number in supervision.dead.items():
+        for process, number in core_state.dead.items():
             self._add(
                 {"record": "dead", "key": [process, -1], "process": process, "number": number}
             )
@@ -215,7 +215,7 @@ class Record:
             self.environment(identity, variables)
         for launch in launches.values():
             self.launch(launch)
-        for instance in supervision.instances.values():
+        for instance in core_state.instances.values():
             self.state(instance, birth(instance.key))
         text = b"".join(self._waiting)
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * max(self._size, len(text)))

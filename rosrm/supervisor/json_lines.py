@@ -32,7 +32,7 @@ def parse(text: bytes) -> dict[str, Any]:
     return fields
 
 
-class Lines:
+class LineSplitter:
     """Splits a stream into lines."""
 
     def __init__(self) -> None:

@@ -9,23 +9,23 @@ from __future__ import annotations
 
 import os
 
-from rosrm.core.supervisor.events import Heard
+from rosrm.core.supervisor.events import ContactReported
 from rosrm.supervisor import own_log, paths, procfs
 
 
-class LastHeard:
+class LastContact:
     """Stores the newest times."""
 
     def __init__(self, state: str) -> None:
         self._path = os.path.join(state, paths.HEARD)
         self._boot = procfs.boot_id()
         self._file = -1
-        self._newest = Heard(0.0)
+        self._newest = ContactReported(0.0)
         self._trouble = ""
 
-    def keep(self, heard: Heard) -> None:
+    def keep(self, heard: ContactReported) -> None:
         """Write newer times to the file, so that they survive this process."""
-        newest = Heard(*map(max, heard, self._newest))
+        newest = ContactReported(*map(max, heard, self._newest))
         if newest == self._newest:
             return
         self._newest = newest
@@ -42,16 +42,16 @@ class LastHeard:
             self._trouble = trouble
 
 
-def _line(boot: str, newest: Heard) -> bytes:
+def _line(boot: str, newest: ContactReported) -> bytes:
     return f"{boot} {newest.at:020.6f} {newest.alive:020.6f}\n".encode()
 
 
-def read(state: str) -> Heard:
+def read(state: str) -> ContactReported:
     """Return the times stored since this machine's start; 0.0: none."""
     try:
         with open(os.path.join(state, paths.HEARD), encoding="ascii") as file:
             boot, at, alive = file.read(100).split()
-        newest = Heard(float(at), float(alive))
+        newest = ContactReported(float(at), float(alive))
     except (OSError, ValueError):
-        return Heard(0.0)
-    return newest if boot == procfs.boot_id() else Heard(0.0)
+        return ContactReported(0.0)
+    return newest if boot == procfs.boot_id() else ContactReported(0.0)

@@ -52,7 +52,7 @@ class LogKeeper:
         self._logs: dict[Key, _Log] = {}
         self._opened: dict[Key, int] = {}
         self._due: float | None = None
-        self._shelf = Shelf(state)
+        self._folder = LogFolder(state)
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
         """Open the log of an instance and return its descriptor; remove old logs to make room.
@@ -67,8 +67,8 @@ class LogKeeper:
             0o600,
         )
         self._opened[instance] = os.fstat(log).st_size
-        self._shelf.add(instance, known, self.limits)
-        self._shelf.remove_old_processes(known, self.limits)
+        self._folder.add(instance, known, self.limits)
+        self._folder.remove_old_processes(known, self.limits)
         return log
 
     def watch(self, instance: Key, now: float, started: int = 0) -> None:
@@ -155,7 +155,7 @@ class _Log:
             own_log.say(f"the time index of {self.path} was not written: {error}")
 
 
-class Shelf:
+class LogFolder:
     """The instances that have files in the log folder; removes the files of old instances.
 
     The folder is read once; from then on the supervisor tracks the files that it creates.

@@ -57,12 +57,12 @@ from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervisor.events import (
     AmendOrdered,
+    ContactReported,
     FailOrdered,
     FenceOrdered,
-    Forgotten,
-    Heard,
     RestartOrdered,
     ShutdownOrdered,
+    StatusStored,
     StopOrdered,
 )
 from rosrm.core.supervisor.instance import Instance
@@ -125,7 +125,7 @@ class Remember(NamedTuple):
 class Forget(NamedTuple):
     """The client has stored these final statuses."""
 
-    instances: tuple[Forgotten, ...]
+    instances: tuple[StatusStored, ...]
 
 
 Order = (
@@ -134,7 +134,7 @@ Order = (
     | Launch
     | StopOrdered
     | FenceOrdered
-    | Heard
+    | ContactReported
     | RestartOrdered
     | FailOrdered
     | Amend
@@ -180,7 +180,7 @@ _WORDS: Final[Mapping[type, str]] = {
     Launch: "start",
     StopOrdered: "stop",
     FenceOrdered: "fence",
-    Heard: "heard",
+    ContactReported: "heard",
     RestartOrdered: "restart",
     FailOrdered: "fail",
     Amend: "amend",
@@ -265,12 +265,14 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     "start": read_launch,
     "stop": lambda fields: StopOrdered(read_key(fields["instance"])),
     "fence": lambda fields: FenceOrdered(read_key(fields["instance"])),
-    "heard": lambda fields: Heard(float(fields["at"]), float(fields["alive"])),
+    "heard": lambda fields: ContactReported(float(fields["at"]), float(fields["alive"])),
     "restart": lambda fields: RestartOrdered(read_key(fields["instance"])),
     "fail": _read_fail,
     "amend": _read_amend,
     "remember": lambda fields: Remember(read_key(fields["instance"]), _text(fields["memo"])),
-    "forget": lambda fields: Forget(tuple(Forgotten(read_key(key)) for key in fields["instances"])),
+    "forget": lambda fields: Forget(
+        tuple(StatusStored(read_key(key)) for key in fields["instances"])
+    ),
     "shutdown": lambda _: ShutdownOrdered(),
 }
 

@@ -13,14 +13,14 @@ import selectors
 import signal
 from collections.abc import Callable, Iterable
 
-from rosrm.core.supervisor.events import Cleared, Event, Exited
+from rosrm.core.supervisor.events import Event, Exited, SessionEnded
 from rosrm.core.supervisor.instance import UNKNOWN_EXIT
 from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.procfs import Stat
 
 
-class Family:
+class ProcessTrees:
     """The living processes of all instances.
 
     Args:
@@ -142,7 +142,7 @@ class Family:
     # --- strays: processes of an instance whose leader has ended ----------------------------------
 
     def watch_strays(self, key: Key, found: Iterable[Stat]) -> None:
-        """Watch these processes; report `Cleared` when they and their forks have ended."""
+        """Watch these processes; report `SessionEnded` when they and their forks have ended."""
         watched = self._strays.setdefault(key, {})
         for stat in found:
             if stat.pid not in watched:
@@ -165,7 +165,7 @@ class Family:
             return
         self.watch_strays(key, self._find(key))
         if key not in self._strays:
-            self._happened(Cleared(key))
+            self._happened(SessionEnded(key))
 
     def _find(self, key: Key) -> list[Stat]:
         session = self._sessions.get(key)

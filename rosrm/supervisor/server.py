@@ -18,14 +18,14 @@ from typing import Final
 from rosrm.core.supervisor import commands, events
 from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
 from rosrm.core.supervisor.instance import STOPPING
-from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import lease_file, messages, own_log, paths, procfs, spawn, takeover
 from rosrm.supervisor.connection import Connection
-from rosrm.supervisor.instance_record import Record
+from rosrm.supervisor.instance_record import InstanceRecord
 from rosrm.supervisor.json_lines import ProtocolError
 from rosrm.supervisor.logs import LogKeeper, LogLimits
-from rosrm.supervisor.process_tree import Family, mark
+from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 
 #: Most spawns before the loop looks at other events.
@@ -49,10 +49,10 @@ class Server:
         self._state = state
         self._listener = listener
         self._selector = selectors.DefaultSelector()
-        self._core = Supervision()
-        self._family = Family(state, self._selector, self._happened)
-        self._record = Record(state)
-        self._heard_at = lease_file.LastHeard(state)
+        self._core = SupervisorState()
+        self._trees = ProcessTrees(state, self._selector, self._happened)
+        self._record = InstanceRecord(state)
+        self._last_contact = lease_file.LastContact(state)
         self._logs = LogKeeper(state, limits)
         self._null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
         self._launches: dict[Key, messages.Launch] = {}
@@ -98,7 +98,7 @@ class Server:
         if self._record.is_large():
             self._rewrite_record()
         self._record.flush()
-        self._tell()
+        self._report()
         if self._served and self._client is None and self._core.idle:
             self._leaving = True
 
@@ -127,12 +127,12 @@ class Server:
             self._execute(command)
 
     def _execute(self, command: commands.Command) -> None:
-        if isinstance(command, commands.Tell):
+        if isinstance(command, commands.ReportStatus):
             self._note_status(command.instance)
         elif isinstance(command, commands.Spawn):
             self._spawns.append(command.instance)
         elif isinstance(command, commands.Signal):
-            self._family.signal(command.instance, command.number)
+            self._trees.signal(command.instance, command.number)
         elif isinstance(command, commands.Unspawn):
             self._unspawn(command.instance)
         elif isinstance(command, commands.Drop):
@@ -146,8 +146,8 @@ class Server:
             self._launches.pop(key, None)
             self._logs.release(key)
         if not instance.pid and instance.phase != STOPPING:
-            self._family.release(key)
-        self._record.state(instance, self._family.birth(key))
+            self._trees.release(key)
+        self._record.state(instance, self._trees.birth(key))
         self._telling.append(messages.encode_status(messages.Status.of(instance)))
 
     def _unspawn(self, key: Key) -> None:
@@ -155,7 +155,7 @@ class Server:
             self._spawns.remove(key)
             self._happened(SpawnFailed(key, ""))
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         telling = b"".join(self._telling)
         self._telling.clear()
         if self._client is not None and telling:
@@ -183,7 +183,7 @@ class Server:
         except spawn.SpawnError as error:
             self._happened(SpawnFailed(key, str(error), error.transient))
             return
-        self._family.add_child(key, pid, birth)
+        self._trees.add_child(key, pid, birth)
         self._logs.watch(key, time.monotonic(), pid)
         self._happened(Spawned(key, pid))
 
@@ -222,13 +222,13 @@ class Server:
     # --- the record ---------------------------------------------------------------------------
 
     def _take_over(self) -> None:
-        recorded = takeover.restore(self._state, self._core, self._family)
+        recorded = takeover.restore(self._state, self._core, self._trees)
         self._launches.update(recorded.launches)
         self._environments.update(recorded.environments)
         self._notes = recorded.notes
         for note in recorded.notes:
             own_log.say(note)
-        for event in takeover.what_happened(recorded, self._state, self._core, self._family):
+        for event in takeover.what_happened(recorded, self._state, self._core, self._trees):
             self._happened(event)
         self._rewrite_record()
         for instance in self._core.instances.values():
@@ -241,19 +241,19 @@ class Server:
             used.add(self._client.environment)  # sent once; later launches refer to it
         for identity in self._environments.keys() - used:
             del self._environments[identity]
-        self._record.rewrite(self._core, self._launches, self._environments, self._family.birth)
+        self._record.rewrite(self._core, self._launches, self._environments, self._trees.birth)
 
     # --- the client ---------------------------------------------------------------------------
 
     def _accept(self) -> None:
         peer, _ = self._listener.accept()
         connection = Connection(peer)
-        self._watch(connection, lambda: self._heard(connection))
+        self._watch(connection, lambda: self._readable(connection))
         if connection.uid not in (0, os.geteuid()):
             self._refuse(connection, "this supervisor belongs to another user")
             self._send(connection, b"")
 
-    def _heard(self, connection: Connection) -> None:
+    def _readable(self, connection: Connection) -> None:
         try:
             for line in connection.read():
                 if not connection.closing:
@@ -278,7 +278,7 @@ class Server:
         elif isinstance(order, messages.Forget):
             for forgotten in order.instances:
                 self._happened(forgotten)
-        elif isinstance(order, events.Heard):
+        elif isinstance(order, events.ContactReported):
             self._renew(order)
         else:
             self._happened(order)
@@ -308,7 +308,7 @@ class Server:
 
     def _client_is_gone(self, client: Connection) -> bool:
         """Return True if the client is gone, also if it left in this very round."""
-        self._heard(client)
+        self._readable(client)
         return client.gone
 
     def _learn_environment(self, client: Connection, order: messages.Environment) -> None:
@@ -329,10 +329,10 @@ class Server:
             )
         )
 
-    def _renew(self, order: events.Heard) -> None:
+    def _renew(self, order: events.ContactReported) -> None:
         now = time.monotonic()
-        newest = events.Heard(min(order.at, now), min(order.alive, now))
-        self._heard_at.keep(newest)
+        newest = events.ContactReported(min(order.at, now), min(order.alive, now))
+        self._last_contact.keep(newest)
         self._happened(newest)
 
     def _amend(self, amendment: messages.Amend) -> None:
@@ -380,19 +380,19 @@ class Server:
 
     def _watch_signals(self) -> None:
         """Let SIGCHLD and SIGTERM wake the loop by a pipe; ignore SIGINT and SIGHUP."""
-        heard, wakeup = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        signals, wakeup = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
         for number in (signal.SIGCHLD, signal.SIGTERM):
             signal.signal(number, lambda *_: None)
         for number in (signal.SIGINT, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
-        self._selector.register(heard, selectors.EVENT_READ, lambda: self._signalled(heard))
-        self._family.reap()
+        self._selector.register(signals, selectors.EVENT_READ, lambda: self._signalled(signals))
+        self._trees.reap()
 
-    def _signalled(self, heard: int) -> None:
-        numbers = os.read(heard, 4096)
+    def _signalled(self, signals: int) -> None:
+        numbers = os.read(signals, 4096)
         if signal.SIGCHLD in numbers:
-            self._family.reap()
+            self._trees.reap()
         if signal.SIGTERM in numbers:
             self._happened(events.ShutdownOrdered())
 

@@ -14,16 +14,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from rosrm.core.supervisor.events import Cleared, Event, Exited, Resumed, Spawned, SpawnFailed
+from rosrm.core.supervisor.events import Event, Exited, Resumed, SessionEnded, Spawned, SpawnFailed
 from rosrm.core.supervisor.instance import RUNNING, STARTING, STOPPING, UNKNOWN_EXIT, Instance
-from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.supervisor import instance_record, lease_file, procfs
 from rosrm.supervisor.instance_record import Recorded
-from rosrm.supervisor.process_tree import Family, mark
+from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import Stat
 
 
-def restore(state: str, core: Supervision, family: Family) -> Recorded:
+def restore(state: str, core: SupervisorState, family: ProcessTrees) -> Recorded:
     """Read the record into the core, and take over the leaders that still run."""
     recorded = instance_record.read(state)
     core.dead.update(recorded.dead)
@@ -55,7 +55,7 @@ def _begin_clock_anew(instance: Instance, now: float) -> None:
 
 
 def what_happened(
-    recorded: Recorded, state: str, core: Supervision, family: Family
+    recorded: Recorded, state: str, core: SupervisorState, family: ProcessTrees
 ) -> Iterator[Event]:
     """Yield the changes of each instance while no supervisor ran."""
     waiting = [
@@ -72,7 +72,9 @@ def what_happened(
             yield from _end_of(instance, left, family)
 
 
-def _start_of(instance: Instance, found: list[Stat], recorded: Recorded, family: Family) -> Event:
+def _start_of(
+    instance: Instance, found: list[Stat], recorded: Recorded, family: ProcessTrees
+) -> Event:
     """Return the outcome of a start that was ordered but has no recorded outcome."""
     leaders = [stat for stat in found if stat.pid == stat.session]
     if instance.key not in recorded.spawning:
@@ -85,10 +87,10 @@ def _start_of(instance: Instance, found: list[Stat], recorded: Recorded, family:
     return SpawnFailed(instance.key, lost, transient=True)
 
 
-def _end_of(instance: Instance, left: list[Stat], family: Family) -> Iterator[Event]:
+def _end_of(instance: Instance, left: list[Stat], family: ProcessTrees) -> Iterator[Event]:
     """Yield the events for an instance that ran and whose leader has ended."""
     family.watch_strays(instance.key, left)
     if instance.pid:
         yield Exited(instance.key, UNKNOWN_EXIT, leftovers=bool(left))
     elif not left:
-        yield Cleared(instance.key)
+        yield SessionEnded(instance.key)

@@ -24,7 +24,7 @@ import psutil
 
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import NoMaster, RosrmError
-from rosrm.model.rows import HostRow, ProcessRow, Snapshot
+from rosrm.model.rows import HostRow, Listing, ProcessRow
 from rosrm.ros.client import MasterClient
 from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
 from rosrm.testing.loopback import settings_on_this_machine
@@ -177,8 +177,8 @@ class LocalCluster:
         return self._client
 
     def wait_until(
-        self, what: str, condition: Callable[[Snapshot], bool], timeout: float = 30.0
-    ) -> Snapshot:
+        self, what: str, condition: Callable[[Listing], bool], timeout: float = 30.0
+    ) -> Listing:
         """Poll hosts and processes until a condition holds; return the last listing.
 
         Raises:
@@ -198,7 +198,7 @@ class LocalCluster:
     def wait_for_hosts(self, timeout: float = 30.0) -> None:
         """Wait until every slave has registered and asks for work."""
 
-        def all_accept(view: Snapshot) -> bool:
+        def all_accept(view: Listing) -> bool:
             accepting = {row.description.name for row in view.hosts if row.accepting}
             return accepting >= set(self.slaves)
 
@@ -299,7 +299,7 @@ def _end_all(parts: Sequence[Part]) -> None:
             part.process.wait(5.0)
 
 
-def _brief(view: Snapshot) -> str:
+def _brief(view: Listing) -> str:
     hosts = ", ".join(f"{row.description.name} {row.state}" for row in view.hosts) or "no host"
     processes = ", ".join(f"{row.name} {row.state}" for row in view.processes[:20])
     return f"{hosts}; {processes or 'no process'}"

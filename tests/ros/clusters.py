@@ -13,7 +13,7 @@ import pytest
 
 from rosrm.config.settings import ClusterConfig, HostConfig, LivenessSettings
 from rosrm.errors import Refused
-from rosrm.model.rows import ProcessRow, Snapshot
+from rosrm.model.rows import Listing, ProcessRow
 from rosrm.model.values import Kind, ProcessSpec, Readiness, StopPolicy
 from rosrm.supervisor.procfs import read_environment
 from rosrm.testing.local_cluster import LocalCluster, Part
@@ -125,7 +125,7 @@ class Cluster(LocalCluster):
             fields: values that the row must have, too.
         """
 
-        def found(view: Snapshot) -> Iterator[ProcessRow]:
+        def found(view: Listing) -> Iterator[ProcessRow]:
             return (
                 row for row in view.processes
                 if row.name == name and row.state in states and where(row)

@@ -14,7 +14,7 @@ from std_msgs.msg import Int64, String
 from rosrm.core.slave.watches import Watch
 from rosrm.model.values import Health, MigrationPolicy, RestartPolicy
 from rosrm.ros.slave.graph import GraphWatch
-from rosrm.ros.slave.health import HealthEar
+from rosrm.ros.slave.health import HealthMonitor
 from tests.ros.clusters import STEADY, alive, host, node, service
 from tests.waiting import wait_gone, wait_until
 
@@ -235,7 +235,7 @@ class Listener:
     def __init__(self, stage, rate: float) -> None:
         self.node = stage.plain
         watch = Watch(Health("/scan", rate, "", SOON), ("/scan",))
-        self.ear = HealthEar(self.node, GraphWatch(self.node), watch, time.monotonic())
+        self.ear = HealthMonitor(self.node, GraphWatch(self.node), watch, time.monotonic())
 
     def look(self) -> tuple[int | None, str]:
         return self.ear.topic((os.getpid(),), time.monotonic())
@@ -310,7 +310,7 @@ def test_another_type_is_followed(stage) -> None:
 def test_a_name_that_is_none_harms_nobody(stage) -> None:
     """The slave reports an invalid topic name and keeps running."""
     watch = Watch(Health("no topic", 1.0, "active", SOON), ("/no topic",), ("/no-node/get_state",))
-    ear = HealthEar(stage.plain, GraphWatch(stage.plain), watch, time.monotonic())
+    ear = HealthMonitor(stage.plain, GraphWatch(stage.plain), watch, time.monotonic())
     heard, trouble = ear.topic((1,), time.monotonic())
     assert heard is None
     assert "cannot be listened to" in trouble

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.config.settings import CheckpointChoice
+from rosrm.config.settings import CheckpointPolicySettings
 from rosrm.model.values import Health, InstanceState
 from tests.ros.clusters import PATIENCE, wait_until
 from tests.ros.portable_kit import (
@@ -33,7 +33,7 @@ TROUBLED = str(Path(__file__).parent / "programs/troubled.py")
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    return two_hosts(make_shared, checkpoint=CheckpointChoice(options={"away": 0.4}))
+    return two_hosts(make_shared, checkpoint=CheckpointPolicySettings(options={"away": 0.4}))
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from rosrm.config.settings import MigrationSettings, ProcessDefaults, RecordSett
 from rosrm.errors import RecordError
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import MigrationPolicy
-from rosrm_simulate.runs import Request, carry_out, load_record, replay_record
+from rosrm_simulate.runs import SimulationRequest, carry_out, load_record, replay_record
 from tests.ros.clusters import MIB, PATIENCE, STEADY, host, job, python, service
 
 HOLD = """
@@ -112,7 +112,7 @@ def test_one_that_still_grows_is_not_taken_for_a_whole_one(records):
 
 def test_the_simulation_of_the_run_agrees_with_it(records):
     """The bounds are for a busy machine: observed deviations are several times smaller."""
-    report = carry_out(Request(records[0]))
+    report = carry_out(SimulationRequest(records[0]))
     recorded, simulated = report.runs
     agreement = report.agreement
     placed = [len(run.outcome.placements) for run in (recorded, simulated)]

@@ -12,7 +12,7 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm import snapshots
-from rosrm.config.settings import CheckpointChoice, KeepSettings, LivenessSettings
+from rosrm.config.settings import CheckpointPolicySettings, KeepSettings, LivenessSettings
 from rosrm.model.values import (
     HostLossPolicy,
     MigrationPolicy,
@@ -76,7 +76,7 @@ def counter(name: str, ballast: int = 0, **options) -> ProcessSpec:
     )  # fmt: skip
 
 
-def kept_directory(cluster: Cluster, on: str, name: str) -> Path:
+def snapshot_directory(cluster: Cluster, on: str, name: str) -> Path:
     return cluster.directory / "hosts" / on / "kept" / name
 
 
@@ -138,7 +138,7 @@ def test_a_large_snapshot(cluster):
     runs = wait_for_count(cluster, "large", 1, 1)
     # By default a snapshot may be a second behind; a busy machine takes time to write it.
     assert runs[1][0] >= 20, runs
-    assert snapshots.newest_head(kept_directory(cluster, row.host, "large")).size > 5_000_000
+    assert snapshots.newest_head(snapshot_directory(cluster, row.host, "large")).size > 5_000_000
     cluster.cancel("large")
 
 
@@ -157,7 +157,7 @@ def test_a_snapshot_that_cannot_be_restored_stays_as_it_is(cluster):
     cluster.submit(counter("other", restart=RestartPolicy("on-failure", delay=0.1, attempts=2)))
     wait_for_count(cluster, "other", 20)
     row = cluster.wait("other", "running")
-    directory = kept_directory(cluster, row.host, "other")
+    directory = snapshot_directory(cluster, row.host, "other")
     os.kill(row.pid, signal.SIGSTOP)
     foreign = rewritten(directory)
     os.kill(row.pid, signal.SIGKILL)
@@ -186,7 +186,7 @@ def test_a_process_that_is_submitted_again_begins_from_nothing(cluster):
     wait_for_copy(cluster, "again", 20)
     cluster.cancel("again")
     wait_until(
-        lambda: not any(kept_directory(cluster, on, "again").exists() for on in cluster.slaves),
+        lambda: not any(snapshot_directory(cluster, on, "again").exists() for on in cluster.slaves),
         "no snapshot is left",
     )
     cluster.submit(counter("again"))
@@ -219,7 +219,7 @@ def test_a_host_without_room_refuses_the_replica_and_logs_this_once(make_cluster
 def test_a_migrated_process_continues_from_the_snapshot_on_its_new_host(make_cluster):
     """The snapshot on the old host is older, and is dropped."""
     cluster = make_cluster(
-        host("h0"), host("h1"), liveness=STEADY, checkpoint=CheckpointChoice(None)
+        host("h0"), host("h1"), liveness=STEADY, checkpoint=CheckpointPolicySettings(None)
     )
     cluster.submit(counter("counter"))
     source = cluster.wait("counter", "running").host
@@ -228,7 +228,7 @@ def test_a_migrated_process_continues_from_the_snapshot_on_its_new_host(make_clu
     cluster.wait_for_event("migrated", process="counter")
     cluster.wait("counter", "running")
     wait_for_count(cluster, "counter", 100)
-    old = kept_directory(cluster, source, "counter")
+    old = snapshot_directory(cluster, source, "counter")
     wait_until(lambda: not old.exists(), "the old snapshot is dropped")
     kill(cluster, "counter")
     runs = wait_for_count(cluster, "counter", 1, 1)
@@ -280,7 +280,7 @@ def copies(cluster: Cluster, name: str) -> dict[str, int]:
     """Return the last cycle of the replica on each host that has one."""
     found = {}
     for on in cluster.slaves:
-        head = snapshots.peek(kept_directory(cluster, on, name) / snapshots.COPY)
+        head = snapshots.peek(snapshot_directory(cluster, on, name) / snapshots.COPY)
         if head is not None:
             found[on] = head.sequence
     return found

@@ -28,7 +28,7 @@ from rosrm_criu.control import messages as control
 from rosrm_criu.engine import image
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
 from rosrm_lab.plan import HostPlan, LabPlan, parse_subnet
-from rosrm_lab.store import Birth, Record
+from rosrm_lab.store import Birth, LabRecord
 from rosrm_lab.wires import Link, Wire
 
 MEMOS = [
@@ -192,7 +192,7 @@ def test_the_state_file_of_a_lab() -> None:
     """A command finds the lab that another version made."""
     plan = LabPlan("lab", (HostPlan("h1", 2**30, 0.5, 2**30),), parse_subnet("10.9.0.0/24"))
     link = Link(Wire(True, 0.0, 0.0), Wire(False, 0.25, 0.5))
-    record = Record(plan, True, "boot", Birth(1, 2), {"h1": Birth(3, 4)}, {"h1": link})
+    record = LabRecord(plan, True, "boot", Birth(1, 2), {"h1": Birth(3, 4)}, {"h1": link})
     plain = {
         "version": 1,
         "plan": {
@@ -202,4 +202,4 @@ def test_the_state_file_of_a_lab() -> None:
         "links": {"h1": [[True, 0.0, 0.0], [False, 0.25, 0.5]]},
     }  # fmt: skip
     assert json.loads(json.dumps(record.to_plain())) == plain
-    assert Record.from_plain(plain) == record
+    assert LabRecord.from_plain(plain) == record

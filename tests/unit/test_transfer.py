@@ -21,8 +21,8 @@ from rosrm_criu.transfer import Offer, starting
 from rosrm_criu.transfer.addresses import nearest_first, own_addresses
 from rosrm_criu.transfer.archive import Archive, Unpacker
 from rosrm_criu.transfer.form import DIGEST_SIZE, new_digest
-from rosrm_criu.transfer.landing import Landing
-from rosrm_criu.transfer.sending import Pace
+from rosrm_criu.transfer.landing import StagingDirectory
+from rosrm_criu.transfer.sending import RateLimiter
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -240,7 +240,7 @@ def test_what_is_no_archive_is_refused(tmp_path):
 
 
 def test_a_target_appears_at_once_and_nothing_else_stays(tmp_path):
-    landing = Landing(tmp_path / "new" / "target")
+    landing = StagingDirectory(tmp_path / "new" / "target")
     (landing.path / "file").write_bytes(b"1")
     assert not (tmp_path / "new" / "target").exists()
     assert stat.S_IMODE(landing.path.stat().st_mode) == 0o700
@@ -250,7 +250,7 @@ def test_a_target_appears_at_once_and_nothing_else_stays(tmp_path):
 
 
 def test_without_an_end_nothing_stays(tmp_path):
-    landing = Landing(tmp_path / "target")
+    landing = StagingDirectory(tmp_path / "target")
     (landing.path / "file").write_bytes(b"1")
     landing.close()
     assert list(tmp_path.iterdir()) == []
@@ -261,10 +261,10 @@ def test_what_a_killed_fetch_has_left_is_removed_and_what_lives_is_not(tmp_path)
     stale = Path(tempfile.mkdtemp(prefix=".rosrm-fetch-", dir=tmp_path))
     (stale / "file").write_bytes(b"1")
     (tmp_path / "other").mkdir()
-    alive = Landing(tmp_path / "first")
+    alive = StagingDirectory(tmp_path / "first")
     assert not stale.exists()
 
-    other = Landing(tmp_path / "second")
+    other = StagingDirectory(tmp_path / "second")
 
     assert alive.path.exists()
     alive.close()
@@ -273,7 +273,7 @@ def test_what_a_killed_fetch_has_left_is_removed_and_what_lives_is_not(tmp_path)
 
 
 def test_the_lock_of_a_fetch_is_held_while_it_lives(tmp_path):
-    landing = Landing(tmp_path / "target")
+    landing = StagingDirectory(tmp_path / "target")
     seen = os.open(landing.path, os.O_RDONLY)
     with pytest.raises(BlockingIOError):
         fcntl.flock(seen, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -285,17 +285,17 @@ def test_the_lock_of_a_fetch_is_held_while_it_lives(tmp_path):
 def test_nothing_is_fetched_over_what_exists(tmp_path):
     (tmp_path / "target").symlink_to("nowhere")
     with pytest.raises(TransferError, match="target exists already"):
-        Landing(tmp_path / "target")
+        StagingDirectory(tmp_path / "target")
 
 
 def test_a_target_in_no_directory_is_refused(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(TransferError, match=r"nothing can be made in .*file"):
-        Landing(tmp_path / "file" / "target")
+        StagingDirectory(tmp_path / "file" / "target")
 
 
 def test_what_has_no_room_is_refused_before_it_is_fetched(tmp_path):
-    landing = Landing(tmp_path / "target")
+    landing = StagingDirectory(tmp_path / "target")
     landing.require(1000, 1000)
     with pytest.raises(TransferError, match=r"do not fit .*are to stay free, and the file system"):
         landing.require(1 << 60, 0)
@@ -310,7 +310,7 @@ def test_what_has_no_room_is_refused_before_it_is_fetched(tmp_path):
 @given(st.lists(st.tuples(st.integers(1, 100_000), st.floats(0, 0.2)), min_size=1, max_size=50))
 def test_no_more_goes_out_than_the_rate(pieces):
     """Over any time from the start, but for what may be caught up."""
-    pace, now, sent = Pace(1_000_000), 100.0, 0
+    pace, now, sent = RateLimiter(1_000_000), 100.0, 0
     for size, rest in pieces:
         now += rest
         now += pace.wait(size, now)
@@ -319,7 +319,7 @@ def test_no_more_goes_out_than_the_rate(pieces):
 
 
 def test_without_a_rate_nothing_waits():
-    assert Pace(0).wait(1 << 40, 1.0) == 0.0
+    assert RateLimiter(0).wait(1 << 40, 1.0) == 0.0
 
 
 def test_loopback_is_the_last_address():

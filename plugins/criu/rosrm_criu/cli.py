@@ -14,8 +14,8 @@ import typer
 from rosrm.cli.options import AsJson
 
 if TYPE_CHECKING:
-    from rosrm_criu.engine.binary import Criu
-    from rosrm_criu.engine.probe import Ability
+    from rosrm_criu.engine.binary import CriuBinary
+    from rosrm_criu.engine.probe import CriuSupport
 
 criu = typer.Typer(
     no_args_is_help=True,
@@ -63,20 +63,20 @@ def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
 # --- inner parts ------------------------------------------------------------------------------
 
 
-def _tried(prefix: Path) -> tuple[Criu | None, Ability]:
+def _tried(prefix: Path) -> tuple[CriuBinary | None, CriuSupport]:
     """Return the CRIU to use on this machine, or None, and its capability."""
     from rosrm.errors import CriuError
     from rosrm_criu.engine.binary import find
-    from rosrm_criu.engine.probe import Ability, probe
+    from rosrm_criu.engine.probe import CriuSupport, probe
 
     try:
         found = find(prefix)
     except CriuError as error:
-        return None, Ability(False, str(error), {})
+        return None, CriuSupport(False, str(error), {})
     return found, probe(found)
 
 
-def _lines(found: Criu | None, able: Ability) -> list[tuple[bool, str, str]]:
+def _lines(found: CriuBinary | None, able: CriuSupport) -> list[tuple[bool, str, str]]:
     """Return the lines of the report: success, subject, and result."""
     if found is None:
         return [(False, "program", able.reason)]

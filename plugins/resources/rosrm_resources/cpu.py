@@ -13,7 +13,7 @@ from annotated_types import Gt, Le
 
 from rosrm import ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
-from rosrm_resources.files import KeptFile, ProcessFiles
+from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
 from rosrm_resources.rate import Rate
 
@@ -76,7 +76,7 @@ class MachineCpu:
 
     def __init__(self, window: float, proc: Path = Path("/proc")) -> None:
         self.capacity: Final = machine_cores(proc)
-        self._file = KeptFile(proc / "stat", 256)
+        self._file = OpenFile(proc / "stat", 256)
         busy, total = self._times()
         # A busy machine must not look idle in its first reading, because the master may place work
         # by it.
@@ -180,14 +180,14 @@ class GroupTime:
     def __init__(self, group: Group, directory: Path, root: Path) -> None:
         self._version = group.version
         if group.version == 2:
-            self._file = KeptFile(directory / "cpu.stat", 512)
+            self._file = OpenFile(directory / "cpu.stat", 512)
             return
         # In version 1 another controller counts the time, and it may be mounted elsewhere.
         account = find_group("cpuacct", root)
         if account is not None and not (directory / "cpuacct.usage").exists():
             same = account.mount / directory.relative_to(group.mount)
             directory = same if same.exists() else account.directory
-        self._file = KeptFile(directory / "cpuacct.usage", 64)
+        self._file = OpenFile(directory / "cpuacct.usage", 64)
 
     def seconds(self) -> float:
         """Return the CPU seconds so far."""

@@ -9,10 +9,10 @@ from typing import Final
 
 #: Most processes whose files stay open. Files of further processes are opened for each read, to
 #: stay far below the usual limit of 1,024 descriptors.
-_KEPT_PROCESSES: Final = 128
+_MOST_OPEN_PROCESSES: Final = 128
 
 
-class KeptFile:
+class OpenFile:
     """Open file of /proc or /sys; each read returns the current content from its beginning.
 
     Args:
@@ -44,14 +44,14 @@ class ProcessFiles:
     def __init__(self, proc: Path, name: str) -> None:
         self._proc = str(proc)
         self._name = name
-        self._kept: dict[int, int] = {}
+        self._descriptors: dict[int, int] = {}
         self._pids: Sequence[int] = ()
 
     def read(self, pids: Sequence[int]) -> Iterator[tuple[int, bytes]]:
         """Yield each live process with the content of its file."""
         if pids != self._pids:
             self._pids = pids
-            self._drop(set(self._kept) - set(pids))
+            self._drop(set(self._descriptors) - set(pids))
         for pid in pids:
             content = self._read_one(pid)
             if content:
@@ -59,11 +59,11 @@ class ProcessFiles:
 
     def close(self) -> None:
         """Close all open files."""
-        self._drop(set(self._kept))
+        self._drop(set(self._descriptors))
 
     def _read_one(self, pid: int) -> bytes:
         """Return the content of one file; b"" if the process has ended."""
-        descriptor = self._kept.get(pid)
+        descriptor = self._descriptors.get(pid)
         if descriptor is not None:
             try:
                 return os.pread(descriptor, 1024, 0)
@@ -74,15 +74,15 @@ class ProcessFiles:
             descriptor = os.open(f"{self._proc}/{pid}/{self._name}", os.O_RDONLY | os.O_CLOEXEC)
         except (FileNotFoundError, ProcessLookupError):
             return b""
-        self._kept[pid] = descriptor
+        self._descriptors[pid] = descriptor
         try:
             return os.pread(descriptor, 1024, 0)
         except ProcessLookupError:
             return b""
         finally:
-            if len(self._kept) > _KEPT_PROCESSES:
+            if len(self._descriptors) > _MOST_OPEN_PROCESSES:
                 self._drop({pid})
 
     def _drop(self, pids: set[int]) -> None:
         for pid in pids:
-            os.close(self._kept.pop(pid))
+            os.close(self._descriptors.pop(pid))

@@ -9,7 +9,7 @@ from typing import Final
 
 from rosrm import ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, find_group, read_number
-from rosrm_resources.files import KeptFile, ProcessFiles
+from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
 
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
@@ -57,7 +57,7 @@ class MachineMemory:
     scope: Final = "machine"
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
-        self._file = KeptFile(proc / "meminfo", 256)
+        self._file = OpenFile(proc / "meminfo", 256)
         self.capacity: Final = self._bytes(b"MemTotal:")
 
     def usage(self) -> float:
@@ -123,8 +123,8 @@ class _GroupBytes:
         current = "memory.usage_in_bytes" if version == 1 else "memory.current"
         # In version 1 only the totals include the groups below, as the usage does.
         self._key = b"\ntotal_inactive_file " if version == 1 else b"\ninactive_file "
-        self._current = KeptFile(directory / current, 64)
-        self._stat = KeptFile(directory / "memory.stat")
+        self._current = OpenFile(directory / current, 64)
+        self._stat = OpenFile(directory / "memory.stat")
 
     def read(self) -> float:
         current = int(self._current.read())

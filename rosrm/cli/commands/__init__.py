@@ -22,14 +22,14 @@ import typer
 from rosrm.cli.commands import change, check, follow, inspect, start
 from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
 from rosrm.cli.installed_commands import find_commands, load_command
-from rosrm.cli.options import Common, Domain
+from rosrm.cli.options import CommonOptions, Domain
 from rosrm.cli.process import INTERRUPTED
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress
 from rosrm.version import PROTOCOL_VERSION, __version__
 
 
-class Guarded(PlainGroup):
+class RootGroup(PlainGroup):
     """Root group: reports user errors without a traceback, and includes installed commands."""
 
     @cached_property
@@ -73,7 +73,7 @@ class Guarded(PlainGroup):
 
 
 app = typer.Typer(
-    cls=Guarded,
+    cls=RootGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -109,7 +109,7 @@ def common(
 ) -> None:
     """Decides on which host each process of a ROS 2 application runs, and keeps it running."""
     del version  # handled by its callback
-    ctx.obj = Common(domain, cluster)
+    ctx.obj = CommonOptions(domain, cluster)
 
 
 for module in (start, change, inspect, follow):

@@ -117,13 +117,13 @@ def logs(  # noqa: PLR0917 - an argument for each option
     line gives the dropped size.
     """
     from rosrm.cli.log_copies import copy_logs, since_of
-    from rosrm.cli.output.log_lines import Stream
+    from rosrm.cli.output.log_lines import LogStream
     from rosrm.client.logs import LogSelection
 
     selection = LogSelection(tail or 0, since_of(since), host, follow)
     width = max(map(len, names)) if len(names) > 1 else 0
     streams = [
-        Stream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps)
+        LogStream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps)
         for name in dict.fromkeys(names)
     ]
     with connection.master(ctx, domain) as client:

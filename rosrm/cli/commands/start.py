@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rosrm.cli.options import Common, Domain
+from rosrm.cli.options import CommonOptions, Domain
 from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def master(
     from rosrm.runtime.state_lock import only_one
 
     registry = Registry.discover()
-    file = config or ctx.ensure_object(Common).cluster
+    file = config or ctx.ensure_object(CommonOptions).cluster
     settings = load_cluster(file, registry) if file else default_cluster(registry)
     settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
     if recover:
@@ -129,7 +129,7 @@ def _without_this_folder() -> list[str]:
 
 
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
-    chosen = ctx.ensure_object(Common).domain if domain is None else domain
+    chosen = ctx.ensure_object(CommonOptions).domain if domain is None else domain
     settings = settings if chosen is None else replace(settings, domain=chosen)
     settings.check_domain()
     return settings

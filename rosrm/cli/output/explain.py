@@ -63,12 +63,12 @@ def _headline(story: Mapping[str, Any]) -> Text:
     return text
 
 
-def _kept(kept: list[Mapping[str, Any]]) -> Text:
+def _kept(replicas: list[Mapping[str, Any]]) -> Text:
     """Return the hosts with a replica of the snapshot, and the cycle of each."""
     places = [
         f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
         f"{formats.duration(one['elapsed'])} ago)"
-        for one in kept
+        for one in replicas
     ]
     return Text(f"Snapshots of its state are on {listed(places)}.")
 

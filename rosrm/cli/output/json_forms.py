@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from rosrm.model.codec import to_plain
-from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, Snapshot
+from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
 
 
 def host_form(row: HostRow) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def forms(rows: Sequence[Any]) -> list[dict[str, Any]]:
     return [host_form(row) if isinstance(row, HostRow) else form(row) for row in rows]
 
 
-def status_form(snapshot: Snapshot) -> dict[str, Any]:
+def status_form(snapshot: Listing) -> dict[str, Any]:
     """Return the overview of `rosrm status` as an object."""
     return {
         "master": snapshot.master,

@@ -27,7 +27,7 @@ def show(pieces: Iterable[Piece]) -> None:
 
 
 @dataclass
-class Stream:
+class LogStream:
     """Output of one process in pieces.
 
     Attributes:

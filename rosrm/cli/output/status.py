@@ -10,19 +10,19 @@ from rich.styled import Styled
 from rich.text import Text
 
 from rosrm.cli.output import formats, tables
-from rosrm.model.rows import HostRow, PluginRow, ProcessRow, Snapshot
+from rosrm.model.rows import HostRow, Listing, PluginRow, ProcessRow
 
 #: States of a process that need an operator's attention.
 _TROUBLE = ("stuck", "unreachable", "unknown", "failed", "set_aside", "backoff")
 _MOST_NAMED = 5
 
 
-def render(snapshot: Snapshot) -> RenderableType:
+def render(snapshot: Listing) -> RenderableType:
     """Return the overview of a listing with hosts, processes and the newest events."""
     return Group(*_lines(snapshot))
 
 
-def _lines(snapshot: Snapshot) -> Iterator[RenderableType]:
+def _lines(snapshot: Listing) -> Iterator[RenderableType]:
     yield Text(f"master     {snapshot.master}, up {formats.duration(snapshot.uptime)}")
     yield Text(f"hosts      {_counted(row.state for row in snapshot.hosts)}{_set(snapshot.hosts)}")
     yield Text(f"processes  {_counted(row.state for row in snapshot.processes)}")

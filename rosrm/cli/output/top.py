@@ -1,6 +1,6 @@
 """Live view: hosts with usage and limits, processes, queue, newest events.
 
-The view is a pure function of a `Snapshot` and the width; `rosrm top` and `make demo` show it. If
+The view is a pure function of a `Listing` and the width; `rosrm top` and `make demo` show it. If
 room is short, reasons shrink first, then bars, and then columns are hidden; names stay whole. A
 reason that is too long loses the beginning that it shares with others, and then its end.
 """
@@ -19,7 +19,7 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.text import Text
 
 from rosrm.cli.output import formats, tables
-from rosrm.model.rows import HostRow, ProcessRow, ResourceRow, Snapshot
+from rosrm.model.rows import HostRow, Listing, ProcessRow, ResourceRow
 
 #: Most processes in a view, if the height of the terminal is unknown.
 ROWS: Final = 18
@@ -64,10 +64,10 @@ _RIGHT: Final = ("SINCE", "CPU", "MEMORY")
 
 
 @dataclass(frozen=True)
-class Picture:
+class TopView:
     """View of a listing, for a rich console of any width."""
 
-    snapshot: Snapshot
+    snapshot: Listing
     rows: int
     events: int
     note: str
@@ -92,7 +92,7 @@ class Picture:
 
 
 def render(
-    snapshot: Snapshot, *, rows: int = ROWS, events: int = 4, note: str = "", sort: str = "state",
+    snapshot: Listing, *, rows: int = ROWS, events: int = 4, note: str = "", sort: str = "state",
     foot: str = "",
 ) -> RenderableType:  # fmt: skip
     """Return the view of a listing.
@@ -105,10 +105,10 @@ def render(
         sort: order of the processes, a key of `SORTS`.
         foot: the last line.
     """
-    return Picture(snapshot, rows, events, note, sort, foot)
+    return TopView(snapshot, rows, events, note, sort, foot)
 
 
-def _title(snapshot: Snapshot, note: str, width: int) -> Iterator[Text]:
+def _title(snapshot: Listing, note: str, width: int) -> Iterator[Text]:
     """Yield the title; if it wraps, a number and its state stay on one line."""
     counts = Counter(row.state for row in snapshot.processes)
     states = sorted(counts, key=_rank)

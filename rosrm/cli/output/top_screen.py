@@ -19,7 +19,7 @@ from rich.live import Live
 from rosrm.cli.output import tables, top
 from rosrm.errors import ConfigError, NoMaster
 from rosrm.extensions.units import Quantity
-from rosrm.model.rows import Snapshot
+from rosrm.model.rows import Listing
 
 #: Least seconds between two views.
 LEAST_PERIOD: Final = 0.1
@@ -47,7 +47,7 @@ def sort_of(text: str) -> str:
     return text
 
 
-def show(look: Callable[[], Snapshot], period: float, count: int, sort: str) -> None:
+def show(look: Callable[[], Listing], period: float, count: int, sort: str) -> None:
     """Show views until q or Ctrl-C, or until `count` of them; 0: no limit.
 
     Args:
@@ -71,7 +71,7 @@ def show(look: Callable[[], Snapshot], period: float, count: int, sort: str) -> 
 
 
 def _keep_up_to_date(
-    console: Console, look: Callable[[], Snapshot], period: float, count: int, sort: str
+    console: Console, look: Callable[[], Listing], period: float, count: int, sort: str
 ) -> None:
     """Draw each view over the one before."""
     snapshot, note = look(), ""
@@ -89,7 +89,7 @@ def _keep_up_to_date(
             snapshot, note = _look_again(look, snapshot)
 
 
-def _look_again(look: Callable[[], Snapshot], before: Snapshot) -> tuple[Snapshot, str]:
+def _look_again(look: Callable[[], Listing], before: Listing) -> tuple[Listing, str]:
     try:
         return look(), ""
     except NoMaster:

@@ -21,8 +21,8 @@ from rosrm.model.values import (
     HostDescription,
     InstanceId,
     InstanceStatus,
-    KeptState,
     ProcessSpec,
+    SnapshotReport,
 )
 
 #: Code of an answer to an order.
@@ -43,7 +43,7 @@ class HostRegistered:
     description: HostDescription
     instances: tuple[InstanceStatus, ...] = ()
     journal_seen: int = 0
-    kept: tuple[KeptState, ...] = ()
+    kept: tuple[SnapshotReport, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class KeptStatesReceived:
 
     host_id: int
     incarnation: int
-    states: tuple[KeptState, ...]
+    states: tuple[SnapshotReport, ...]
 
 
 @dataclass(frozen=True, slots=True)

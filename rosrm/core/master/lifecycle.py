@@ -12,16 +12,16 @@ from rosrm.core.master.assignment.reservations import learn_from
 from rosrm.core.master.hosts import readoption
 from rosrm.core.master.master_state import (
     WAITING,
+    DesiredState,
     Instance,
     MasterState,
     Process,
     ProcessPhase,
-    Wanted,
 )
 from rosrm.core.master.migration import failover
 from rosrm.core.master.plugin_failures import note_on_host
 from rosrm.core.master.state.hosts import Host, HostCondition
-from rosrm.core.master.state.migration import End, Run
+from rosrm.core.master.state.migration import End, Migration
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import FenceInstance, Order, ReportInstances, StopInstance
 from rosrm.model.plan import Start
@@ -65,7 +65,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     note_on_host(state, host, event.failing_plugins(), now)
     if event.complete:
         state.missing_since.pop(host.column, None)
-        state.hosts.set_untold(host, untold=False)
+        state.hosts.set_report_due(host, report_due=False)
         reconcile(state, host, event.statuses, now)
         return
     if not is_next:
@@ -97,9 +97,10 @@ def reconcile(
 
 def _yet_to_start(state: MasterState, instance: Instance) -> bool:
     """Return True if a plan has reserved room for an instance and not ordered its start yet."""
-    run = state.runs.get(instance.id.process)
-    return run is not None and any(
-        isinstance(step, Start) and step.instance == instance.id for step in run.ahead
+    migration = state.migrations.get(instance.id.process)
+    return migration is not None and any(
+        isinstance(step, Start) and step.instance == instance.id
+        for step in migration.remaining_steps
     )
 
 
@@ -107,7 +108,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     """Apply the status of one instance."""
     instance = state.instances.get(status.instance.number)
     if instance is None or instance.host is not host or instance.id != status.instance:
-        _take_stranger(state, host, status, now)
+        _handle_unknown_instance(state, host, status, now)
         return
     before = instance.state
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
@@ -126,13 +127,13 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     if process is None:
         return
     if process.restarts != status.restarts:
-        process.out_of_sight = None  # a new run began while its host was silent
+        process.phase_before_loss = None  # a new run began while its host was silent
     process.restarts = status.restarts
-    if process.wanted is not Wanted.RUN and not instance.stopping:
+    if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_instance(state, instance, now)
     if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
         stop_instance(state, instance, now)  # its standby is ready sooner, and with the snapshot
-    if process.name not in state.runs:
+    if process.name not in state.migrations:
         _follow(state, process, instance, status, now, repeated=before is status.state)
 
 
@@ -161,17 +162,19 @@ def _follow(
 
 def phase_of(process: Process, owner: Instance) -> ProcessPhase:
     """Return the phase of a process by the state of the instance that owns its name."""
-    if process.wanted is not Wanted.RUN:
+    if process.wanted is not DesiredState.RUN:
         return ProcessPhase.STOPPING
     return _PHASE.get(owner.state, ProcessPhase.STARTING)
 
 
-def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
+def _handle_unknown_instance(
+    state: MasterState, host: Host, status: InstanceStatus, now: float
+) -> None:
     """Stop an instance that is not assigned to its host, because it may have a successor elsewhere.
 
     The master tracks it until it has ended: it repeats the order to stop, and starts no successor.
     """
-    if readoption.take_back(state, host, status, now):
+    if readoption.readopt(state, host, status, now):
         take_status(state, host, status, now)
         return
     if status.state.ended:
@@ -187,10 +190,10 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
         f"{status.instance} is not assigned to {host.name}: the master {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
-    stranger = adopt_to_stop(state, status.instance, host, now)
-    stranger.state, stranger.pid = status.state, status.pid
-    stranger.at_once = followed
-    stop_instance(state, stranger, now)
+    unknown = adopt_to_stop(state, status.instance, host, now)
+    unknown.state, unknown.pid = status.state, status.pid
+    unknown.at_once = followed
+    stop_instance(state, unknown, now)
     process = state.processes.get(status.instance.process)
     if process is not None and process.phase in WAITING:
         _wait_for_ends(state, process, now)
@@ -199,7 +202,7 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
 def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
     """Track an instance that is only to end; the readings show its usage, so none is reserved."""
     nothing = state.hosts.fractions_of(host, EMPTY)
-    adopted = state.charge_instance(instance, host, now, EMPTY, frozenset(), nothing)
+    adopted = state.reserve(instance, host, now, EMPTY, frozenset(), nothing)
     adopted.stopping = True
     return adopted
 
@@ -226,11 +229,11 @@ def _ended(
     learn_from(state, process.spec, instance, status)
     learn_run_time(state, process.spec, status)
     end = _end(process, instance, status, before)
-    run = state.runs.get(process.name)
-    if run is not None:
-        run.ended[instance.id.number] = end
-        state.save_run(run)
-        if status.state is InstanceState.REFUSED and not _recalled(run, instance):
+    migration = state.migrations.get(process.name)
+    if migration is not None:
+        migration.ended[instance.id.number] = end
+        state.save_migration(migration)
+        if status.state is InstanceState.REFUSED and not _recalled(migration, instance):
             exclude(process, instance.host, status)
     if process.owner != instance.id.number:
         state.record(
@@ -240,7 +243,7 @@ def _ended(
         )  # fmt: skip
         requeue_if_clear(state, process, now)
         return
-    if run is not None:
+    if migration is not None:
         return  # the current plan handles this end
     if instance.restarting:  # it ended before the order to restart arrived
         missed = replace(status, message="it ended before it was restarted")
@@ -258,9 +261,13 @@ def _end(
         and before is not InstanceState.STOPPING
         and status.run_time > 0.0  # else it was stopped before it was started
     )  # fmt: skip
-    told = instance.stopping or instance.recalled or process.wanted is Wanted.REQUEUE
-    told = told or status.state is InstanceState.WITHDRAWN  # the slave stopped it, no order did
-    return End(status, ordered=told and not completed, completed=completed)
+    ordered_to_end = (
+        instance.stopping or instance.recalled or process.wanted is DesiredState.REQUEUE
+    )
+    ordered_to_end = (
+        ordered_to_end or status.state is InstanceState.WITHDRAWN
+    )  # the slave stopped it, no order did
+    return End(status, ordered=ordered_to_end and not completed, completed=completed)
 
 
 def conclude(state: MasterState, process: Process, end: End, host: Host, now: float) -> None:
@@ -270,7 +277,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     status = end.status
     process.owner = 0
     process.exit_code = None if end.gone else status.known_exit
-    if process.wanted is Wanted.CANCEL:
+    if process.wanted is DesiredState.CANCEL:
         _finish(state, process, ProcessPhase.CANCELLED, host, now, "")
     elif end.gone:
         _requeue(state, process, host, now, status.message)
@@ -303,9 +310,11 @@ def exclude(process: Process, host: Host, status: InstanceStatus) -> None:
     process.demand = None
 
 
-def _recalled(run: Run, instance: Instance) -> bool:
+def _recalled(migration: Migration, instance: Instance) -> bool:
     """Return True if a refusal may only mean that the stop arrived before the start."""
-    return instance.stopping or (run.undo is not None and instance.id == run.destination)
+    return instance.stopping or (
+        migration.undo is not None and instance.id == migration.destination
+    )
 
 
 def _finish(
@@ -328,7 +337,7 @@ def _requeue(state: MasterState, process: Process, host: Host, now: float, reaso
         f"{process.name} returns to the queue: {reason}", process=process.name,
         host=host.name,
     )  # fmt: skip
-    process.wanted = Wanted.REQUEUE
+    process.wanted = DesiredState.REQUEUE
     for instance in state.instances_of(process):
         if not instance.stopping:
             stop_instance(state, instance, now)
@@ -339,7 +348,7 @@ def _requeue(state: MasterState, process: Process, host: Host, now: float, reaso
 def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
     """Mark a process to be queued at its place once none of its instances runs."""
     state.unqueue(process)
-    process.wanted = Wanted.REQUEUE
+    process.wanted = DesiredState.REQUEUE
     note_awaited_ends(state, process, now)
     state.save(process)
 
@@ -352,12 +361,17 @@ def note_awaited_ends(state: MasterState, process: Process, now: float) -> None:
 
 def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
     """Queue or cancel a process as desired, unless an instance of it may still run."""
-    if process.owner or process.instances or process.name in state.runs or process.phase.over:
+    if (
+        process.owner
+        or process.instances
+        or process.name in state.migrations
+        or process.phase.is_terminal
+    ):
         return False
-    if process.wanted is Wanted.CANCEL:
+    if process.wanted is DesiredState.CANCEL:
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(now, EventKind.CANCELLED, f"{process.name} cancelled", process=process.name)
-    elif process.wanted is Wanted.REQUEUE:
+    elif process.wanted is DesiredState.REQUEUE:
         state.enqueue(process, now)
     else:
         return False
@@ -375,10 +389,10 @@ def gone(
         return
     status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
     end = End(status, gone=comes_again)
-    run = state.runs.get(process.name)
-    if run is not None:
-        run.ended[instance.id.number] = end
-        state.save_run(run)
+    migration = state.migrations.get(process.name)
+    if migration is not None:
+        migration.ended[instance.id.number] = end
+        state.save_migration(migration)
     elif process.owner == instance.id.number:
         conclude(state, process, end, instance.host, now)
     else:
@@ -398,7 +412,7 @@ def note_phase(state: MasterState, process: Process, owner: Instance, now: float
     """Set the phase of a process without a plan, by its owner and by the owner's host."""
     host = owner.host
     unreachable = state.hosts.why_unreachable(host)
-    if process.wanted is Wanted.CANCEL:
+    if process.wanted is DesiredState.CANCEL:
         where = f"; it may still run on {host.name}, which {unreachable}" if unreachable else ""
         ends = f", and ends when {host.name} returns" if unreachable else ""
         if state.hosts.condition_of(host) is HostCondition.DETACHED:

@@ -9,11 +9,11 @@ from rosrm.core.master.assignment.assign import decide_now
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import (
+    DesiredState,
     Instance,
     MasterState,
     Process,
     ProcessPhase,
-    Wanted,
 )
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -58,7 +58,8 @@ def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
     return HostRow(
         host.description, host.host_id, _CONDITION[condition], host.cordoned,
         host.draining, table.is_accepting(host) and condition is HostCondition.UP,
-        now - float(table.heard[column]), tuple(rows), int(table.processes[column]), host.drained,
+        now - float(table.last_contact[column]), tuple(rows), int(table.processes[column]),
+        host.drained,
     )  # fmt: skip
 
 
@@ -76,7 +77,11 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     reason = reason_of(state, process) or _of_standby(process) or _awaited_node(process, owner)
     if silence and process.phase in _OBSERVED:
         phase, reason = "unknown", f"{silence}; last known: {phase}"
-    if owner is not None and process.wanted is Wanted.CANCEL and process.name not in state.runs:
+    if (
+        owner is not None
+        and process.wanted is DesiredState.CANCEL
+        and process.name not in state.migrations
+    ):
         reason += _awaited(state, owner.host, now)
     elif owner is not None and process.phase is ProcessPhase.STOPPING:
         reason = _stopped_by_slave(state, owner, process.spec.stop, reason)
@@ -95,7 +100,7 @@ def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
     """Return why readings of an instance are old; "" where its host reports."""
     if owner is None or state.hosts.condition_of(owner.host) in _HEARD:
         return ""
-    age = now - float(state.hosts.heard[owner.host.column])
+    age = now - float(state.hosts.last_contact[owner.host.column])
     return f"{owner.host.name} has been silent for {age:.0f} s"
 
 
@@ -113,7 +118,7 @@ def _awaited(state: MasterState, host: Host, now: float) -> str:
     if condition is HostCondition.DETACHED:
         return f" {now - host.detached_since:.0f} s ago"
     if condition is HostCondition.SUSPECT:
-        silence = now - float(state.hosts.heard[host.column])
+        silence = now - float(state.hosts.last_contact[host.column])
         return f": waits for {host.name}, which has been silent for {silence:.0f} s"
     return ""
 
@@ -156,7 +161,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
             filter(None, (_reason(state, process, row), _advice(state, process)))
         ),
         "decision": None if decision is None else {**decision, "elapsed": age},
-        "kept": _kept(state, process, now),
+        "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
         "history": [
             {"elapsed": now - at, "kind": kind, "message": message}
@@ -165,16 +170,16 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
     }  # fmt: skip
 
 
-def _kept(state: MasterState, process: Process, now: float) -> list[Mapping[str, Any]]:
+def _replicas(state: MasterState, process: Process, now: float) -> list[Mapping[str, Any]]:
     """Return the hosts with a replica of the snapshot, the newest first."""
-    holdings = state.keeping.holdings
-    known = holdings.of(process.name)
+    replicas = state.replication.replicas
+    known = replicas.of(process.name)
     return [
         {
             "host": host, "number": known[host].number, "sequence": known[host].sequence,
             "size": known[host].size, "elapsed": now - known[host].since,
         }
-        for host in holdings.hosts_of(process.name, process.born)
+        for host in replicas.hosts_of(process.name, process.born)
     ]  # fmt: skip
 
 

@@ -15,18 +15,18 @@ from rosrm.core.master.hosts.fencing import fence_of
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.master.state.capabilities import Abilities
+from rosrm.core.master.state.capabilities import HostCapabilities
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import LearnedNeeds
-from rosrm.core.master.state.migration import Run, run_to_dict
+from rosrm.core.master.state.migration import Migration, migration_to_dict
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
-from rosrm.core.master.state.process import JOURNALED, Instance, Process, ProcessPhase, Wanted
+from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
-from rosrm.core.master.state.replicas import Keeping
+from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
@@ -41,11 +41,11 @@ _HISTORY: Final = 12
 #: Instance numbers that are reserved durably at a time.
 _RESERVED: Final = 1000
 #: Phases between the rejoin of a host and its report of its instances.
-_ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
+_BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
 #: Phases of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 #: Most removed processes of which replicas are still dropped.
-_REMOVED_KEPT: Final = 10_000
+_MOST_REMOVED: Final = 10_000
 #: Faster than `fields_to_plain`, because a process is saved in the turn of its decision.
 _journaled_of: Final = attrgetter(*JOURNALED)
 #: No instance gets a number as large as this.
@@ -53,33 +53,33 @@ _LARGEST: Final = 2**53
 
 __all__ = [
     "WAITING",
+    "DesiredState",
     "Instance",
     "MasterState",
+    "Migration",
     "Process",
     "ProcessPhase",
-    "Run",
-    "Wanted",
     "larger",
 ]
 
 
 @dataclass(slots=True)
-class Tail:
+class JournalGap:
     """Journal gap: the end of the journal as it was when this master started.
 
     Attributes:
         newest: sequence of its newest record.
         started: time of the start.
-        fell: the machine had rebooted, and not every host has rejoined.
+        machine_rebooted: the machine had rebooted, and not every host has rejoined.
         lost: number of records that are known to be lost.
-        short: some are lost, and some hosts may not have had the time to report since.
+        records_missing: some are lost, and some hosts may not have had the time to report since.
     """
 
     newest: int = _LARGEST
     started: float = 0.0
-    fell: bool = False
+    machine_rebooted: bool = False
     lost: int = 0
-    short: bool = False
+    records_missing: bool = False
 
 
 class MasterState:
@@ -118,21 +118,21 @@ class MasterState:
         self.hosts = HostTable()
         self.queue = Queue()
         self.processes: dict[str, Process] = {}
-        self.over: dict[str, None] = {}
+        self.terminal: dict[str, None] = {}
         self.instances: dict[int, Instance] = {}
-        self.runs: dict[str, Run] = {}
-        self.standbys: dict[str, Run] = {}
+        self.migrations: dict[str, Migration] = {}
+        self.standbys: dict[str, Migration] = {}
         self.wants_standby: set[str] = set()
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.set_aside: set[str] = set()
-        self.orphans: dict[str, set[int]] = {}
+        self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
         self.plugins = PluginCalls()
-        self.keeping = Keeping()
-        self.abilities = Abilities()
+        self.replication = ReplicationState()
+        self.host_capabilities = HostCapabilities()
         self.images = Images()
         self.pending_orders = PendingOrders()
         self.periodic = Periodic()
@@ -140,15 +140,15 @@ class MasterState:
         self.next_instance = 1
         self.reserved_instances = 1
         self.wall = 0.0
-        self.in_company_since = inf
+        self.contact_since = inf
         self.held_since = inf
-        self.tail = Tail()
+        self.journal_gap = JournalGap()
         self.missing_since: dict[int, float] = {}
         self.reviewed = float("-inf")
         self.demands: dict[Any, Demand] = {}
         self._out: list[Command] = []
         self._unsaved: dict[str, Process] = {}
-        self._unsaved_runs: dict[str, Run] = {}
+        self._unsaved_migrations: dict[str, Migration] = {}
 
     # --- what handlers emit --------------------------------------------------------------
 
@@ -161,9 +161,9 @@ class MasterState:
         for process in self._unsaved.values():
             self._out.append(self._intent_of(process))
         self._unsaved.clear()
-        for run in self._unsaved_runs.values():
-            self._out.append(self._intent_of_run(run))
-        self._unsaved_runs.clear()
+        for migration in self._unsaved_migrations.values():
+            self._out.append(self._intent_of_migration(migration))
+        self._unsaved_migrations.clear()
         out, self._out = self._out, []
         return out
 
@@ -188,7 +188,7 @@ class MasterState:
 
     def _intent_of(self, process: Process) -> Intent:
         owner, left = self.instances.get(process.owner), process.left_behind
-        phase, _, began = process.out_of_sight or (process.phase, 0.0, process.wall)
+        phase, _, began = process.phase_before_loss or (process.phase, 0.0, process.wall)
         held = {str(number): self.instances[number].host.name for number in process.instances}
         aliases = {
             str(number): alias
@@ -209,26 +209,26 @@ class MasterState:
         )  # fmt: skip
 
     def _standby_of(self, process: Process) -> Mapping[str, Any] | None:
-        run = self.standbys.get(process.name)
-        return None if run is None else run_to_dict(run, ())
+        migration = self.standbys.get(process.name)
+        return None if migration is None else migration_to_dict(migration, ())
 
-    def save_run(self, run: Run) -> None:
+    def save_migration(self, migration: Migration) -> None:
         """Persist the progress of a migration, as it stands after the current event."""
-        if self.standbys.get(run.process) is run:
-            self.save(self.processes[run.process])
+        if self.standbys.get(migration.process) is migration:
+            self.save(self.processes[migration.process])
             return
-        self._unsaved_runs[run.process] = run
+        self._unsaved_migrations[migration.process] = migration
 
-    def end_run(self, run: Run) -> None:
+    def end_migration(self, migration: Migration) -> None:
         """Remove a migration that has ended."""
-        del self.runs[run.process]
-        self._unsaved_runs.pop(run.process, None)
-        self.emit(Intent("migration", run.process, None))
+        del self.migrations[migration.process]
+        self._unsaved_migrations.pop(migration.process, None)
+        self.emit(Intent("migration", migration.process, None))
 
-    def _intent_of_run(self, run: Run) -> Intent:
-        numbers = sorted(self.processes[run.process].instances)
+    def _intent_of_migration(self, migration: Migration) -> Intent:
+        numbers = sorted(self.processes[migration.process].instances)
         stopping = [number for number in numbers if self.instances[number].stopping]
-        return Intent("migration", run.process, run_to_dict(run, stopping))
+        return Intent("migration", migration.process, migration_to_dict(migration, stopping))
 
     def send(self, host: Host, order: Order, purpose: Purpose | None = None) -> OrderId:
         """Send an order to the slave of a host and return its id.
@@ -249,7 +249,7 @@ class MasterState:
         if process.phase is not phase:
             self._begin_phase(process, phase, now)
         process.reason = reason
-        self._note_whether_over(process)
+        self._update_terminal(process)
 
     def _begin_phase(self, process: Process, phase: ProcessPhase, now: float) -> None:
         """Change the phase and note its start.
@@ -258,11 +258,11 @@ class MasterState:
         """
         before, began = process.phase, (now, self.wall)
         if phase is ProcessPhase.UNREACHABLE:
-            process.out_of_sight = (before, process.since, process.wall)
-        elif process.out_of_sight is not None and phase not in _ON_THE_WAY_BACK:
-            if process.out_of_sight[0] is phase:
-                began = process.out_of_sight[1:]
-            process.out_of_sight = None
+            process.phase_before_loss = (before, process.since, process.wall)
+        elif process.phase_before_loss is not None and phase not in _BEFORE_REPORT:
+            if process.phase_before_loss[0] is phase:
+                began = process.phase_before_loss[1:]
+            process.phase_before_loss = None
         process.phase = phase
         process.since, process.wall = began
 
@@ -270,24 +270,24 @@ class MasterState:
         """Add a process; it replaces a terminal one of the same name."""
         self.processes.pop(process.name, None)  # listings are in order of submission
         self.processes[process.name] = process
-        self._note_whether_over(process)
+        self._update_terminal(process)
 
-    def _note_whether_over(self, process: Process) -> None:
+    def _update_terminal(self, process: Process) -> None:
         """Update `over`, which stays in the order in which processes ended."""
-        if not process.phase.over:
-            self.over.pop(process.name, None)
+        if not process.phase.is_terminal:
+            self.terminal.pop(process.name, None)
             if process.spec.standby.wanted:
                 self.wants_standby.add(process.name)
         else:
-            self.over.setdefault(process.name)
+            self.terminal.setdefault(process.name)
             self.wants_standby.discard(process.name)
 
-    def forget_oldest(self) -> None:
+    def collect_garbage(self) -> None:
         """Forget ended processes beyond the newest `keep_ended` that cannot run any more."""
-        excess = len(self.over) - self.settings.keep_ended
+        excess = len(self.terminal) - self.settings.keep_ended
         if excess <= 0:
             return
-        gone = [name for name in self.over if self.is_gone(self.processes[name])]
+        gone = [name for name in self.terminal if self.is_gone(self.processes[name])]
         for name in gone[:excess]:
             self.remove_process(name)
 
@@ -297,7 +297,7 @@ class MasterState:
 
     def remove_process(self, name: str) -> None:
         """Remove an ended process of which no instance may run from memory and journal."""
-        del self.over[name]
+        del self.terminal[name]
         if self.declared.has_snapshots(self.processes.pop(name).spec):
             self._note_removed(name)
         self._unsaved.pop(name, None)
@@ -305,11 +305,11 @@ class MasterState:
 
     def _note_removed(self, name: str) -> None:
         """Journal the removal of a process with state: a host may return with a replica."""
-        removed = self.keeping.removed
+        removed = self.replication.removed
         removed.pop(name, None)  # oldest first
         removed[name] = self.next_instance
         self.emit(Intent("removed", name, {"next": self.next_instance}))
-        if len(removed) > _REMOVED_KEPT:
+        if len(removed) > _MOST_REMOVED:
             oldest = next(iter(removed))
             del removed[oldest]
             self.emit(Intent("removed", oldest, None))
@@ -317,7 +317,7 @@ class MasterState:
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place in the line."""
         process.owner, process.ended_on = 0, ""
-        process.wanted = Wanted.RUN
+        process.wanted = DesiredState.RUN
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.queue.add(process.name, process.spec.priority, process.order)
 
@@ -364,14 +364,16 @@ class MasterState:
         """Add an instance of a spec, with a reservation on its host."""
         estimate = self.learned.estimate(spec, self.settings.default_needs)
         need = self.hosts.fractions_of(host, estimate.amounts, estimate.estimated)
-        return self.charge_instance(instance, host, now, estimate.amounts, estimate.estimated, need)
+        return self.reserve(instance, host, now, estimate.amounts, estimate.estimated, need)
 
     def _numbers_of(self, name: str) -> set[int]:
         """Return the set of instance numbers of a name, known or not."""
         process = self.processes.get(name)
-        return self.orphans.setdefault(name, set()) if process is None else process.instances
+        return (
+            self.unowned_instances.setdefault(name, set()) if process is None else process.instances
+        )
 
-    def charge_instance(
+    def reserve(
         self, instance: InstanceId, host: Host, now: float, amounts: Mapping[str, float],
         estimated: frozenset[str], need: FloatArray,
     ) -> Instance:  # fmt: skip
@@ -379,21 +381,21 @@ class MasterState:
 
         `need`, (R,), is `amounts` as fractions of the host's capacity.
         """
-        charged = need.copy()
-        charged[charged == np.inf] = 0.0
-        added = Instance(instance, host, now, amounts, estimated, charged)
+        reserved = need.copy()
+        reserved[reserved == np.inf] = 0.0
+        added = Instance(instance, host, now, amounts, estimated, reserved)
         self.instances[instance.number] = added
         host.instances.add(instance.number)
         self._numbers_of(instance.process).add(instance.number)
-        self.hosts.charge(host, charged, processes=1)
+        self.hosts.add_reservation(host, reserved, processes=1)
         return added
 
-    def charge_ranked(
+    def reserve_ranked(
         self, instance: InstanceId, host: Host, now: float, ranking: Ranking
     ) -> Instance:
         """Add an instance with the reservation of the ranking that chose the host."""
         demand = ranking.demand
-        return self.charge_instance(
+        return self.reserve(
             instance, host, now, demand.amounts, demand.estimated, ranking.need[:, host.column]
         )
 
@@ -403,9 +405,9 @@ class MasterState:
         instance.host.instances.discard(instance.id.number)
         name = instance.id.process
         self._numbers_of(name).discard(instance.id.number)
-        if not self.orphans.get(name, True):
-            del self.orphans[name]
-        self.hosts.charge(instance.host, -instance.charged, processes=-1)
+        if not self.unowned_instances.get(name, True):
+            del self.unowned_instances[name]
+        self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
 
     def assignment(
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
@@ -416,10 +418,10 @@ class MasterState:
         kept_on: tuple[str, ...] = ()
         kept_from = 0
         if self.declared.has_snapshots(spec):
-            born = self.processes[spec.name].born if spec.name in self.processes else 0
-            kept_from = max(1, born)  # 0 says that there are no snapshots
+            first_instance = self.processes[spec.name].born if spec.name in self.processes else 0
+            kept_from = max(1, first_instance)  # 0 says that there are no snapshots
             if not shadow and not restored:
-                kept_on = self.keeping.in_reach(spec.name, born, self.hosts)
+                kept_on = self.replication.in_reach(spec.name, first_instance, self.hosts)
         return Assignment(
             instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, kept_from,
             restored,

@@ -8,7 +8,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.hosts.liveness import lease_of
-from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Wanted
+from rosrm.core.master.master_state import DesiredState, MasterState, Process, ProcessPhase
 from rosrm.core.master.requests import count, known_host, known_processes, refuse
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.extensions.contracts import Intent
@@ -26,14 +26,14 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
             return
         processes, hosts = found
     else:
-        ended = [state.processes[name] for name in state.over]
-        processes = [process for process in ended if not _why_kept(state, process)]
+        ended = [state.processes[name] for name in state.terminal]
+        processes = [process for process in ended if not _why_not_pruned(state, process)]
         left = [
             host
             for host in state.hosts.listed()
             if state.hosts.condition_of(host) in _DEPARTED and not host.instances
         ]
-        hosts = [host for host in left if not _why_held(state, host, now)]
+        hosts = [host for host in left if not _why_not_pruned_host(state, host, now)]
     for process in processes:
         state.remove_process(process.name)
     left_running = [_prune_host(state, host, event.by, now) for host in hosts]
@@ -58,8 +58,8 @@ def _named(
         if host is None:
             return None
         hosts.append(host)
-    faults = [_why_kept(state, process) for process in processes]
-    faults += [_why_held(state, host, now) for host in hosts]
+    faults = [_why_not_pruned(state, process) for process in processes]
+    faults += [_why_not_pruned_host(state, host, now) for host in hosts]
     for fault in faults:
         if fault:
             refuse(state, event.request, f"{fault}. Nothing was removed")
@@ -67,9 +67,9 @@ def _named(
     return processes, hosts
 
 
-def _why_kept(state: MasterState, process: Process) -> str:
+def _why_not_pruned(state: MasterState, process: Process) -> str:
     """Return why a process cannot be removed; "" if it can."""
-    if not process.phase.over:
+    if not process.phase.is_terminal:
         return f"{process.name} is {process.phase.value}; cancel it first"
     if process.instances:
         instance = state.instances[min(process.instances)]
@@ -77,13 +77,13 @@ def _why_kept(state: MasterState, process: Process) -> str:
     return "" if state.is_gone(process) else f"the standby of {process.name} is being ended"
 
 
-def _why_held(state: MasterState, host: Host, now: float) -> str:
+def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:
     """Return why a host cannot be removed; "" if it can."""
     condition = state.hosts.condition_of(host)
     if condition is HostCondition.UP:
         return f"{host.name} is up; stop its slave first"
     if condition is HostCondition.SUSPECT:
-        silence = now - float(state.hosts.heard[host.column])
+        silence = now - float(state.hosts.last_contact[host.column])
         return (
             f"{host.name} is suspect: it has not reported for {silence:.1f} s and may report "
             f"again. Stop its slave if it runs; a host can be pruned once it has left or is lost, "
@@ -91,7 +91,7 @@ def _why_held(state: MasterState, host: Host, now: float) -> str:
         )
     held = [state.instances[number] for number in sorted(host.instances)]
     owned = [one.id.process for one in held if (process := state.owned_by(one)) is not None
-             and process.wanted is not Wanted.CANCEL]  # fmt: skip
+             and process.wanted is not DesiredState.CANCEL]  # fmt: skip
     if owned and condition is HostCondition.LEFT:
         end = "it has ended" if len(owned) == 1 else "they have ended"
         return f"{host.name} is still stopping {listed(owned)}; wait until {end}"
@@ -99,7 +99,7 @@ def _why_held(state: MasterState, host: Host, now: float) -> str:
         them = "it" if len(owned) == 1 else "them"
         return f"{host.name} may still run {listed(owned)}; cancel {them} first"
     for instance in held:
-        if instance.id.process in state.runs:
+        if instance.id.process in state.migrations:
             return f"{instance.id.process} is moving from or to {host.name}"
     for name in state.images.of:
         image = state.processes[name].image

@@ -13,7 +13,7 @@ from rosrm.core.master.checkpoint import image_requests, images, replication
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
-from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase, Wanted
+from rosrm.core.master.master_state import WAITING, DesiredState, MasterState, Process, ProcessPhase
 from rosrm.core.master.migration.eviction import departures, try_move
 from rosrm.core.master.migration.start import why_busy
 from rosrm.core.master.outcomes import Rejected
@@ -54,7 +54,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     if fault:
         refuse(state, event.request, fault)
         return
-    live = (one.spec for one in state.processes.values() if not one.phase.over)
+    live = (one.spec for one in state.processes.values() if not one.phase.is_terminal)
     shared = shared_nodes(event.specs, live)
     for spec in event.specs:
         process = Process(
@@ -83,12 +83,12 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
         return f"submitted twice at once: {listed(twice)}; names are unique. Nothing was queued"
     taken = [
         spec.name for spec in event.specs
-        if spec.name in state.processes and not state.processes[spec.name].phase.over
+        if spec.name in state.processes and not state.processes[spec.name].phase.is_terminal
     ]  # fmt: skip
     if taken:
         return f"{'; '.join(_in_use(state, taken))}. Nothing was queued"
     for spec in event.specs:
-        if spec.name in state.processes or spec.name in state.orphans:
+        if spec.name in state.processes or spec.name in state.unowned_instances:
             left = _still_stopping(state, spec.name)
             if left:
                 return f"{left}. Nothing was queued"
@@ -97,18 +97,18 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
 
 def _in_use(state: MasterState, taken: list[str]) -> list[str]:
     """Return sentences: the names belong to live processes, and what frees them."""
-    live = [name for name in taken if state.processes[name].wanted is not Wanted.CANCEL]
+    live = [name for name in taken if state.processes[name].wanted is not DesiredState.CANCEL]
     ending: dict[str, list[str]] = {}
     for name in taken:
         if name not in live:
             ending.setdefault(state.processes[name].reason, []).append(name)
-    said = [f"{_names(alike)} still in use: {reason}" for reason, alike in ending.items()]
+    phrases = [f"{_names(alike)} still in use: {reason}" for reason, alike in ending.items()]
     if live:
-        said.append(
+        phrases.append(
             f"{_names(live)} in use already; `rosrm cancel` with the name or the file cancels "
             f"{'it' if len(live) == 1 else 'them'}"
         )
-    return said
+    return phrases
 
 
 def _names(names: list[str]) -> str:
@@ -118,7 +118,7 @@ def _names(names: list[str]) -> str:
 def _still_stopping(state: MasterState, name: str) -> str:
     """Return a sentence on an earlier instance that may still run; "" for none."""
     process = state.processes.get(name)
-    numbers = state.orphans.get(name) if process is None else process.instances
+    numbers = state.unowned_instances.get(name) if process is None else process.instances
     if not numbers:
         return ""
     instance = state.instances[min(numbers)]
@@ -187,33 +187,33 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
     processes = known_processes(state, event.request, event.names)
     if processes is None:
         return
-    over = [process.name for process in processes if process.phase.over]
+    terminal = [process.name for process in processes if process.phase.is_terminal]
     for process in processes:
-        if not process.phase.over:
+        if not process.phase.is_terminal:
             _cancel(state, process, now, event.by)
-    state.emit(Reply(event.request, message=_cancelled(state, processes, over)))
+    state.emit(Reply(event.request, message=_cancelled(state, processes, terminal)))
 
 
-def _cancelled(state: MasterState, processes: Iterable[Process], over: list[str]) -> str:
-    """Return the outcome of a cancellation; `over`: names that had ended before."""
-    asked = [process for process in processes if process.name not in over]
-    pending = [process for process in asked if not process.phase.over]
-    said = [f"{count(len(asked) - len(pending))} cancelled"] if len(asked) > len(pending) else []
+def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[str]) -> str:
+    """Return the outcome of a cancellation; `terminal`: names that had ended before."""
+    asked = [process for process in processes if process.name not in terminal]
+    pending = [process for process in asked if not process.phase.is_terminal]
+    phrases = [f"{count(len(asked) - len(pending))} cancelled"] if len(asked) > len(pending) else []
     if pending:
-        said.append(f"{count(len(pending))} being cancelled")
-    said += [
+        phrases.append(f"{count(len(pending))} being cancelled")
+    phrases += [
         f"{process.name} is {process.reason}"
         for process in pending
         if (owner := state.instances.get(process.owner)) is not None
         and state.hosts.why_unreachable(owner.host)
     ]
-    if over:
-        said.append(f"ended before: {listed(over)}")
-    return "; ".join(said)
+    if terminal:
+        phrases.append(f"ended before: {listed(terminal)}")
+    return "; ".join(phrases)
 
 
 def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
-    process.wanted, process.left_behind = Wanted.CANCEL, None
+    process.wanted, process.left_behind = DesiredState.CANCEL, None
     state.record(
         now,
         EventKind.CANCEL_REQUESTED,
@@ -227,18 +227,18 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
         state.record(
             now, EventKind.CANCELLED, f"{process.name} cancelled in the queue", process=process.name
         )
-    elif process.image is not None and process.name not in state.runs:
+    elif process.image is not None and process.name not in state.migrations:
         images.drop(state, process)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(
             now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
             process=process.name,
         )  # fmt: skip
-    elif process.owner == 0 and process.name not in state.runs:
+    elif process.owner == 0 and process.name not in state.migrations:
         # Its owner has ended, and former instances are being stopped.
         if not lifecycle.requeue_if_clear(state, process, now):
             lifecycle.note_awaited_ends(state, process, now)
-    elif process.name not in state.runs:  # otherwise the current plan turns back first
+    elif process.name not in state.migrations:  # otherwise the current plan turns back first
         owner = state.instances[process.owner]
         lifecycle.note_phase(state, process, owner, now)
         lifecycle.stop_instance(state, owner, now)
@@ -265,11 +265,11 @@ def _restart_fault(state: MasterState, process: Process) -> str:
         return f"{process.name} is set aside: {process.reason}"
     if process.phase in WAITING:
         return f"{process.name} waits in the queue already"
-    if process.name in state.runs:
-        return why_busy(state.runs[process.name])
-    if process.phase.over or process.image is not None:
+    if process.name in state.migrations:
+        return why_busy(state.migrations[process.name])
+    if process.phase.is_terminal or process.image is not None:
         return _still_stopping(state, process.name)
-    if process.wanted is not Wanted.RUN:
+    if process.wanted is not DesiredState.RUN:
         return f"{process.name} is being stopped"
     if process.phase is ProcessPhase.UNREACHABLE:
         return f"{process.name} is out of reach: {process.reason}"
@@ -284,7 +284,7 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
         process=process.name,
         by=by,
     )
-    if process.phase.over or process.image is not None:
+    if process.phase.is_terminal or process.image is not None:
         images.drop(state, process)
         replication.begin_anew(state, process)
         process.excluded.clear()
@@ -319,7 +319,7 @@ def migration_requested(state: MasterState, event: happened.MigrationRequested, 
         _note_refused_move(state, process, rejected.reason, now)
         refuse(state, event.request, rejected.reason)
         return
-    name = state.runs[process.name].destination_host.name
+    name = state.migrations[process.name].destination_host.name
     state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
 
 
@@ -355,9 +355,9 @@ def _begin(
     if rejected is not None:
         refuse(state, event.request, rejected.reason)
         return
-    run = state.runs[event.name]
-    message = f"{event.name}: {run.course}"
-    state.emit(Reply(event.request, message=message, host=run.source_host.name))
+    migration = state.migrations[event.name]
+    message = f"{event.name}: {migration.progress_text}"
+    state.emit(Reply(event.request, message=message, host=migration.source_host.name))
 
 
 def asked_for(by: str) -> str:
@@ -393,13 +393,13 @@ def host_state_requested(
     state.hosts.set_closed(
         host, cordoned=event.action != "uncordon", draining=event.action == "drain"
     )
-    host.told.clear()
+    host.recorded_at.clear()
     host.blocked.clear()
     save_host(state, host)
     done = kind.removeprefix("host_")
     state.record(now, kind, f"{host.name} is {done}", host=host.name, by=event.by)
     reconsider_set_aside(state, now)
-    said = f"{host.name} is {done}"
+    phrases = f"{host.name} is {done}"
     if host.draining:
-        said = f"{said}: {departures(state, host)}"
-    state.emit(Reply(event.request, message=said))
+        phrases = f"{phrases}: {departures(state, host)}"
+    state.emit(Reply(event.request, message=phrases))

@@ -7,7 +7,7 @@ from typing import Final
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
-from rosrm.core.master.assignment.reservations import settle_charge
+from rosrm.core.master.assignment.reservations import settle_reservation
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.commands import Redeliver, Withdraw
 from rosrm.core.master.hosts import capabilities
@@ -15,13 +15,13 @@ from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
 from rosrm.core.master.lifecycle import stop_instance
 from rosrm.core.master.master_state import (
+    DesiredState,
     Instance,
     MasterState,
     Process,
     ProcessPhase,
-    Wanted,
 )
-from rosrm.core.master.migration.eviction import relieve_hosts
+from rosrm.core.master.migration.eviction import evict_from_hosts
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
 from rosrm.model.orders import ReportInstances
@@ -46,11 +46,11 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     _ask_for_missing_statuses(state, now)
     capabilities.ask_hosts(state, now)
     images.review(state, now)
-    relieve_hosts(state, now)
+    evict_from_hosts(state, now)
     replication.review(state, now)
     periodic.review(state, now)
     reconsider_set_aside(state, now)
-    state.forget_oldest()
+    state.collect_garbage()
 
 
 def _review_instance(state: MasterState, instance: Instance, now: float) -> None:
@@ -58,11 +58,11 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
     if instance.state is None:
         _review_delivery(state, instance, age, now)
     if waits_too_long(instance, now):
-        _take_back(state, instance, now)
+        _cancel_prefetch(state, instance, now)
     if instance.stopping and now - instance.order_at >= state.settings.order_retry:
         stop_instance(state, instance, now)
     if not instance.settled and age >= state.settings.settle:
-        settle_charge(state, instance, now)
+        settle_reservation(state, instance, now)
 
 
 def _review_delivery(state: MasterState, instance: Instance, age: float, now: float) -> None:
@@ -72,19 +72,23 @@ def _review_delivery(state: MasterState, instance: Instance, age: float, now: fl
         return
     if age >= state.settings.delivery_timeout:
         _withdraw(state, process, instance, now)
-    elif age >= state.settings.order_retry and not instance.given_again:
-        instance.given_again = True
+    elif age >= state.settings.order_retry and not instance.redelivered:
+        instance.redelivered = True
         assignment = state.assignment(instance.id, process.spec)
         order_id = state.pending_orders.add()
         state.emit(Redeliver(order_id, instance.host.host_id, assignment))
 
 
-def _take_back(state: MasterState, instance: Instance, now: float) -> None:
+def _cancel_prefetch(state: MasterState, instance: Instance, now: float) -> None:
     """Return a prefetched process to its place in the queue, because its slot stays taken."""
     review_slots(state, instance.host, now)
     process = state.owned_by(instance)
-    if process is not None and process.wanted is Wanted.RUN and process.name not in state.runs:
-        process.wanted = Wanted.REQUEUE
+    if (
+        process is not None
+        and process.wanted is DesiredState.RUN
+        and process.name not in state.migrations
+    ):
+        process.wanted = DesiredState.REQUEUE
         state.save(process)
         stop_instance(state, instance, now)
 
@@ -93,8 +97,8 @@ def _withdraw(state: MasterState, process: Process, instance: Instance, now: flo
     """Withdraw an assignment that was not accepted; its process is queued again in any case."""
     if now - instance.order_at < state.settings.delivery_timeout:
         return
-    if process.wanted is Wanted.RUN:
-        process.wanted = Wanted.REQUEUE
+    if process.wanted is DesiredState.RUN:
+        process.wanted = DesiredState.REQUEUE
         state.save(process)
     instance.order_at = now
     state.emit(Withdraw(state.pending_orders.add(), instance.host.host_id, instance.id))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rosrm.core.slave.watches import Look, Memo
+from rosrm.core.slave.watches import Memo, Observation
 from rosrm.model.values import Assignment, InstanceId, InstanceStatus, RestartPolicy
 
 
@@ -61,7 +61,7 @@ class FenceOrdered:
 
 
 @dataclass(frozen=True, slots=True)
-class MasterHears:
+class ContactConfirmed:
     """The master reported that it receives messages from this host.
 
     Attributes:
@@ -138,7 +138,7 @@ class LookedAt:
 
     instance: InstanceId
     pid: int
-    look: Look
+    look: Observation
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ Event = (
     | LaunchRefused
     | StopOrdered
     | FenceOrdered
-    | MasterHears
+    | ContactConfirmed
     | RestartOrdered
     | RestartPolicySet
     | RestartPolicyRecorded

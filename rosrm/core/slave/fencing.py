@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from rosrm.core.slave.commands import Command, Renew
-from rosrm.core.slave.events import MasterHears
+from rosrm.core.slave.events import ContactConfirmed
 from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import Assignment, InstanceId
 
@@ -17,9 +17,9 @@ from rosrm.model.values import Assignment, InstanceId
 RENEW_PERIOD: Final = 0.1
 
 
-def master_hears(state: SlaveState, event: MasterHears, now: float) -> list[Command]:
+def contact_confirmed(state: SlaveState, event: ContactConfirmed, now: float) -> list[Command]:
     """Note the last contact, and renew the fences."""
-    state.heard_at = max(state.heard_at, event.at)
+    state.last_contact = max(state.last_contact, event.at)
     return renew_in_time(state, now)
 
 
@@ -33,13 +33,13 @@ def renew(state: SlaveState, now: float) -> list[Command]:
     if not any(held.fenced and not held.status.state.ended for held in state.held.values()):
         return []
     state.renewed_at = now
-    return [Renew(state.heard_at, now)]
+    return [Renew(state.last_contact, now)]
 
 
 def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
     """Return why an instance must not be started any more; "" if it may."""
     fence = assignment.fence
-    if fence is None or fence.alive or now < state.heard_at + fence.after:
+    if fence is None or fence.alive or now < state.last_contact + fence.after:
         return ""
     return (
         f"fenced before it was started: no confirmed contact with the master for {fence.after:g} s"

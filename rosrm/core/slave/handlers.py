@@ -23,10 +23,10 @@ from rosrm.core.slave.commands import (
 )
 from rosrm.core.slave.events import (
     AssignmentsReceived,
+    ContactConfirmed,
     FenceOrdered,
     LaunchRefused,
     LookedAt,
-    MasterHears,
     MasterLost,
     Registered,
     ReportRequested,
@@ -39,8 +39,8 @@ from rosrm.core.slave.events import (
     SupervisorReported,
     TimePassed,
 )
-from rosrm.core.slave.health import Judgement, watch_of
-from rosrm.core.slave.state import Held, SlaveState, awaits_graph, qualified_name
+from rosrm.core.slave.health import InstanceHealth, watch_of
+from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph, qualified_name
 from rosrm.core.slave.watches import Awaited, Memo
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
 
@@ -60,9 +60,9 @@ def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
         state.tombstones.clear()
     for held in state.held.values():
         held.ended_at = max(held.ended_at, now)  # reported with the registration, not before
-    if not state.unheard:
+    if not state.report_unconfirmed:
         return []
-    state.unheard = False
+    state.report_unconfirmed = False
     # Not complete: a late report must not deny assignments made since.
     return [Report(state.statuses())]
 
@@ -80,7 +80,7 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
             continue  # the order arrived twice
         status = _refused(state, assignment, event.given_at, now)
         if status is not None:
-            state.held[instance] = Held(status, ended_at=now)
+            state.held[instance] = HeldInstance(status, ended_at=now)
             _bury(state, instance)
             refusals.append(status)
             continue
@@ -108,7 +108,7 @@ def _refused(
     return None
 
 
-def _waiting(assignment: Assignment) -> Held:
+def _waiting(assignment: Assignment) -> HeldInstance:
     spec = assignment.spec
     awaited = None
     if awaits_graph(spec) and not assignment.restored:  # a restored one joins the graph later
@@ -116,7 +116,7 @@ def _waiting(assignment: Assignment) -> Held:
         awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)
     watch, fenced = watch_of(assignment), assignment.fence is not None
-    return Held(status, spec, awaited, watch=watch, fenced=fenced)
+    return HeldInstance(status, spec, awaited, watch=watch, fenced=fenced)
 
 
 def _start_waiting(state: SlaveState, now: float) -> _Commands:
@@ -136,7 +136,7 @@ def _refuse_late(state: SlaveState, now: float) -> _Commands:
     for instance, why in late.items():
         del state.waiting[instance]
         status = InstanceStatus(instance, InstanceState.FENCED, message=why)
-        state.held[instance] = Held(status, ended_at=now)
+        state.held[instance] = HeldInstance(status, ended_at=now)
         _bury(state, instance)
     return [Report(tuple(state.held[one].status for one in late))] if late else []
 
@@ -171,7 +171,7 @@ def _end_ordered(state: SlaveState, event: StopOrdered | FenceOrdered, now: floa
     status = InstanceStatus(
         instance, InstanceState.REFUSED, message="it was stopped before it was started"
     )
-    state.held[instance] = Held(status, ended_at=now)
+    state.held[instance] = HeldInstance(status, ended_at=now)
     return [Report((status,))]
 
 
@@ -208,7 +208,7 @@ def _restart_policy_set(state: SlaveState, event: RestartPolicySet, now: float) 
     return [Amend(event.instance, event.restart), *remember]
 
 
-def _pause_or_watch(held: Held, order: RestartPolicySet) -> bool:
+def _pause_or_watch(held: HeldInstance, order: RestartPolicySet) -> bool:
     """Pause or resume the health watch by the restart policy; return True if that changed.
 
     A migration turns the restarts off and on again. An instance that is never restarted shows no
@@ -277,7 +277,7 @@ def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: floa
     ]  # fmt: skip
 
 
-def _amend_again(order: RestartPolicySet, held: Held, *, lost: bool) -> Command:
+def _amend_again(order: RestartPolicySet, held: HeldInstance, *, lost: bool) -> Command:
     """Return the command that repeats an order which may be lost with the supervisor."""
     if held.status.state.ended:
         return Settle(order.instance, order.restart)
@@ -291,7 +291,7 @@ def _follow(
     held = state.held.get(reported.instance)
     if held is None:
         known = memo or Memo()
-        held = state.held[reported.instance] = Held(
+        held = state.held[reported.instance] = HeldInstance(
             reported, awaited=known.awaited, watch=known.watch
         )
         if reported.state is InstanceState.RUNNING:
@@ -309,7 +309,7 @@ def _follow(
     return held.status
 
 
-def _running(held: Held, reported: InstanceStatus, now: float) -> InstanceStatus:
+def _running(held: HeldInstance, reported: InstanceStatus, now: float) -> InstanceStatus:
     """Return the status of a new run: ready at once, or after it is seen in the graph."""
     if held.awaited is None or held.awaited.seen == reported.pid:
         return replace(reported, state=InstanceState.READY)
@@ -317,7 +317,7 @@ def _running(held: Held, reported: InstanceStatus, now: float) -> InstanceStatus
     return reported
 
 
-def _with_unready(held: Held, reported: InstanceStatus) -> InstanceStatus:
+def _with_unready(held: HeldInstance, reported: InstanceStatus) -> InstanceStatus:
     if not held.unready or not reported.state.ended:
         return reported
     return replace(reported, state=InstanceState.FAILED, message=held.unready)
@@ -341,7 +341,7 @@ def _looked_at(state: SlaveState, event: LookedAt, now: float) -> _Commands:
     if held is None or watch is None or held.status.pid != event.pid:
         return []
     if held.judgement is None or held.judgement.pid != event.pid:
-        held.judgement = Judgement(watch, event.pid, now)
+        held.judgement = InstanceHealth(watch, event.pid, now)
     reason = held.judgement.look(event.look, now)
     if not reason:
         return []
@@ -349,7 +349,7 @@ def _looked_at(state: SlaveState, event: LookedAt, now: float) -> _Commands:
     return [Fail(event.instance, event.pid, reason, kill=event.look.stopped)]
 
 
-def _may_be_forgotten(state: SlaveState, held: Held, now: float) -> bool:
+def _may_be_discarded(state: SlaveState, held: HeldInstance, now: float) -> bool:
     return state.registered and now - held.ended_at >= REMEMBER_END
 
 
@@ -365,7 +365,7 @@ def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
                 f"this instance was seen in the ROS graph"
             )
             commands.append(Stop(instance))
-        elif held.status.state.ended and _may_be_forgotten(state, held, now):
+        elif held.status.state.ended and _may_be_discarded(state, held, now):
             forgotten.append(instance)
     if forgotten:
         for instance in forgotten:
@@ -386,7 +386,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         LaunchRefused: _launch_refused,
         StopOrdered: _end_ordered,
         FenceOrdered: _end_ordered,
-        MasterHears: fencing.master_hears,
+        ContactConfirmed: fencing.contact_confirmed,
         RestartOrdered: _restart_ordered,
         RestartPolicySet: _restart_policy_set,
         RestartPolicyRecorded: _restart_policy_recorded,

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from rosrm.core.slave.watches import NO_ANSWER, Look, Watch
+from rosrm.core.slave.watches import NO_ANSWER, Observation, Watch
 from rosrm.model.values import Assignment, Health
 
 #: Seconds between two looks.
@@ -98,7 +98,7 @@ class _Lasting:
         self.amiss = amiss
 
 
-class Judgement:
+class InstanceHealth:
     """The health of one run of an instance.
 
     Args:
@@ -116,25 +116,25 @@ class Judgement:
         self.pid = pid
         self._watch = watch
         self._looked = now
-        self._stride = max(_STRIDE * watch.wanted.timeout, _LEAST_STRIDE)
+        self._stride = max(_STRIDE * watch.checks.timeout, _LEAST_STRIDE)
         self._stopped = _Lasting()
         self._lifecycle = _Lasting()
-        self._rate = _Rate(watch.wanted)
+        self._rate = _Rate(watch.checks)
 
-    def look(self, seen: Look, now: float) -> str:
+    def look(self, seen: Observation, now: float) -> str:
         """Add a look; return the checks that have failed for too long, as text; "": none."""
         gap = now - self._looked
         passed = min(gap, self._stride)
         self._looked = now
         self._stopped.note(seen.stopped, passed)
-        self._lifecycle.note(seen.state not in (None, self._watch.wanted.lifecycle), passed)
+        self._lifecycle.note(seen.state not in (None, self._watch.checks.lifecycle), passed)
         if self._watch.topics:
             self._rate.look(seen, now, passed, missed=gap > self._stride)
         reasons = "; ".join(self._reasons(seen))
         return f"unhealthy: {reasons}" if reasons else ""
 
-    def _reasons(self, seen: Look) -> Iterator[str]:
-        wanted = self._watch.wanted
+    def _reasons(self, seen: Observation) -> Iterator[str]:
+        wanted = self._watch.checks
         if self._stopped.seconds > wanted.timeout:
             yield f"stopped by a signal (SIGSTOP) for {self._stopped.seconds:.1f} s"
         if self._lifecycle.seconds > wanted.timeout:
@@ -156,7 +156,7 @@ class _Rate:
         amiss: duration for which the rate has been too low.
     """
 
-    __slots__ = ("_counts", "_heard", "_heard_amiss", "_idle", "_least", "_window", "amiss")
+    __slots__ = ("_counts", "_idle", "_least", "_messages", "_messages_amiss", "_window", "amiss")
 
     def __init__(self, wanted: Health) -> None:
         self.amiss = _Lasting()
@@ -166,35 +166,35 @@ class _Rate:
             self._window = max(self._window, _PERIODS / wanted.rate)
         self._idle = wanted.timeout  # seconds that a node has until it must publish
         self._counts: deque[tuple[float, int]] = deque()
-        self._heard = 0
-        self._heard_amiss = 0
+        self._messages = 0
+        self._messages_amiss = 0
 
     @property
     def found(self) -> float:
         """Return the rate in Hz while it was too low."""
-        return self._heard_amiss / self.amiss.seconds
+        return self._messages_amiss / self.amiss.seconds
 
-    def look(self, seen: Look, now: float, passed: float, *, missed: bool) -> None:
+    def look(self, seen: Observation, now: float, passed: float, *, missed: bool) -> None:
         """Count messages; `missed`: the last look is so long ago that some may have been lost."""
-        if seen.heard is None or missed:
+        if seen.messages is None or missed:
             self._counts.clear()
-        self._heard += seen.heard or 0
+        self._messages += seen.messages or 0
         amiss = self._is_amiss(seen, now)
         self._idle -= passed
         if amiss is None or self._idle > 0.0:
             return
         was_amiss = self.amiss.amiss
         self.amiss.note(amiss, passed)
-        self._heard_amiss = self._heard_amiss + (seen.heard or 0) if was_amiss else 0
+        self._messages_amiss = self._messages_amiss + (seen.messages or 0) if was_amiss else 0
 
-    def _is_amiss(self, seen: Look, now: float) -> bool | None:
+    def _is_amiss(self, seen: Observation, now: float) -> bool | None:
         """Return True if the rate is too low; None: not observed for long enough."""
-        if seen.heard is None:
+        if seen.messages is None:
             return True
-        self._counts.append((now, self._heard))
+        self._counts.append((now, self._messages))
         while len(self._counts) > 1 and self._counts[1][0] <= now - self._window:
             self._counts.popleft()
         since, before = self._counts[0]
         if now - since < self._window:
             return None
-        return self._heard - before + _SLACK < self._least * (now - since)
+        return self._messages - before + _SLACK < self._least * (now - since)

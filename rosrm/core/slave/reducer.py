@@ -11,7 +11,7 @@ AssignmentsReceived     has them launched, once, or holds them until a slot is f
 LaunchRefused           reports that the host cannot run it, and why
 StopOrdered             has it stopped; one never heard of will never be started
 FenceOrdered            the same, but at once
-MasterHears             tells the supervisor, where there is a fence that this renews
+ContactConfirmed        tells the supervisor, where there is a fence that this renews
 RestartOrdered          has it stopped and started again here
 RestartPolicySet        has the supervisor keep it, unless it has ended or is not known: settled
 RestartPolicyRecorded   the supervisor has it in its record: settled
@@ -46,7 +46,7 @@ def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
     """
     commands = HANDLERS[type(event)](state, event, now)
     if not state.registered and any(isinstance(command, Report) for command in commands):
-        state.unheard = True
+        state.report_unconfirmed = True
     return commands
 
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.slave.health import Judgement
+from rosrm.core.slave.health import InstanceHealth
 from rosrm.core.slave.watches import Awaited, Memo, Watch
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -26,7 +26,7 @@ _SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.u
 
 
 @dataclass(slots=True)
-class Held:
+class HeldInstance:
     """One instance on this host.
 
     Attributes:
@@ -47,7 +47,7 @@ class Held:
     awaited: Awaited | None = None
     ready_by: float | None = None
     watch: Watch | None = None
-    judgement: Judgement | None = None
+    judgement: InstanceHealth | None = None
     fenced: bool = False
     unready: str = ""
     unsettled: tuple[RestartPolicy, ...] = ()
@@ -74,10 +74,10 @@ class SlaveState:
         max_starting: most that are started at a time, until they are ready; 0: no bound.
         max_age: seconds after which an assignment that was under way is not accepted.
         waiting: assignments to be started as soon as the bounds allow, in order.
-        unheard: a report was made while no master had registered this host: perhaps after the
-            registration was sent.
-        heard_at: last contact: newest known time at which the master received from this host; 0:
-            unknown.
+        report_unconfirmed: a report was made while no master had registered this host: perhaps
+            after the registration was sent.
+        last_contact: last contact: newest known time at which the master received from this host;
+            0: unknown.
         renewed_at: time of the last `Renew` to the supervisor.
     """
 
@@ -86,18 +86,18 @@ class SlaveState:
     max_age: float = inf
     epoch: int = 0
     registered: bool = False
-    unheard: bool = False
-    heard_at: float = 0.0
+    report_unconfirmed: bool = False
+    last_contact: float = 0.0
     renewed_at: float = 0.0
-    held: dict[InstanceId, Held] = field(default_factory=dict)
+    held: dict[InstanceId, HeldInstance] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
-    def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
+    def awaited_in_graph(self) -> Mapping[InstanceId, HeldInstance]:
         """Return the instances that become ready when seen in the ROS graph."""
         return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
 
-    def watched(self) -> Mapping[InstanceId, Held]:
+    def watched(self) -> Mapping[InstanceId, HeldInstance]:
         """Return the instances whose health is watched now."""
         return {one: held for one, held in self.held.items() if held.watched is not None}
 

@@ -31,14 +31,14 @@ class Watch:
     """Health checks of an instance that is ready.
 
     Attributes:
-        wanted: as its spec declares.
+        checks: as its spec declares.
         topics: absolute names, on one of which it must publish; (): none.
         services: absolute names under which its lifecycle state is queried; (): it is not.
         restarts: its slave restarts it, unless a migration is under way.
         paused: it is not watched for now: it is a shadow, or is being moved and may be silent.
     """
 
-    wanted: Health
+    checks: Health
     topics: tuple[str, ...] = ()
     services: tuple[str, ...] = ()
     restarts: bool = True
@@ -46,18 +46,18 @@ class Watch:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Observation:
     """Observation of an instance since the previous look.
 
     Attributes:
         stopped: a signal has stopped its session leader.
-        heard: messages on its topic; None: the topic cannot be received.
+        messages: messages on its topic; None: the topic cannot be received.
         trouble: why the topic cannot be received; "": it can.
         state: of its lifecycle, or `NO_ANSWER`; None: not known yet.
     """
 
     stopped: bool = False
-    heard: int | None = None
+    messages: int | None = None
     trouble: str = ""
     state: str | None = None
 

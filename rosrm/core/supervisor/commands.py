@@ -26,7 +26,7 @@ class Signal(NamedTuple):
     number: int
 
 
-class Tell(NamedTuple):
+class ReportStatus(NamedTuple):
     """Record the status of the instance, then send it to the client."""
 
     instance: Key
@@ -42,4 +42,4 @@ class Leave(NamedTuple):
     """End the supervisor: every instance has ended (or cannot be ended)."""
 
 
-Command = Spawn | Unspawn | Signal | Tell | Drop | Leave
+Command = Spawn | Unspawn | Signal | ReportStatus | Drop | Leave

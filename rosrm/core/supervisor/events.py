@@ -35,7 +35,7 @@ class FenceOrdered(NamedTuple):
     instance: Key
 
 
-class Heard(NamedTuple):
+class ContactReported(NamedTuple):
     """The client reported the last contact: the master received from this host at that time.
 
     Attributes:
@@ -75,7 +75,7 @@ class FailOrdered(NamedTuple):
     kill: bool = False
 
 
-class Forgotten(NamedTuple):
+class StatusStored(NamedTuple):
     """The client has stored the final status: the supervisor need not keep it."""
 
     instance: Key
@@ -119,7 +119,7 @@ class Exited(NamedTuple):
     leftovers: bool = False
 
 
-class Cleared(NamedTuple):
+class SessionEnded(NamedTuple):
     """The other processes of the session have ended too, after the session leader."""
 
     instance: Key
@@ -147,16 +147,16 @@ Event = (
     StartOrdered
     | StopOrdered
     | FenceOrdered
-    | Heard
+    | ContactReported
     | RestartOrdered
     | AmendOrdered
     | FailOrdered
-    | Forgotten
+    | StatusStored
     | Resumed
     | Spawned
     | SpawnFailed
     | Exited
-    | Cleared
+    | SessionEnded
     | FencePassed
     | TimePassed
     | ShutdownOrdered

@@ -27,7 +27,7 @@
     stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
               Exited           as was meant (end, restart, policy)           exited, starting, ...
                                others of its session live: -                 stopping
-              Cleared          as was meant (end, restart, policy)           exited, starting, ...
+              SessionEnded     as was meant (end, restart, policy)           exited, starting, ...
               StopOrdered      now it is meant to end                        stopping
               FencePassed      now it is meant to end, in the grace          stopping
               FenceOrdered     the same; SIGKILL                             stopping
@@ -39,12 +39,12 @@
               FencePassed      -                                             fenced
               FenceOrdered     -                                             fenced
               AmendOrdered     - (if the policy now allows no restart)       failed, backoff
-    ended     Forgotten        Drop; its number is dead                      -
+    ended     StatusStored     Drop; its number is dead                      -
 
 An instance may have a fence: `FencePassed` follows without an order when the last contact with the
-master (`Heard`; the start counts as one) is too long ago. Where the fence is `alive`, a running
-slave counts as contact. A fenced instance is not restarted here, whatever its policy and whatever
-is ordered afterwards.
+master (`ContactReported`; the start counts as one) is too long ago. Where the fence is `alive`, a
+running slave counts as contact. A fenced instance is not restarted here, whatever its policy and
+whatever is ordered afterwards.
 
 `ShutdownOrdered` stops every instance as `StopOrdered` does. An instance that no order had stopped
 before ends as withdrawn, not exited, so that the master knows: neither the process nor the master
@@ -53,8 +53,8 @@ ended it.
 `ClientLost` changes nothing: each instance keeps running as long as its fence allows.
 
 An event that is not in the table changes nothing. An order that changes nothing has its status
-reported again, because DDS may repeat it. Every change of an instance is reported (`Tell`). A
-signal goes to every process that is left of an instance, and none is sent after its end.
+reported again, because DDS may repeat it. Every change of an instance is reported (`ReportStatus`).
+A signal goes to every process that is left of an instance, and none is sent after its end.
 
 The supervisor imports this package and must stay small. So the package uses nothing of
 `rosrm.model.values` (dataclasses alone cost 2 MiB); a test compares the values that are in both.
@@ -65,19 +65,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from rosrm.core.supervisor.commands import Command, Drop, Leave, Spawn, Tell
+from rosrm.core.supervisor.commands import Command, Drop, Leave, ReportStatus, Spawn
 from rosrm.core.supervisor.events import (
     AmendOrdered,
     ClientLost,
+    ContactReported,
     Event,
     FailOrdered,
     FenceOrdered,
     FencePassed,
-    Forgotten,
-    Heard,
     RestartOrdered,
     ShutdownOrdered,
     StartOrdered,
+    StatusStored,
     StopOrdered,
     TimePassed,
 )
@@ -93,12 +93,12 @@ MOST_RESTARTS: Final = 8
 RESTART_SPAN: Final = 1.0
 
 _ORDERS: Final = (
-    StartOrdered, StopOrdered, FenceOrdered, RestartOrdered, AmendOrdered, FailOrdered, Forgotten
+    StartOrdered, StopOrdered, FenceOrdered, RestartOrdered, AmendOrdered, FailOrdered, StatusStored
 )  # fmt: skip
-_OrderOfStranger = StartOrdered | StopOrdered | FenceOrdered | RestartOrdered | AmendOrdered
+_OrderForUnknown = StartOrdered | StopOrdered | FenceOrdered | RestartOrdered | AmendOrdered
 
 
-class Supervision:
+class SupervisorState:
     """The instances of one host.
 
     Attributes:
@@ -142,7 +142,7 @@ class Supervision:
                 yield from self._fence_in_time(self.instances[key], now)
                 if self._has_turn(self.instances[key], now):
                     yield from self._apply(self.instances[key], event, now)
-        elif isinstance(event, Heard):
+        elif isinstance(event, ContactReported):
             self._renew(min(event.at, now), min(event.alive, now))
         elif isinstance(event, ShutdownOrdered):
             self.closing = True
@@ -153,7 +153,7 @@ class Supervision:
             return
         elif event.instance in self.instances:
             yield from self._known(self.instances[event.instance], event, now)
-        elif isinstance(event, _OrderOfStranger):
+        elif isinstance(event, _OrderForUnknown):
             yield from self._unknown(event, now)
 
     def _renew(self, heard: float, alive: float) -> None:
@@ -187,15 +187,15 @@ class Supervision:
         return False
 
     def _known(self, instance: Instance, event: Event, now: float) -> Iterator[Command]:
-        if isinstance(event, Forgotten) and instance.ended:
+        if isinstance(event, StatusStored) and instance.ended:
             yield self._bury(instance)
             return
         commands = self._apply(instance, event, now)
         yield from commands
         if not commands and isinstance(event, _ORDERS):
-            yield Tell(instance.key)
+            yield ReportStatus(instance.key)
 
-    def _unknown(self, event: _OrderOfStranger, now: float) -> Iterator[Command]:
+    def _unknown(self, event: _OrderForUnknown, now: float) -> Iterator[Command]:
         name, number = event.instance
         if isinstance(event, StartOrdered):
             instance = Instance(event.instance, event.restart, event.stop)
@@ -213,7 +213,7 @@ class Supervision:
         elif self.closing:
             end(instance, REFUSED, "the supervisor of this host is shutting down")
         self._watch_deadline(instance)
-        yield Tell(instance.key)
+        yield ReportStatus(instance.key)
         if not instance.ended:
             yield Spawn(instance.key)
 

@@ -7,10 +7,9 @@ import zlib
 from collections.abc import Callable
 from typing import Final
 
-from rosrm.core.supervisor.commands import Command, Signal, Spawn, Tell, Unspawn
+from rosrm.core.supervisor.commands import Command, ReportStatus, Signal, Spawn, Unspawn
 from rosrm.core.supervisor.events import (
     AmendOrdered,
-    Cleared,
     Event,
     Exited,
     FailOrdered,
@@ -18,6 +17,7 @@ from rosrm.core.supervisor.events import (
     FencePassed,
     RestartOrdered,
     Resumed,
+    SessionEnded,
     Spawned,
     SpawnFailed,
     StopOrdered,
@@ -64,7 +64,7 @@ def _spawned(instance: Instance, event: Event, now: float) -> list[Command]:
     instance.message = instance.fault = ""
     if instance.then == THEN_END:
         return _stop(instance, event, now)
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _spawn_failed(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -76,14 +76,14 @@ def _spawn_failed(instance: Instance, event: Event, now: float) -> list[Command]
         _by_policy(instance, event.message, succeeded=False, now=now)
     else:  # the program or its directory is missing here: the master tries another host
         end(instance, REFUSED, event.message)
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _stop_before_spawn(instance: Instance, event: Event, now: float) -> list[Command]:
     if instance.then == THEN_END:
         return []
     instance.then = THEN_END
-    return [Tell(instance.key), Unspawn(instance.key)]
+    return [ReportStatus(instance.key), Unspawn(instance.key)]
 
 
 def _spawn(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -102,7 +102,7 @@ def _exited(instance: Instance, event: Event, now: float) -> list[Command]:
         return _when_nothing_is_left(instance, now)
     if instance.phase == STOPPING:
         again: list[Command] = [Signal(instance.key, signal.SIGKILL)]
-        return [Tell(instance.key), *(again if instance.step >= _KILL else [])]
+        return [ReportStatus(instance.key), *(again if instance.step >= _KILL else [])]
     return _begin_stop(instance, THEN_POLICY, now)
 
 
@@ -131,7 +131,7 @@ def _mean_to_end(instance: Instance, event: Event, now: float) -> list[Command]:
         return []
     instance.then = THEN_END
     instance.message = stopping(instance)
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -139,7 +139,7 @@ def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Comma
         return []  # it is meant to end, or to start again already
     instance.then = THEN_RESTART
     instance.message = stopping(instance)
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -153,7 +153,7 @@ def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
         instance.trail += f"{', ' if instance.trail else ''}{number.name}{after}"
     instance.message = stopping(instance)
     instance.deadline = now + _grace(instance, now)
-    return [Tell(instance.key), Signal(instance.key, number)]
+    return [ReportStatus(instance.key), Signal(instance.key, number)]
 
 
 def _restart_due(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -169,7 +169,7 @@ def _restart_now(instance: Instance, event: Event, now: float) -> list[Command]:
 
 def _stop_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
     _end_as_meant(instance, f"stopped while it waited for its restart ({ending(instance)})")
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _fence_before_spawn(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -191,13 +191,13 @@ def _fence_while_it_stops(instance: Instance, event: Event, now: float) -> list[
     assert instance.deadline is not None
     instance.deadline = min(instance.deadline, now + _grace(instance, now))
     instance.message = stopping(instance)
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _fence_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
     _take_fence(instance, event, now)
     _end_as_meant(instance, f"it waited for its restart ({ending(instance)})")
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _amend(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -205,7 +205,7 @@ def _amend(instance: Instance, event: Event, now: float) -> list[Command]:
     if instance.restart == event.restart:
         return []
     instance.restart = event.restart
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _amend_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -233,7 +233,7 @@ TRANSITIONS: Final[dict[tuple[Phase, type], Transition]] = {
     (RUNNING, FailOrdered): _fail,
     (STOPPING, TimePassed): _escalate,
     (STOPPING, Exited): _exited,
-    (STOPPING, Cleared): _cleared,
+    (STOPPING, SessionEnded): _cleared,
     (STOPPING, StopOrdered): _mean_to_end,
     (STOPPING, FencePassed): _fence_while_it_stops,
     (STOPPING, FenceOrdered): _fence_while_it_stops,
@@ -256,7 +256,7 @@ def _start_again(instance: Instance) -> list[Command]:
     instance.deadline = None
     instance.then = ""
     instance.message = ""
-    return [Tell(instance.key), Spawn(instance.key)]
+    return [ReportStatus(instance.key), Spawn(instance.key)]
 
 
 def _begin_stop(instance: Instance, then: Then, now: float, first: int = 0) -> list[Command]:
@@ -318,7 +318,7 @@ def _when_nothing_is_left(instance: Instance, now: float) -> list[Command]:
         exited_well = instance.exit_code == 0 and instance.exit_signal == 0
         succeeded = exited_well and not instance.fault
         _by_policy(instance, ending(instance), succeeded=succeeded, now=now)
-    return [Tell(instance.key)]
+    return [ReportStatus(instance.key)]
 
 
 def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) -> None:

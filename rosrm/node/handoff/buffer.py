@@ -23,7 +23,7 @@ class Sent(NamedTuple):
     number: int | None = None
 
 
-class Kept(NamedTuple):
+class BufferedMessage(NamedTuple):
     """One message in the buffer.
 
     Attributes:
@@ -49,13 +49,13 @@ class _Track:
         mixed: time stamps are not in one order: several publishers, or one that was restarted
             with its clock behind.
         overlap: a message was received that the source has processed too.
-        heard_at: arrival of the last message, here or at the source, seconds.
+        arrived_at: arrival of the last message, here or at the source, seconds.
         held: messages in the buffer.
         last: the last message received of the one publisher.
         after_gap: time stamp of the message after a missing one; None: none is missing.
     """
 
-    heard_at: float
+    arrived_at: float
     covered: dict[int, None] = field(default_factory=dict)
     newest: int | None = None
     mixed: bool = False
@@ -78,7 +78,7 @@ class InputBuffer:
         self._limit = limit
         self._room = room
         self._since = now
-        self._kept: deque[Kept] = deque()
+        self._messages: deque[BufferedMessage] = deque()
         self._tracks: dict[str, _Track] = {}
 
     def _track(self, topic: str) -> _Track:
@@ -98,7 +98,7 @@ class InputBuffer:
             False: the buffer has no room for it.
         """
         track = self._track(topic)
-        track.heard_at = now
+        track.arrived_at = now
         _note_order(track, sent)
         if _is_covered(track, sent.stamp):
             track.overlap = True
@@ -107,7 +107,7 @@ class InputBuffer:
             return False
         track.held += 1
         self._room -= size
-        self._kept.append(Kept(topic, sent.stamp, item, size))
+        self._messages.append(BufferedMessage(topic, sent.stamp, item, size))
         return True
 
     def cover(self, topic: str, stamps: Iterable[int], *, single: bool, now: float) -> None:
@@ -126,7 +126,7 @@ class InputBuffer:
         new = [stamp for stamp in stamps if stamp not in track.covered]
         if not new:
             return
-        track.heard_at = now
+        track.arrived_at = now
         track.covered.update(dict.fromkeys(new))
         newest = max(new)
         track.newest = newest if track.newest is None else max(track.newest, newest)
@@ -137,15 +137,15 @@ class InputBuffer:
     def _drop_covered(self, topic: str, track: _Track) -> None:
         if not track.held:
             return
-        left: deque[Kept] = deque()
-        for one in self._kept:
+        left: deque[BufferedMessage] = deque()
+        for one in self._messages:
             if one.topic == topic and _is_covered(track, one.stamp):
                 track.overlap = True
                 track.held -= 1
                 self._room += one.size
             else:
                 left.append(one)
-        self._kept = left
+        self._messages = left
 
     def overlaps(self, topic: str) -> bool:
         """Return True if a received message is covered too: from there on none is missing."""
@@ -165,25 +165,25 @@ class InputBuffer:
         count too, because such a message may have been lost on its way here and arrive later.
         """
         track = self._track(topic)
-        return not track.held and now - max(track.heard_at, since) >= for_seconds
+        return not track.held and now - max(track.arrived_at, since) >= for_seconds
 
     def is_marked(self, topic: str, stamp: int) -> bool:
         """Return True if a mark has named exactly this message."""
         track = self._tracks.get(topic)
         return track is not None and stamp in track.covered
 
-    def take(self) -> Kept | None:
+    def take(self) -> BufferedMessage | None:
         """Remove and return the oldest message; None: the buffer is empty."""
-        if not self._kept:
+        if not self._messages:
             return None
-        kept = self._kept.popleft()
-        self._tracks[kept.topic].held -= 1
-        self._room += kept.size
-        return kept
+        message = self._messages.popleft()
+        self._tracks[message.topic].held -= 1
+        self._room += message.size
+        return message
 
     def __len__(self) -> int:
         """Return the number of waiting messages."""
-        return len(self._kept)
+        return len(self._messages)
 
 
 def _note_order(track: _Track, sent: Sent) -> None:

@@ -60,7 +60,7 @@ class Channel:
         self._destination = destination
         self._instance = instance
         self._peer = peer
-        self._heard = heard
+        self._take_report = heard
         self._last: HandoffReport | None = None
         self.topic = topic
         self._publisher = plain.create_publisher(
@@ -73,7 +73,7 @@ class Channel:
     def _take(self, report: HandoffReport) -> None:
         theirs = report.instance == self._peer and report.destination == self._destination
         if theirs and report.protocol_version == PROTOCOL_VERSION:
-            self._heard(report)
+            self._take_report(report)
 
     def say(self, phase: int, sequence: int = 0, message: str = "") -> None:
         """Publish a report, unless it repeats the last one."""

@@ -12,8 +12,8 @@ from rosrm.node.entities import waiting
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.snapshot_assembler import Cut, CutAssembler
-from rosrm.node.handoff.state_parts import Part, StateError
-from rosrm.node.managed_node import Member
+from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
@@ -35,16 +35,20 @@ class Destination:
     """The role of a shadow until it is active.
 
     Args:
-        member: the node.
+        entities: the node.
         parts: of its state.
         mark_topic: fully qualified.
         activated: called when the node is active.
     """
 
     def __init__(
-        self, member: Member, parts: list[Part], mark_topic: str, activated: Callable[[], None]
+        self,
+        entities: NodeEntities,
+        parts: list[StateTopic],
+        mark_topic: str,
+        activated: Callable[[], None],
     ) -> None:
-        self._member = member
+        self._entities = entities
         self._parts = parts
         self._mark_topic = mark_topic
         self._activated = activated
@@ -58,13 +62,13 @@ class Destination:
         self._silent_at: int | None = None
         self._alone = False
         self._active = False
-        self._heard_at = 0.0
+        self._last_report = 0.0
         self._matched_at = inf
         self._was_ready = False
         self._may_switch = False
-        self._over = False
+        self._ended = False
         self._fault = ""
-        member.on_overflow = self._overflowed
+        entities.on_overflow = self._overflowed
 
     # --- messages of the master ------------------------------------------------------------
 
@@ -77,7 +81,7 @@ class Destination:
             channel.repeat()  # a new master may be asking, after the first was lost
         if config.phase == StateConfig.DONE:
             self.close()
-        elif self._over:
+        elif self._ended:
             if config.phase == StateConfig.ABORT and not self._active:
                 channel.say(HandoffReport.ABORTED, self._sequence(), self._fault)
         elif config.phase == StateConfig.SWITCH:
@@ -90,12 +94,12 @@ class Destination:
             self._end(HandoffReport.ABORTED, "the master called it off")
 
     def _open(self, config: StateConfig) -> Channel:
-        member = self._member
+        entities = self._entities
         channel = self._channel = Channel(
-            member.plain, config.channel, config.destination, member.identity.instance,
-            config.source, self._heard,
+            entities.plain, config.channel, config.destination, entities.identity.instance,
+            config.source, self._take_report,
         )  # fmt: skip
-        if self._over:
+        if self._ended:
             channel.say(HandoffReport.FAILED, 0, self._fault)
             return channel
         self._assembler = CutAssembler()
@@ -103,12 +107,12 @@ class Destination:
         self._follow(StateMark, self._mark_topic, self._take_mark, topics.MARK)
         for part in self._parts:
             self.follow_part(part)
-        if not self._over:
-            self._timer = steady_timer(member.plain, _REVIEW, self._look)
+        if not self._ended:
+            self._timer = steady_timer(entities.plain, _REVIEW, self._look)
             self._review()
         return channel
 
-    def follow_part(self, part: Part) -> None:
+    def follow_part(self, part: StateTopic) -> None:
         """Subscribe to a part of the state, also to one that the author names later."""
         if self._assembler is not None:
             take = partial(self._assembler.add_part, part.topic)
@@ -119,9 +123,9 @@ class Destination:
         self, message_type: Any, topic: str, take: Callable[[Any], None], qos: Any, *,
         raw: bool = False,
     ) -> None:  # fmt: skip
-        if self._over:
+        if self._ended:
             return
-        subscribe = self._member.plain.create_subscription
+        subscribe = self._entities.plain.create_subscription
         try:
             subscription = subscribe(
                 message_type, topic, partial(self._came, take), qos, raw=raw,
@@ -134,9 +138,9 @@ class Destination:
 
     # --- messages of the source ------------------------------------------------------------
 
-    def _heard(self, report: HandoffReport) -> None:
-        with self._member.turn:
-            if self._over:
+    def _take_report(self, report: HandoffReport) -> None:
+        with self._entities.turn:
+            if self._ended:
                 return
             if report.phase == HandoffReport.ATTACHED:
                 self._attached = True
@@ -147,19 +151,19 @@ class Destination:
             self._go_on()
 
     def _came(self, take: Callable[[Any], None], message: Any) -> None:
-        with self._member.turn:
-            if self._over:
+        with self._entities.turn:
+            if self._ended:
                 return
             take(message)
             self._catch_up()
-            self._heard_at = time.monotonic()
+            self._last_report = time.monotonic()
             self._go_on()
 
     def _catch_up(self) -> None:
         """Take all received messages; one at a time, a shadow would stay behind a fast source."""
         for subscription, take in self._followed:
             for message, _ in waiting(subscription):
-                if self._over:
+                if self._ended:
                     return
                 take(message)
 
@@ -193,13 +197,13 @@ class Destination:
     # --- following -------------------------------------------------------------------------
 
     def _look(self) -> None:
-        with self._member.turn:
-            if not self._over:
+        with self._entities.turn:
+            if not self._ended:
                 self._review()
 
     def _go_on(self) -> None:
         """Restore the newest state, if there is a new one, then check the next step."""
-        if self._over or self._assembler is None:
+        if self._ended or self._assembler is None:
             return
         cut = self._assembler.take()
         if cut is not None and not self._restore(cut):
@@ -217,14 +221,14 @@ class Destination:
         now = time.monotonic()
         for mark in (*cut.passed, cut.mark):
             for covered in mark.inputs:
-                self._member.buffer.cover(
+                self._entities.buffer.cover(
                     covered.topic, covered.covered, single=covered.publishers <= 1, now=now
                 )
         return True
 
     def _review(self) -> None:
         """Report progress, request silence when allowed, and become active after it."""
-        if self._channel is None or self._over:
+        if self._channel is None or self._ended:
             return
         if self._alone:
             self._take_over_when_quiet()
@@ -267,21 +271,21 @@ class Destination:
         for covered in self._cut.mark.inputs:
             if not self._follows(covered.topic, now):
                 return f"until a message on {covered.topic} has been here and in the state"
-        lossy = self._member.input_with_gap()
+        lossy = self._entities.input_with_gap()
         if lossy:
             return f"until the state covers a message on {lossy} that did not come here"
         return ""
 
     def _missing_peers(self, mark: StateMark) -> str:
         """Return the topic and number of peers matched with the source but not with this node."""
-        readers = {one.topic_name: one.get_subscription_count() for one in self._member.outputs}
+        readers = {one.topic_name: one.get_subscription_count() for one in self._entities.outputs}
         for output in mark.outputs:
             if readers.get(output.topic, output.subscriptions) < output.subscriptions:
                 return (
                     f"for the readers of {output.topic}: {readers[output.topic]} of "
                     f"{output.subscriptions} matched"
                 )
-        writers = {one.key: one.subscription.get_publisher_count() for one in self._member.inputs}
+        writers = {one.key: one.subscription.get_publisher_count() for one in self._entities.inputs}
         for covered in mark.inputs:
             if writers.get(covered.topic, covered.publishers) < covered.publishers:
                 return (
@@ -298,8 +302,8 @@ class Destination:
 
     def _follows(self, topic: str, now: float) -> bool:
         """Return True if no message of an input can be missing both here and in the state."""
-        buffer = self._member.buffer
-        if all(one.key != topic for one in self._member.inputs) or buffer.overlaps(topic):
+        buffer = self._entities.buffer
+        if all(one.key != topic for one in self._entities.inputs) or buffer.overlaps(topic):
             return True
         return buffer.is_idle(topic, now, self._matched_at, _IDLE)
 
@@ -307,7 +311,7 @@ class Destination:
 
     def _take_over_when_quiet(self) -> None:
         """Become active after the source's end, once the last of its messages have arrived."""
-        if time.monotonic() - self._heard_at < _QUIET:
+        if time.monotonic() - self._last_report < _QUIET:
             return
         if self._cut is None:
             self._end(HandoffReport.FAILED, "the source ended before a state of it was here")
@@ -315,29 +319,29 @@ class Destination:
             self._activate()
 
     def _activate_if_complete(self) -> None:
-        self._member.catch_up()
-        lossy = self._member.input_with_gap()
+        self._entities.catch_up()
+        lossy = self._entities.input_with_gap()
         if lossy:
             self._end(
                 HandoffReport.FAILED,
                 f"a message on {lossy} did not come here, and the source has not processed it: "
                 f"its subscription needs a greater depth, or this host is too busy",
             )
-        elif not self._over:
+        elif not self._ended:
             self._activate()
 
     def _activate(self) -> None:
-        member, cut = self._member, self._cut
+        entities, cut = self._entities, self._cut
         if cut is None:
             return
-        self._over = self._active = True
-        member.sequence = self._sequence()
+        self._ended = self._active = True
+        entities.sequence = self._sequence()
         for covered in cut.mark.inputs:
-            member.inherit(covered.topic, covered.covered)
+            entities.inherit(covered.topic, covered.covered)
         passed = time.monotonic() - cut.arrived
         due = [None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due]
         # Buffered messages are served first, because `_unfollow` and `_activated` take time.
-        member.become_active(due, self._say_active, (self._unfollow, self._activated))
+        entities.become_active(due, self._say_active, (self._unfollow, self._activated))
 
     def _say_active(self) -> None:
         if self._channel is not None:
@@ -345,26 +349,26 @@ class Destination:
 
     def _end(self, phase: int, message: str) -> None:
         """Give up for good; this process then runs until its slave stops it."""
-        self._over, self._fault = True, message
-        self._member.node.get_logger().warning(f"will not take over: {message}")
+        self._ended, self._fault = True, message
+        self._entities.node.get_logger().warning(f"will not take over: {message}")
         if self._channel is not None:
             self._channel.say(phase, self._sequence(), message)
         self._unfollow()
 
     def _overflowed(self, topic: str) -> None:
-        if not self._over:
+        if not self._ended:
             self._end(
                 HandoffReport.FAILED,
                 f"more came on {topic} than can be kept until the source's state covers it",
             )
 
     def _unfollow(self) -> None:
-        destroy = self._member.plain.destroy_subscription
+        destroy = self._entities.plain.destroy_subscription
         for subscription, _ in self._followed:
             destroy(subscription)
         self._followed = []
         if self._timer is not None:
-            self._member.plain.destroy_timer(self._timer)
+            self._entities.plain.destroy_timer(self._timer)
             self._timer = None
         self._assembler = None
         self._cut = None

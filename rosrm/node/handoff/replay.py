@@ -14,7 +14,7 @@ _SLICE: Final = 0.02
 _OVER: Final = object()
 
 
-class Replay:
+class InputReplay:
     """Serves buffered messages in the executor, so a callback's exception reaches the author.
 
     Args:

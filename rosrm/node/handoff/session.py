@@ -7,11 +7,11 @@ from typing import Any, Final
 
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.destination import Destination
-from rosrm.node.handoff.source import Source
-from rosrm.node.handoff.state_parts import ParametersPart, Part
-from rosrm.node.identity import Identity
-from rosrm.node.managed_node import Member
-from rosrm.node.snapshots.restore import Revival, kept_state
+from rosrm.node.handoff.source import HandoffSource
+from rosrm.node.handoff.state_parts import ParametersPart, StateTopic
+from rosrm.node.identity import NodeIdentity
+from rosrm.node.managed_node import NodeEntities
+from rosrm.node.snapshots.restore import SnapshotRestore, newest_snapshot
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
 
@@ -19,7 +19,7 @@ _MARK: Final = "_rosrm/mark"
 _PARAMETERS: Final = "_rosrm/parameters"
 
 
-class Handoff:
+class HandoffSession:
     """The handoffs of one node: first perhaps as a destination, later as a source.
 
     Args:
@@ -28,52 +28,52 @@ class Handoff:
         identity: given by rosrm to this process.
     """
 
-    def __init__(self, node: Any, plain: Any, identity: Identity) -> None:
-        self._kept, self._damaged = kept_state(identity)
-        resting = identity.shadow or self._kept is not None
-        self.member = Member(node, plain, identity, resting=resting)
+    def __init__(self, node: Any, plain: Any, identity: NodeIdentity) -> None:
+        self._snapshot, self._damaged = newest_snapshot(identity)
+        resting = identity.shadow or self._snapshot is not None
+        self.entities = NodeEntities(node, plain, identity, resting=resting)
         self.identity = identity
         self._epoch = identity.epoch
-        self._parts: list[Part] = []
-        self._source: Source | None = None
+        self._parts: list[StateTopic] = []
+        self._source: HandoffSource | None = None
         self._destination: Destination | None = None
         self._refused: set[str] = set()
         self._subscription: Any = None
 
     def begin(self) -> None:
         """Take the first role; called by the node's constructor, before the author's continues."""
-        node = self.member.node
+        node = self.entities.node
         for fault in self._damaged:
             node.get_logger().warning(f"ignoring a damaged snapshot: {fault}")
         self._parts.append(ParametersPart(self._own(_PARAMETERS), node))
         if self.identity.shadow:
             self._destination = Destination(
-                self.member, self._parts, self._own(_MARK), self._become_source
+                self.entities, self._parts, self._own(_MARK), self._become_source
             )
-        elif self._kept is not None:
-            Revival(self.member, self._parts, self._kept, self._become_source)
+        elif self._snapshot is not None:
+            SnapshotRestore(self.entities, self._parts, self._snapshot, self._become_source)
         else:
             self._become_source()
-        self._subscription = self.member.plain.create_subscription(
+        self._subscription = self.entities.plain.create_subscription(
             StateConfig, self.identity.state_config, self._configured, topics.STATE_CONFIG
         )
 
     def _own(self, path: str) -> str:
-        return f"{self.member.visible_node}/{path}"
+        return f"{self.entities.visible_node}/{path}"
 
     def _become_source(self) -> None:
-        self._kept = None
-        self._source = Source(self.member, self._parts, self._own(_MARK))
+        self._snapshot = None
+        self._source = HandoffSource(self.entities, self._parts, self._own(_MARK))
 
     def keep_state(
         self, topic: str, message_type: Any, save: Callable[[], Any], restore: Callable[[Any], None]
     ) -> None:
         """Add a part of the state on a topic that the author names."""
-        resolve = self.member.node.resolve_topic_name
-        full = resolve(self.member.visible(topic, resolve))
+        resolve = self.entities.node.resolve_topic_name
+        full = resolve(self.entities.visible(topic, resolve))
         if any(part.topic == full for part in self._parts):
             raise ValueError(f"keep_state: {full} is named twice; each part has a topic of its own")
-        part = Part(full, message_type, save, restore)
+        part = StateTopic(full, message_type, save, restore)
         self._parts.append(part)
         if self._source is not None:
             self._source.add_part(part)
@@ -94,12 +94,12 @@ class Handoff:
         role = self._destination if own.instance == config.destination else self._source
         if role is None:
             return
-        with self.member.turn:
+        with self.entities.turn:
             try:
                 role.configure(config)
             except Exception as error:  # noqa: BLE001 - no message of the master ends the node
                 what = f"{type(error).__name__}: {error}"
-                self.member.node.get_logger().error(f"a state_config cannot be followed: {what}")
+                self.entities.node.get_logger().error(f"a state_config cannot be followed: {what}")
 
     def _fault_of(self, config: StateConfig) -> str:
         """Return a reason to ignore this message; "": it comes from this node's master."""
@@ -118,7 +118,7 @@ class Handoff:
     def _refuse(self, fault: str) -> None:
         if fault not in self._refused:
             self._refused.add(fault)
-            self.member.node.get_logger().warning(f"a state_config is left alone: {fault}")
+            self.entities.node.get_logger().warning(f"a state_config is left alone: {fault}")
 
     def close(self) -> None:
         """End all roles, because the node is destroyed."""

@@ -12,9 +12,9 @@ from rclpy.duration import Duration
 
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
-from rosrm.node.handoff.state_parts import Part, StateError
-from rosrm.node.managed_node import Member, Mode
-from rosrm.node.snapshots.writer import LARGEST_PART, Keeper
+from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.managed_node import Mode, NodeEntities
+from rosrm.node.snapshots.writer import LARGEST_PART, SnapshotSaver
 from rosrm.node.steady_timer import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
@@ -27,17 +27,17 @@ _LOOK: Final = 0.05
 _AT_ONCE: Final = Duration(nanoseconds=0)
 
 
-class Source:
+class HandoffSource:
     """The role of the active node towards a successor.
 
     Args:
-        member: the node.
+        entities: the node.
         parts: of its state.
         mark_topic: fully qualified.
     """
 
-    def __init__(self, member: Member, parts: list[Part], mark_topic: str) -> None:
-        self._member = member
+    def __init__(self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str) -> None:
+        self._entities = entities
         self._parts = parts
         self._run = random.getrandbits(63) | 1
         self._channel: Channel | None = None
@@ -49,18 +49,18 @@ class Source:
         self._timers_due: list[int] = []
         self._silent_since = 0.0
         self._look_again: Any = None
-        plain = member.plain
+        plain = entities.plain
         self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
         for part in parts:
             part.publisher = plain.create_publisher(part.message_type, part.topic, topics.STATE)
-            part.retained = bool(member.identity.keep)
-        self._keeper = Keeper(member, parts, self._run) if member.identity.keep else None
-        member.on_cycle = self._after_cycle
-        member.on_overflow = self._overflowed
+            part.retained = bool(entities.identity.keep)
+        self._keeper = SnapshotSaver(entities, parts, self._run) if entities.identity.keep else None
+        entities.on_cycle = self._after_cycle
+        entities.on_overflow = self._overflowed
 
-    def add_part(self, part: Part) -> None:
+    def add_part(self, part: StateTopic) -> None:
         """Add another part of the state that the author names."""
-        part.publisher = self._member.plain.create_publisher(
+        part.publisher = self._entities.plain.create_publisher(
             part.message_type, part.topic, topics.STATE
         )
         part.retained = self._keeper is not None
@@ -100,34 +100,34 @@ class Source:
                 try:
                     part.publish(LARGEST_PART)
                 except StateError as error:
-                    self._member.node.get_logger().error(str(error), throttle_duration_sec=10.0)
+                    self._entities.node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
     def _failed(self, fault: str) -> None:
         """Report that the state cannot be published: this handoff fails, the node stays active."""
         if not self._fault:
-            self._member.node.get_logger().error(f"{fault}. This node stays where it is")
+            self._entities.node.get_logger().error(f"{fault}. This node stays where it is")
         self._fault = fault
         if self._channel is not None:
-            self._channel.say(HandoffReport.FAILED, self._member.sequence, fault)
+            self._channel.say(HandoffReport.FAILED, self._entities.sequence, fault)
 
     def _mark(self, *, last: bool) -> StateMark:
-        member = self._member
-        due = self._still_due() if last else member.timers_due()
+        entities = self._entities
+        due = self._still_due() if last else entities.timers_due()
         return StateMark(
-            protocol_version=PROTOCOL_VERSION, run=self._run, sequence=member.sequence, last=last,
+            protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence, last=last,
             parts=[part.described() for part in self._parts],
             inputs=[
                 CoveredInput(
                     topic=one.key, publishers=one.subscription.get_publisher_count(),
                     covered=array("q", one.covered),
                 )
-                for one in member.inputs if one.buffered
+                for one in entities.inputs if one.buffered
             ],
             outputs=[
                 MatchedOutput(
                     topic=one.topic_name, subscriptions=one.get_subscription_count()
                 )
-                for one in member.outputs
+                for one in entities.outputs
             ],
             timers_due=array("q", due),
         )  # fmt: skip
@@ -159,66 +159,66 @@ class Source:
         self.close()
         self._fault = ""
         self._channel = Channel(
-            self._member.plain, config.channel, config.destination,
-            self._member.identity.instance, config.destination, self._heard,
+            self._entities.plain, config.channel, config.destination,
+            self._entities.identity.instance, config.destination, self._take_report,
         )  # fmt: skip
 
-    def _heard(self, report: HandoffReport) -> None:
-        with self._member.turn:
+    def _take_report(self, report: HandoffReport) -> None:
+        with self._entities.turn:
             if report.phase == HandoffReport.SHADOWING:
                 self._attach()
             elif report.phase == HandoffReport.SWITCHING:
                 self._asked = True
                 self._switch()
-            elif report.phase == HandoffReport.ACTIVE and self._member.mode is Mode.SILENT:
-                self._member.close_services()
+            elif report.phase == HandoffReport.ACTIVE and self._entities.mode is Mode.SILENT:
+                self._entities.close_services()
 
     def _attach(self) -> None:
-        if self._channel is None or self._attached or self._member.mode is not Mode.ACTIVE:
+        if self._channel is None or self._attached or self._entities.mode is not Mode.ACTIVE:
             return
         self._attached = True
         if self._show():
-            self._channel.say(HandoffReport.ATTACHED, self._member.sequence)
+            self._channel.say(HandoffReport.ATTACHED, self._entities.sequence)
 
     def _switch(self) -> None:
         """Fall silent, once both the master and the destination have requested it."""
         if self._channel is None or not (self._may_switch and self._asked) or self._fault:
             return
-        if self._member.mode is Mode.ACTIVE and not self._finishing:
+        if self._entities.mode is Mode.ACTIVE and not self._finishing:
             self._finishing = True
-            self._member.serve_what_has_come(self._fall_silent)
+            self._entities.serve_what_has_come(self._fall_silent)
 
     def _fall_silent(self) -> None:
-        member, wanted = self._member, self._finishing
+        entities, wanted = self._entities, self._finishing
         self._finishing = False
         if self._channel is None or not wanted or self._fault:
             return  # the handoff was called off
-        self._timers_due = member.fall_silent()
+        self._timers_due = entities.fall_silent()
         self._silent_since = time.monotonic()
         if not self._show(last=True):
             self._go_on(_nothing)
             return
-        self._channel.say(HandoffReport.SILENT, member.sequence)
-        self._look_again = steady_timer(member.plain, _LOOK, self._release_when_heard)
+        self._channel.say(HandoffReport.SILENT, entities.sequence)
+        self._look_again = steady_timer(entities.plain, _LOOK, self._release_when_heard)
 
     def _release_when_heard(self) -> None:
         """Report RELEASED when all outputs are acknowledged (a stop loses others) or time is up."""
-        with self._member.turn:
-            heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._member.outputs)
+        with self._entities.turn:
+            heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
             if heard or time.monotonic() - self._silent_since >= _LAST_WORDS:
                 self._look_no_more()
                 if self._channel is not None:
-                    self._channel.say(HandoffReport.RELEASED, self._member.sequence)
+                    self._channel.say(HandoffReport.RELEASED, self._entities.sequence)
 
     def _look_no_more(self) -> None:
         if self._look_again is not None:
-            self._member.plain.destroy_timer(self._look_again)
+            self._entities.plain.destroy_timer(self._look_again)
             self._look_again = None
 
     def _resume(self) -> None:
         self._may_switch = self._asked = self._attached = self._finishing = False
         self._look_no_more()
-        if self._member.mode is Mode.SILENT:
+        if self._entities.mode is Mode.SILENT:
             # Otherwise the shadow of a later handoff would take the last mark for its own.
             self._marks.publish(self._mark(last=False))
             self._go_on(self._say_resumed)
@@ -227,15 +227,15 @@ class Source:
 
     def _say_resumed(self) -> None:
         if self._channel is not None:
-            self._channel.say(HandoffReport.RESUMED, self._member.sequence)
+            self._channel.say(HandoffReport.RESUMED, self._entities.sequence)
 
     def _go_on(self, announce: Callable[[], None]) -> None:
         passed = time.monotonic() - self._silent_since
         due = [None if ns < 0 else ns / 1e9 - passed for ns in self._timers_due]
-        self._member.become_active(due, announce)
+        self._entities.become_active(due, announce)
 
     def _overflowed(self, topic: str) -> None:
-        self._member.node.get_logger().error(
+        self._entities.node.get_logger().error(
             f"silent for its successor, and the buffer of {topic} is full: a message is lost",
             throttle_duration_sec=1.0,
         )

@@ -18,7 +18,7 @@ class StateError(Exception):
     """A state cannot be saved or restored; the text names it and the reason."""
 
 
-class Part:
+class StateTopic:
     """One topic of a node's state.
 
     Args:
@@ -158,7 +158,7 @@ def type_name(message_type: Any) -> str:
     return f"{package}/{kind}/{message_type.__name__}"
 
 
-class ParametersPart(Part):
+class ParametersPart(StateTopic):
     """The parameters of a node, with values set at run time.
 
     Args:

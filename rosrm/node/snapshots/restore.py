@@ -9,11 +9,11 @@ from typing import Final
 
 from rclpy.serialization import deserialize_message
 
-from rosrm.node.handoff.state_parts import Part, StateError
-from rosrm.node.identity import Identity
-from rosrm.node.managed_node import Member
+from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.identity import NodeIdentity
+from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
-from rosrm.snapshots import Kept, newest
+from rosrm.snapshots import Listing, newest
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 
@@ -26,39 +26,43 @@ _REMEDY: Final = (
 )
 
 
-def kept_state(identity: Identity) -> tuple[Kept | None, list[str]]:
+def newest_snapshot(identity: NodeIdentity) -> tuple[Listing | None, list[str]]:
     """Return a process's snapshot, or None, and the faults of its damaged files."""
     if identity.shadow or not identity.keep:
         return None, []
     return newest(Path(identity.keep), up_to=identity.instance)
 
 
-class Revival:
+class SnapshotRestore:
     """Restores a snapshot in the executor's first round; until then the node is like a shadow.
 
     By then the author's constructor has returned (or has named all parts), and no callback of the
     author has run.
 
     Args:
-        member: the node, at rest.
+        entities: the node, at rest.
         parts: of its state; parts that the author names later are added to this very list.
-        kept: the snapshot.
+        snapshot: the snapshot.
         done: called when the node is active.
     """
 
     def __init__(
-        self, member: Member, parts: Sequence[Part], kept: Kept, done: Callable[[], None]
+        self,
+        entities: NodeEntities,
+        parts: Sequence[StateTopic],
+        snapshot: Listing,
+        done: Callable[[], None],
     ) -> None:
-        self._member = member
+        self._entities = entities
         self._parts = parts
-        self._kept = kept
+        self._snapshot = snapshot
         self._done = done
         self._give_up = time.monotonic() + _PATIENCE
-        self._timer = steady_timer(member.plain, 0.0, self._restore)
+        self._timer = steady_timer(entities.plain, 0.0, self._restore)
 
     def _restore(self) -> None:
-        with self._member.turn:
-            plain = self._member.plain
+        with self._entities.turn:
+            plain = self._entities.plain
             plain.destroy_timer(self._timer)
             if self._is_incomplete() and time.monotonic() < self._give_up:
                 self._timer = steady_timer(plain, _LOOK, self._restore)
@@ -66,25 +70,25 @@ class Revival:
             try:
                 mark = self._restored()
             except StateError as fault:
-                message = f"the snapshot {self._kept.path} cannot be restored: {fault}"
-                self._member.node.get_logger().error(f"{message}. {_REMEDY}")
+                message = f"the snapshot {self._snapshot.path} cannot be restored: {fault}"
+                self._entities.node.get_logger().error(f"{message}. {_REMEDY}")
                 raise StateError(message) from fault
             self._go_on(mark)
 
     def _is_incomplete(self) -> bool:
         """Return True if the author's constructor spins and has not named all parts yet."""
-        return len(self._parts) < len(self._kept.blocks) - 1
+        return len(self._parts) < len(self._snapshot.blocks) - 1
 
     def _restored(self) -> StateMark:
         try:
-            mark = deserialize_message(self._kept.blocks[0], StateMark)
+            mark = deserialize_message(self._snapshot.blocks[0], StateMark)
         except Exception as error:
             raise StateError(f"its mark cannot be read: {error}") from error
         fault = self._fault_of(mark)
         if fault:
             raise StateError(fault)
         topics = [part.topic for part in mark.parts]
-        data = dict(zip(topics, self._kept.blocks[1:], strict=True))
+        data = dict(zip(topics, self._snapshot.blocks[1:], strict=True))
         for part in self._parts:
             part.restore_changed(data[part.topic])
         return mark
@@ -95,9 +99,10 @@ class Revival:
                 f"it is of protocol version {mark.protocol_version}, and this node speaks "
                 f"{PROTOCOL_VERSION}"
             )
-        if len(mark.parts) != len(self._kept.blocks) - 1:
+        if len(mark.parts) != len(self._snapshot.blocks) - 1:
             return (
-                f"it has {len(self._kept.blocks) - 1} parts, but its mark lists {len(mark.parts)}"
+                f"it has {len(self._snapshot.blocks) - 1} parts, but its mark lists "
+                f"{len(mark.parts)}"
             )
         theirs = {part.topic: part.type for part in mark.parts}
         ours = {part.topic: part.type_name for part in self._parts}
@@ -110,21 +115,21 @@ class Revival:
         return ""
 
     def _go_on(self, mark: StateMark) -> None:
-        member = self._member
-        member.sequence = int(mark.sequence)
+        entities = self._entities
+        entities.sequence = int(mark.sequence)
         for covered in mark.inputs:
-            member.buffer.cover(
+            entities.buffer.cover(
                 covered.topic, covered.covered, single=covered.publishers <= 1, now=time.monotonic()
             )
-            member.inherit(covered.topic, covered.covered)
+            entities.inherit(covered.topic, covered.covered)
         due = [None if ns < 0 else ns / 1e9 for ns in mark.timers_due]
         try:
-            member.become_active(due, self._say)
+            entities.become_active(due, self._say)
         finally:
             self._done()
 
     def _say(self) -> None:
-        head = self._kept.head
-        self._member.node.get_logger().info(
+        head = self._snapshot.head
+        self._entities.node.get_logger().info(
             f"continues from the snapshot of {head.process}#{head.instance}, cycle {head.sequence}"
         )

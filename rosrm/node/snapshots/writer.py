@@ -16,8 +16,8 @@ from typing import Any, Final
 
 from rclpy.serialization import serialize_message
 
-from rosrm.node.handoff.state_parts import Part, StateError
-from rosrm.node.managed_node import Member, Mode
+from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.steady_timer import steady_timer
 from rosrm.snapshots import LARGEST, Block, SlotWriter
 from rosrm.version import PROTOCOL_VERSION
@@ -33,33 +33,33 @@ _LAST_WORDS: Final = 5.0
 _TOLD_EVERY: Final = 60.0
 
 
-class Keeper:
+class SnapshotSaver:
     """Saves snapshots between cycles, as often as `_SHARE` allows, at least each `keep_every` s.
 
     Args:
-        member: the node, whose identity names the directory.
+        entities: the node, whose identity names the directory.
         parts: of its state; parts that the author names later are added to this very list.
         run: random number of this run of the node.
     """
 
-    def __init__(self, member: Member, parts: list[Part], run: int) -> None:
-        self._member = member
+    def __init__(self, entities: NodeEntities, parts: list[StateTopic], run: int) -> None:
+        self._entities = entities
         self._parts = parts
         self._run = run
-        self._every = member.identity.keep_every
+        self._every = entities.identity.keep_every
         self._next = 0.0
         self._kept = -1
         self._closed = False
         self._due: list[int] = []
         self._publishers: dict[str, int] = {}
-        self._writer = _Writer(member)
+        self._writer = _Writer(entities)
         # A state not saved right after its cycle is saved later, even if no cycle follows.
         self._late = steady_timer(
-            member.plain, max(self._every, 1e-3), self._keep_late, autostart=False
+            entities.plain, max(self._every, 1e-3), self._keep_late, autostart=False
         )
         self._armed = False
         atexit.register(self.close)
-        if member.sequence:  # the state came from another instance, so this one has no file of it
+        if entities.sequence:  # the state came from another instance, so this one has no file of it
             self._arm()
 
     def after_cycle(self) -> None:
@@ -75,7 +75,7 @@ class Keeper:
         self._late.reset()
 
     def _keep_late(self) -> None:
-        with self._member.turn:
+        with self._entities.turn:
             self._armed = False
             self._late.cancel()
             if self._may_keep():
@@ -83,20 +83,20 @@ class Keeper:
 
     def _may_keep(self) -> bool:
         """Return True if the state is new, and lies between two cycles of an active node."""
-        member = self._member
-        new = member.sequence != self._kept
-        return new and member.mode is Mode.ACTIVE and not member.in_cycle
+        entities = self._entities
+        new = entities.sequence != self._kept
+        return new and entities.mode is Mode.ACTIVE and not entities.in_cycle
 
     def _keep(self, now: float) -> None:
         try:
             blocks = self._blocks()
         except StateError as error:
             self._next = now + self._every
-            self._member.node.get_logger().error(
+            self._entities.node.get_logger().error(
                 f"no snapshot was written: {error}", throttle_duration_sec=_TOLD_EVERY
             )
             return
-        self._kept = self._member.sequence
+        self._kept = self._entities.sequence
         self._writer.put(self._kept, blocks)
         cost = time.monotonic() - now
         self._next = now + min(self._every, cost / _SHARE)
@@ -112,16 +112,17 @@ class Keeper:
         return blocks
 
     def _mark(self) -> StateMark:
-        member = self._member
+        entities = self._entities
         return StateMark(
-            protocol_version=PROTOCOL_VERSION, run=self._run, sequence=member.sequence, last=False,
+            protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence,
+            last=False,
             parts=[part.described() for part in self._parts],
             inputs=[
                 CoveredInput(
                     topic=one.key, publishers=self._publishers_of(one),
                     covered=array("q", one.covered),
                 )
-                for one in member.inputs if one.buffered
+                for one in entities.inputs if one.buffered
             ],
             timers_due=array("q", self._timers_due()),
         )  # fmt: skip
@@ -135,7 +136,7 @@ class Keeper:
 
     def _timers_due(self) -> list[int]:
         try:
-            self._due = self._member.timers_due()
+            self._due = self._entities.timers_due()
         except Exception:  # noqa: BLE001 - at shutdown ROS may be gone already
             return self._due
         return self._due
@@ -147,20 +148,20 @@ class Keeper:
         self._closed = True
         atexit.unregister(self.close)
         # Another thread of the executor may be stuck in a callback: waiting for it has a limit.
-        if self._member.turn.acquire(timeout=_LAST_WORDS):
+        if self._entities.turn.acquire(timeout=_LAST_WORDS):
             try:
                 if self._may_keep():
                     self._keep(time.monotonic())
             finally:
-                self._member.turn.release()
+                self._entities.turn.release()
         self._writer.close()
 
 
 class _Writer:
     """A thread that writes the newest snapshot; newer ones replace any that still wait."""
 
-    def __init__(self, member: Member) -> None:
-        self._member = member
+    def __init__(self, entities: NodeEntities) -> None:
+        self._entities = entities
         self._slots: SlotWriter | None = None
         self._waiting: tuple[int, Sequence[Block]] | None = None
         self._ending = False
@@ -200,7 +201,7 @@ class _Writer:
 
     def _write(self, sequence: int, blocks: Sequence[Block]) -> bool:
         """Write a snapshot; return False if a newer instance writes there: this one then stops."""
-        identity = self._member.identity
+        identity = self._entities.identity
         try:
             if self._slots is None:
                 self._slots = SlotWriter(Path(identity.keep), identity.process, identity.instance)
@@ -217,15 +218,17 @@ class _Writer:
         if self._fault:
             self._fault = ""
             # This call needs its own line: rclpy binds one severity to a line, else it raises.
-            self._member.node.get_logger().info(f"its state is saved again, up to cycle {sequence}")
+            self._entities.node.get_logger().info(
+                f"its state is saved again, up to cycle {sequence}"
+            )
 
     def _not_written(self, error: OSError) -> None:
         if self._fault != str(error):
             self._fault = str(error)
             self._warn(
-                f"not saved: {error.strerror}, in {self._member.identity.keep}. The node "
+                f"not saved: {error.strerror}, in {self._entities.identity.keep}. The node "
                 f"continues, and retries with each newer state"
             )
 
     def _warn(self, message: str) -> None:
-        self._member.node.get_logger().warning(f"its state is {message}")
+        self._entities.node.get_logger().warning(f"its state is {message}")

@@ -19,9 +19,9 @@ from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
 from rosrm.ros import names, qos
 from rosrm.ros.master.handoff import HandoffEndpoint
-from rosrm.ros.master.services import Identity, MasterServices, Queries
+from rosrm.ros.master.services import MasterIdentity, MasterServices, Queries
 from rosrm.ros.master.slave_links import HostLinks
-from rosrm.ros.master.subscriptions import Hearing, Refusals
+from rosrm.ros.master.subscriptions import Refusals, SlaveSubscriptions
 from rosrm.ros.participant import Participant
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
@@ -45,7 +45,7 @@ class MasterEndpoint:
     def __init__(
         self,
         participant: Participant,
-        identity: Identity,
+        identity: MasterIdentity,
         queries: Queries,
         control: ControlSettings,
     ) -> None:
@@ -62,11 +62,13 @@ class MasterEndpoint:
         self.handoffs = HandoffEndpoint(
             participant, identity.name, identity.epoch, self.events.append, refuse
         )
-        self._hearing = Hearing(participant, self.links, self.events.append, refuse)
+        self._subscriptions = SlaveSubscriptions(
+            participant, self.links, self.events.append, refuse
+        )
         self._say(participant)
         self.services = MasterServices(
             participant, self.links, identity, queries,
-            control=control, tell=self.events.append, refuse=refuse,
+            control=control, handle=self.events.append, refuse=refuse,
         )  # fmt: skip
 
     def _say(self, participant: Participant) -> None:
@@ -87,10 +89,10 @@ class MasterEndpoint:
     def poll_readings(self) -> None:
         """Take new readings, even when no other event occurs; called in every tick."""
         self._guard.call(self._take_readings)
-        self._oldest.append(self.links.ledger.ages(time.monotonic())[1])
+        self._oldest.append(self.links.reading_stats.ages(time.monotonic())[1])
 
     def _take_readings(self) -> None:
-        readings = self._hearing.poll_readings()
+        readings = self._subscriptions.poll_readings()
         if readings is not None:
             # Placed first, because a usage must not be judged by readings older than it.
             self.events.insert(0, readings)
@@ -125,7 +127,7 @@ class MasterEndpoint:
 
     def _say_load(self, uptime: float) -> None:
         """Publish statistics that show if the master keeps up with its slaves' messages."""
-        ledger = self.links.ledger
+        ledger = self.links.reading_stats
         hosts, _ = ledger.ages(time.monotonic())
         oldest, self._oldest = self._oldest, []
         facts = {

@@ -19,7 +19,7 @@ _GONE: Final = 10.0
 _FIRST_ROOM: Final = 16
 
 
-class Ledger:
+class ReadingStats:
     """Received cycles, missed cycles and newest beats, by host id.
 
     Attributes:
@@ -37,7 +37,7 @@ class Ledger:
         self.beat: npt.NDArray[np.uint64] = np.zeros(hosts, np.uint64)
         self._incarnation: npt.NDArray[np.uint64] = np.zeros(hosts, np.uint64)
         self._sequence: npt.NDArray[np.int64] = np.zeros(hosts, np.int64)
-        self._heard: npt.NDArray[np.float64] = np.full(hosts, -np.inf)
+        self._last_contact: npt.NDArray[np.float64] = np.full(hosts, -np.inf)
 
     def begin(self, host_id: int, incarnation: int) -> None:
         """Start the count of a newly registered run with its first message."""
@@ -45,21 +45,21 @@ class Ledger:
             self._grow(2 * host_id)
         self._incarnation[host_id] = incarnation
         self._sequence[host_id] = self.beat[host_id] = 0
-        self._heard[host_id] = -np.inf
+        self._last_contact[host_id] = -np.inf
 
     def _grow(self, hosts: int) -> None:
         kept: tuple[npt.NDArray[Any], ...] = (
-            self.beat, self._incarnation, self._sequence, self._heard
+            self.beat, self._incarnation, self._sequence, self._last_contact
         )  # fmt: skip
         self._room(hosts)
-        into = (self.beat, self._incarnation, self._sequence, self._heard)
+        into = (self.beat, self._incarnation, self._sequence, self._last_contact)
         for line, before in zip(into, kept, strict=True):
             line[: len(before)] = before
 
     def forget(self, host_id: int) -> None:
         """Stop expecting readings of a host that left."""
         if host_id < len(self.beat):
-            self._heard[host_id] = -np.inf
+            self._last_contact[host_id] = -np.inf
 
     def take(self, runs: Runs, now: float) -> npt.NDArray[np.int64]:
         """Enter a batch; skip runs that are not registered.
@@ -79,11 +79,11 @@ class Ledger:
         newer = sequence > before
         self._sequence[at[newer]] = sequence[newer]
         self.beat[at] = runs.beat[known]
-        self._heard[at] = now
+        self._last_contact[at] = now
         return at
 
     def ages(self, now: float) -> tuple[int, float]:
         """Return the number of reporting hosts, and the greatest age of a newest reading, s."""
-        age = now - self._heard
+        age = now - self._last_contact
         age = age[age < _GONE]
         return (len(age), float(age.max())) if len(age) else (0, 0.0)

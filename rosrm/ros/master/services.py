@@ -11,9 +11,9 @@ from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Reply
 from rosrm.errors import JournalError, Refused
-from rosrm.model.rows import Snapshot
+from rosrm.model.rows import Listing
 from rosrm.ros import convert, names
-from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
+from rosrm.ros.control import ControlServer, RequestGate, accepted, refused, version_refusal
 from rosrm.ros.master.slave_links import HostLink, HostLinks
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.version import PROTOCOL_VERSION, __version__
@@ -23,7 +23,7 @@ _Respond = Callable[[Any], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class MasterIdentity:
     """Identity of this master."""
 
     name: str
@@ -36,7 +36,7 @@ class Identity:
 class Queries(Protocol):
     """Interface of the master for read-only requests."""
 
-    def snapshot(self, request: srv.List.Request) -> Snapshot:
+    def snapshot(self, request: srv.List.Request) -> Listing:
         """Return the requested listings."""
 
     def explain(self, name: str) -> str | None:
@@ -52,22 +52,23 @@ class MasterServices:
         identity: of this master.
         queries: answers read-only requests.
         control: greatest age of a request, and the beat period for slaves.
-        tell: receives the events.
+        handle: receives the events.
         refuse: receives refused peers, and reasons.
     """
 
     def __init__(
-        self, participant: Participant, links: HostLinks, identity: Identity, queries: Queries,
+        self, participant: Participant, links: HostLinks, identity: MasterIdentity,
+        queries: Queries,
         *, control: ControlSettings,
-        tell: Callable[[happened.Event], None], refuse: Callable[[str, str], None],
+        handle: Callable[[happened.Event], None], refuse: Callable[[str, str], None],
     ) -> None:  # fmt: skip
         self._participant = participant
-        self._server = ControlServer(participant, Gate(time.monotonic_ns, control.max_age))
+        self._server = ControlServer(participant, RequestGate(time.monotonic_ns, control.max_age))
         self._identity = identity
         self._queries = queries
         self._beat_period = control.beat_period
         self._links = links
-        self._tell = tell
+        self._handle = handle
         self._refuse = refuse
         self._open: dict[int, Callable[[Reply], None]] = {}
         self._next_request = 1
@@ -122,7 +123,7 @@ class MasterServices:
                 del self._open[token]
                 respond(kind.Response(answer=refused(refusal.code, str(refusal))))
                 return
-            self._tell(event)
+            self._handle(event)
 
         return take
 
@@ -158,7 +159,7 @@ class MasterServices:
         try:
             description = convert.host_from_msg(request.host)
             statuses = tuple(convert.status_from_msg(status) for status in request.instances)
-            kept = tuple(convert.kept_from_msg(state) for state in request.kept)
+            kept = tuple(convert.snapshot_from_msg(state) for state in request.kept)
         except Refused as refusal:
             respond(srv.RegisterHost.Response(answer=refused(refusal.code, str(refusal))))
             return
@@ -171,7 +172,7 @@ class MasterServices:
             respond(response)
 
         token, seen = self._keep(answer), int(request.journal_seen)
-        self._tell(happened.HostRegistered(token, description, statuses, seen, kept))
+        self._handle(happened.HostRegistered(token, description, statuses, seen, kept))
 
     def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
         kept = tuple(convert.status_from_msg(status) for status in request.kept)
@@ -187,7 +188,7 @@ class MasterServices:
             respond(srv.RequestProcess.Response(answer=answer))
             return
         # Before its first reading the slave's limits, and so its possible load, are not known.
-        self._links.when_heard(link, lambda: self._open_poll(link, request, respond))
+        self._links.after_first_reading(link, lambda: self._open_poll(link, request, respond))
 
     def _open_poll(
         self, link: HostLink, request: srv.RequestProcess.Request, respond: _Respond
@@ -198,7 +199,7 @@ class MasterServices:
 
         token = self._keep(turn_away)
         self._links.open_poll(link, respond, lambda: self._drop(token))
-        self._tell(happened.ProcessRequested(token, request.host_id, request.incarnation))
+        self._handle(happened.ProcessRequested(token, request.host_id, request.incarnation))
 
     def _drop(self, token: int) -> None:
         self._open.pop(token, None)

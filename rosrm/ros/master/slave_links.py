@@ -19,14 +19,14 @@ from rosrm.model.orders import seconds_of
 from rosrm.model.values import Assignment, HostDescription
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, accepted, version_refusal
-from rosrm.ros.master.reading_stats import Ledger
+from rosrm.ros.master.reading_stats import ReadingStats
 from rosrm.ros.orders import order_to_msg
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
 
 
 @dataclass(frozen=True, slots=True)
-class _Unheard:
+class _Deferred:
     """An order for a slave, or a request of one, that waits for its next reading.
 
     Attributes:
@@ -46,7 +46,7 @@ class HostLink:
 
     Attributes:
         incarnation: of the run that registered last; messages of a former run are ignored.
-        unheard: orders and requests that wait for its first beat.
+        deferred: orders and requests that wait for its first beat.
         outbox: assignments for the answer to its open request.
         poll: answers that request; None: none is open.
         forget_poll: removes the open request from those that the master may still refuse.
@@ -55,7 +55,7 @@ class HostLink:
     host_id: int
     control: Any
     incarnation: int
-    unheard: list[_Unheard] = field(default_factory=list)
+    deferred: list[_Deferred] = field(default_factory=list)
     outbox: list[Assignment] = field(default_factory=list)
     poll: Callable[[Any], None] | None = None
     forget_poll: Callable[[], None] = lambda: None
@@ -74,7 +74,7 @@ class HostLinks:
         sender: of the orders, for messages.
         epoch: of this master.
         order_timeout: seconds beyond an order's own time for its answer.
-        tell: receives the events.
+        handle: receives the events.
     """
 
     def __init__(
@@ -83,19 +83,19 @@ class HostLinks:
         sender: str,
         epoch: int,
         order_timeout: float,
-        tell: Callable[[happened.Event], None],
+        handle: Callable[[happened.Event], None],
     ) -> None:
         self._participant = participant
         self._epoch = epoch
         self._order_timeout = order_timeout
-        self._tell = tell
+        self._handle = handle
         self._names = names.Names(participant.settings.namespace)
         self._client = ControlClient(participant, sender)
         self._links: dict[int, HostLink] = {}
         # Of a thousand links few have pending work, so only those are checked.
         self._waiting: set[int] = set()
         self._with_work: set[int] = set()
-        self.ledger = Ledger()
+        self.reading_stats = ReadingStats()
 
     # --- registered slaves ---------------------------------------------------------------
 
@@ -117,30 +117,30 @@ class HostLinks:
         if link.incarnation == description.incarnation:
             # The same run again: assignments that it has not fetched stay valid. But it was
             # unreachable, so an order with the last received beat would be stale.
-            self.ledger.beat[host_id] = 0
+            self.reading_stats.beat[host_id] = 0
             return
         link.incarnation = description.incarnation
-        self.ledger.begin(host_id, description.incarnation)
+        self.reading_stats.begin(host_id, description.incarnation)
         link.outbox.clear()
-        waiting, link.unheard = link.unheard, []
+        waiting, link.deferred = link.deferred, []
         for order in waiting:
             order.done(None)
 
     def left(self, link: HostLink) -> None:
         """Close the open request of a slave that stops in an orderly way."""
         link.close_poll()
-        self.ledger.forget(link.host_id)
+        self.reading_stats.forget(link.host_id)
 
-    def heard(self, host_ids: Iterable[int]) -> None:
+    def reading_received(self, host_ids: Iterable[int]) -> None:
         """Send the orders that waited for readings of these hosts."""
         for host_id in self._waiting.intersection(host_ids) if self._waiting else ():
             self._waiting.discard(host_id)
             link = self._links[host_id]
-            waiting, link.unheard = link.unheard, []
+            waiting, link.deferred = link.deferred, []
             for order in waiting:
                 order.send()
 
-    def when_heard(
+    def after_first_reading(
         self,
         link: HostLink,
         send: Callable[[], None],
@@ -153,13 +153,13 @@ class HostLinks:
             deadline: monotonic seconds.
             done: called with None when the deadline passes first.
         """
-        if self.ledger.beat[link.host_id]:
+        if self.reading_stats.beat[link.host_id]:
             send()
         else:
-            self._wait(link, _Unheard(deadline, send, done))
+            self._wait(link, _Deferred(deadline, send, done))
 
-    def _wait(self, link: HostLink, order: _Unheard) -> None:
-        link.unheard.append(order)
+    def _wait(self, link: HostLink, order: _Deferred) -> None:
+        link.deferred.append(order)
         self._waiting.add(link.host_id)
 
     # --- work ----------------------------------------------------------------------------
@@ -195,7 +195,7 @@ class HostLinks:
                 srv.RequestProcess.Response(
                     answer=accepted(epoch=self._epoch),
                     journal=journal,
-                    slave_beat=int(self.ledger.beat[link.host_id]),
+                    slave_beat=int(self.reading_stats.beat[link.host_id]),
                     assignments=[convert.assignment_to_msg(one) for one in batch],
                 )
             )
@@ -207,7 +207,7 @@ class HostLinks:
         kept = [one for one in waiting if one.instance != command.instance]
         if link is not None and len(kept) < len(waiting):
             link.outbox = kept
-            self._tell(happened.AssignmentWithdrawn(command.instance))
+            self._handle(happened.AssignmentWithdrawn(command.instance))
             return
         self.order(command.if_fetched, now)
 
@@ -224,32 +224,32 @@ class HostLinks:
         link = self._links.get(command.host_id)
         if link is None:  # expected from the journal, not registered yet
             why = "the host does not report"
-            self._tell(happened.OrderAnswered(command.order_id, False, "timeout", why))
+            self._handle(happened.OrderAnswered(command.order_id, False, "timeout", why))
             return
         request = order_to_msg(command.order)
         deadline = now + seconds_of(command.order) + self._order_timeout
 
         def done(response: srv.ControlHost.Response | None) -> None:
-            self._tell(_order_answered(command.order_id, response))
+            self._handle(_order_answered(command.order_id, response))
 
         def send() -> None:
             if not link.control.service_is_ready():
-                self._wait(link, _Unheard(deadline, send, done))
+                self._wait(link, _Deferred(deadline, send, done))
                 return
-            beat = int(self.ledger.beat[link.host_id])
+            beat = int(self.reading_stats.beat[link.host_id])
             request.envelope = self._client.envelope(beat, self._epoch)
             self._client.call(link.control, request, deadline, done)
 
-        self.when_heard(link, send, deadline, done)
+        self.after_first_reading(link, send, deadline, done)
 
     def expire(self, now: float) -> None:
         """End the orders and requests that got no answer in time."""
         self._client.expire(now)
         for host_id in list(self._waiting):
             link = self._links[host_id]
-            late = [order for order in link.unheard if now >= order.deadline]
-            link.unheard = [order for order in link.unheard if now < order.deadline]
-            if not link.unheard:
+            late = [order for order in link.deferred if now >= order.deadline]
+            link.deferred = [order for order in link.deferred if now < order.deadline]
+            if not link.deferred:
                 self._waiting.discard(host_id)
             for order in late:
                 order.done(None)

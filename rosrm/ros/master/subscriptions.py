@@ -19,38 +19,38 @@ from rosrm_msgs import msg
 
 #: Seconds between two records of the same refusal, and most different refusals remembered.
 _REFUSED_EVERY: Final = 10.0
-_REFUSED_KEPT: Final = 1000
+_MOST_REFUSALS: Final = 1000
 
 
 class Refusals:
     """Records refused peers, but not ten times a second.
 
     Args:
-        tell: receives the events.
+        handle: receives the events.
     """
 
-    def __init__(self, tell: Callable[[happened.Event], None]) -> None:
-        self._tell = tell
-        self._told: dict[tuple[str, str], float] = {}
+    def __init__(self, handle: Callable[[happened.Event], None]) -> None:
+        self._handle = handle
+        self._recorded_at: dict[tuple[str, str], float] = {}
 
     def __call__(self, who: str, reason: str) -> None:
         """Record a refusal, unless the same one was recorded within the last seconds."""
         now = time.monotonic()
-        if now - self._told.get((who, reason), -_REFUSED_EVERY) < _REFUSED_EVERY:
+        if now - self._recorded_at.get((who, reason), -_REFUSED_EVERY) < _REFUSED_EVERY:
             return
-        if len(self._told) >= _REFUSED_KEPT:
-            self._told.clear()
-        self._told[who, reason] = now
-        self._tell(happened.PeerRefused(who, reason))
+        if len(self._recorded_at) >= _MOST_REFUSALS:
+            self._recorded_at.clear()
+        self._recorded_at[who, reason] = now
+        self._handle(happened.PeerRefused(who, reason))
 
 
-class Hearing:
+class SlaveSubscriptions:
     """The subscriptions to the messages of slaves.
 
     Args:
         participant: creates the subscriptions.
         links: receives the ids of hosts whose readings arrived.
-        tell: receives the events.
+        handle: receives the events.
         refuse: receives refused peers, and reasons.
     """
 
@@ -58,11 +58,11 @@ class Hearing:
         self,
         participant: Participant,
         links: HostLinks,
-        tell: Callable[[happened.Event], None],
+        handle: Callable[[happened.Event], None],
         refuse: Callable[[str, str], None],
     ) -> None:
         self._links = links
-        self._tell = tell
+        self._handle = handle
         self._refuse = refuse
         node, path = participant.node, names.Names(participant.settings.namespace)
         # Thousands of readings arrive: they are taken raw, in batches, without the executor.
@@ -73,7 +73,7 @@ class Hearing:
         for kind, topic, take in (
             (msg.ProcessStatusBatch, names.PROCESS_STATUS, self._take_statuses),
             (msg.ProcessUsage, names.PROCESS_USAGE, self._take_usage),
-            (msg.KeptStates, names.KEPT_STATES, self._take_kept),
+            (msg.KeptStates, names.KEPT_STATES, self._take_snapshots),
         ):
             node.create_subscription(kind, path(topic), participant.counted(take), qos.STATUSES)
 
@@ -89,10 +89,10 @@ class Hearing:
             return None
         batch = decode(taken)
         if batch.runs is not None:
-            heard = self._links.ledger.take(batch.runs, time.monotonic())
-            self._links.heard(heard.tolist())
-        for stranger in batch.strangers:
-            self._refuse("resource_info", stranger)
+            received = self._links.reading_stats.take(batch.runs, time.monotonic())
+            self._links.reading_received(received.tolist())
+        for refusal in batch.refusals:
+            self._refuse("resource_info", refusal)
         return batch.readings
 
     def _take_statuses(self, message: msg.ProcessStatusBatch) -> None:
@@ -107,7 +107,7 @@ class Hearing:
         except Refused as refusal:
             self._refuse(who, str(refusal))
             return
-        self._tell(
+        self._handle(
             happened.StatusesReceived(
                 message.host_id,
                 message.incarnation,
@@ -127,21 +127,21 @@ class Hearing:
         if fault or len(sizes) > 1:
             self._refuse(who, fault or "arrays of different lengths")
             return
-        self._tell(
+        self._handle(
             happened.UsagesReceived(
                 message.host_id, message.incarnation, np.asarray(message.numbers, np.uint64),
                 np.asarray(message.cpu, np.float64), np.asarray(message.memory, np.float64),
             )
         )  # fmt: skip
 
-    def _take_kept(self, message: msg.KeptStates) -> None:
+    def _take_snapshots(self, message: msg.KeptStates) -> None:
         who = f"kept_states of host {message.host_id}"
         fault = version_refusal(message.protocol_version, who)
         if fault:
             self._refuse(who, fault)
             return
-        states = tuple(convert.kept_from_msg(one) for one in message.states)
-        self._tell(happened.KeptStatesReceived(message.host_id, message.incarnation, states))
+        states = tuple(convert.snapshot_from_msg(one) for one in message.states)
+        self._handle(happened.KeptStatesReceived(message.host_id, message.incarnation, states))
 
 
 def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:

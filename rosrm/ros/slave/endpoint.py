@@ -18,11 +18,11 @@ from rosrm.core.slave.master_clock import BeatClock
 from rosrm.core.slave.state import SlaveState
 from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
-from rosrm.model.values import HostDescription, InstanceStatus, KeptState
+from rosrm.model.values import HostDescription, InstanceStatus, SnapshotReport
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import Call, ControlClient, version_refusal
 from rosrm.ros.participant import Participant
-from rosrm.ros.slave.journal_watermark import JournalSeen, Seen
+from rosrm.ros.slave.journal_watermark import JournalWatermark, Watermark
 from rosrm.ros.slave.reporter import Reporter
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import msg, srv
@@ -52,7 +52,7 @@ _MISSED_BEATS: Final = 10
 _MISSED_BY_ANOTHER: Final = 3
 
 
-class Link(Enum):
+class MasterLink(Enum):
     """State of the connection to the master."""
 
     SEARCHING = "searching"
@@ -86,13 +86,14 @@ class SlaveEndpoint:
     def __init__(
         self, participant: Participant, description: HostDescription, state: SlaveState, *,
         take: Callable[[events.Event], None],
-        kept_states: Callable[[], Sequence[KeptState]] = tuple, seen: JournalSeen | None = None,
+        kept_states: Callable[[], Sequence[SnapshotReport]] = tuple,
+        seen: JournalWatermark | None = None,
     ) -> None:  # fmt: skip
         self._participant = participant
         self._state, self._take, self._kept_states = state, take, kept_states
         self._description = description
-        self._seen = seen or JournalSeen()
-        self.link = Link.SEARCHING
+        self._seen = seen or JournalWatermark()
+        self.link = MasterLink.SEARCHING
         self.failure = ""
         self.superseded = False
         self.cluster = ""
@@ -153,17 +154,17 @@ class SlaveEndpoint:
     def go_on(self, now: float) -> None:
         """Take the next step towards a registration; called in every cycle."""
         self._control.expire(now)
-        if self.link is Link.SEARCHING and self._clients[srv.Handshake].service_is_ready():
+        if self.link is MasterLink.SEARCHING and self._clients[srv.Handshake].service_is_ready():
             self._greet(now)
-        if self.link is Link.LISTENING and now - self._greeted_at >= _PATIENCE:
-            self.link = Link.SEARCHING
-        if self.link is Link.REGISTERED and self._missed(_MISSED_BEATS, now):
+        if self.link is MasterLink.LISTENING and now - self._greeted_at >= _PATIENCE:
+            self.link = MasterLink.SEARCHING
+        if self.link is MasterLink.REGISTERED and self._missed(_MISSED_BEATS, now):
             silence = now - self._beat_at
             keep = "; processes keep running" if self._leaves is None else ""
             self._lose_master(f"the master has been silent for {silence:.1f} s{keep}")
 
     def _greet(self, now: float) -> None:
-        self.link = Link.GREETING
+        self.link = MasterLink.GREETING
         self._asked_at = now
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role="slave",
@@ -176,7 +177,7 @@ class SlaveEndpoint:
     def _take_greeting(self, answer: srv.Handshake.Response | None) -> None:
         now = time.monotonic()
         if answer is None or now - self._asked_at >= _PATIENCE:  # this process was stopped
-            self.link = Link.SEARCHING
+            self.link = MasterLink.SEARCHING
             return
         fault = version_refusal(answer.protocol_version, f"the master on {answer.hostname}")
         if fault or not answer.accepted:
@@ -186,24 +187,24 @@ class SlaveEndpoint:
         self._greeting, self._greeted_at = answer, now
         self._beat_clock.restart()
         self._note_beat(answer.beat, now)
-        self.link = Link.LISTENING
+        self.link = MasterLink.LISTENING
         self._register_if_known()
 
     def _register_if_known(self) -> None:
         """Register once a beat identifies the run of the master that greeted this slave."""
         beat = self._newest_beat
-        if beat is None or _speaker(beat) != _speaker(self._greeting):
+        if beat is None or _master_identity(beat) != _master_identity(self._greeting):
             return
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._state.statuses()],
-            kept=[convert.kept_to_msg(one) for one in self._kept_states()],
+            kept=[convert.snapshot_to_msg(one) for one in self._kept_states()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
         self._incarnation = beat.incarnation
         self._asked_at = time.monotonic()
-        self.link = Link.REGISTERING
+        self.link = MasterLink.REGISTERING
         self._poll_at = 0.0
         self._control.call(
             self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
@@ -213,7 +214,7 @@ class SlaveEndpoint:
     def _take_registration(self, response: srv.RegisterHost.Response | None) -> None:
         now = time.monotonic()
         if response is None or response.answer.code == "stale":
-            self.link = Link.SEARCHING
+            self.link = MasterLink.SEARCHING
             return
         answer = response.answer
         if answer.code in ("journal", "failed"):
@@ -232,8 +233,8 @@ class SlaveEndpoint:
         self._beat_at = now
         self._poll_anew = _FIRST_POLL_ANEW
         self._reporter.begin(self.host_id, self._beat_period)
-        self.link = Link.REGISTERED
-        self._take(events.MasterHears(self._asked_at))
+        self.link = MasterLink.REGISTERED
+        self._take(events.ContactConfirmed(self._asked_at))
         self._take(events.Registered(answer.epoch, renumbers))
         greeting = self._greeting
         _log.info(
@@ -245,7 +246,7 @@ class SlaveEndpoint:
 
     def _wait_for_journal(self, why: str, now: float) -> None:
         """Retry while the master's journal stalls, and log the wait once."""
-        self.link = Link.SEARCHING
+        self.link = MasterLink.SEARCHING
         if self._waits_since is None:
             self._waits_since = now
             _log.info("the master takes no host in, asking on: %s", why)
@@ -263,14 +264,14 @@ class SlaveEndpoint:
             self.failure = answer.message
             self.superseded = answer.code == "name_taken"
             return
-        self.link = Link.SEARCHING
+        self.link = MasterLink.SEARCHING
 
     def _patience(self) -> float:
         found = any(not status.state.ended for status in self._state.statuses())
         return _NAME_TAKEN_BY_FORMER if found and not self.host_id else _NAME_TAKEN
 
     def _lose_master(self, reason: str) -> None:
-        self.link = Link.SEARCHING
+        self.link = MasterLink.SEARCHING
         self._poll_at = 0.0
         self._newest_beat = None
         self._control.forget()
@@ -281,17 +282,17 @@ class SlaveEndpoint:
         if version_refusal(beat.protocol_version, "the master"):
             return  # the handshake reports the version mismatch
         now = time.monotonic()
-        if self.link is Link.REGISTERED and beat.incarnation != self._incarnation:
+        if self.link is MasterLink.REGISTERED and beat.incarnation != self._incarnation:
             if beat.epoch <= self.epoch and not self._missed(_MISSED_BY_ANOTHER, now):
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
         said_at = self._note_beat(beat.beat, now)
-        if self.link is Link.REGISTERED:
-            self._seen.note(Seen(beat.journal, beat.incarnation, self.cluster))
-        if self.link is Link.REGISTERED and self.host_id not in beat.unheard:
-            self._take(events.MasterHears(said_at))
-        if self.link is Link.LISTENING:
+        if self.link is MasterLink.REGISTERED:
+            self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))
+        if self.link is MasterLink.REGISTERED and self.host_id not in beat.unheard:
+            self._take(events.ContactConfirmed(said_at))
+        if self.link is MasterLink.LISTENING:
             self._register_if_known()
 
     def _missed(self, beats: int, now: float) -> bool:
@@ -313,7 +314,7 @@ class SlaveEndpoint:
         takes that answer as well, because the master repeats assignments that were lost only
         after `control.order_retry`.
         """
-        if now < self._poll_at or self.link is not Link.REGISTERED:
+        if now < self._poll_at or self.link is not MasterLink.REGISTERED:
             return
         self._poll_at = now + self._poll_anew
         self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
@@ -337,7 +338,7 @@ class SlaveEndpoint:
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return
-        self._seen.note(Seen(response.journal, self._incarnation, self.cluster))
+        self._seen.note(Watermark(response.journal, self._incarnation, self.cluster))
         try:
             work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
         except Refused as refusal:
@@ -356,13 +357,13 @@ class SlaveEndpoint:
 
         A reading without news is sent with a later cycle (`rosrm.ros.slave.reporter`).
         """
-        if self.link is Link.REGISTERED:
+        if self.link is MasterLink.REGISTERED:
             facts = (accepting, processes, present, stale, self._status_sequence)
             self._reporter.cycle(usage, limit, facts)
 
     def publish_statuses(self, statuses: Sequence[InstanceStatus], *, complete: bool) -> None:
         """Publish statuses of instances."""
-        if self.link is not Link.REGISTERED:
+        if self.link is not MasterLink.REGISTERED:
             return  # the next registration includes all statuses
         self._status_sequence += 1
         self._statuses.publish(
@@ -385,7 +386,7 @@ class SlaveEndpoint:
         The newest reading is sent first: the master reduces reservations by these usages, so its
         readings must already include that load.
         """
-        if self.link is Link.REGISTERED:
+        if self.link is MasterLink.REGISTERED:
             self._reporter.tell()
             self._usages.publish(
                 msg.ProcessUsage(
@@ -395,22 +396,22 @@ class SlaveEndpoint:
                 )
             )  # fmt: skip
 
-    def publish_kept(self, states: Sequence[KeptState]) -> bool:
+    def publish_kept(self, states: Sequence[SnapshotReport]) -> bool:
         """Publish all snapshots that this host holds; False: it is not registered."""
-        if self.link is not Link.REGISTERED:
+        if self.link is not MasterLink.REGISTERED:
             return False
         self._kept.publish(
             msg.KeptStates(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                 incarnation=self._description.incarnation,
-                states=[convert.kept_to_msg(one) for one in states],
+                states=[convert.snapshot_to_msg(one) for one in states],
             )
         )  # fmt: skip
         return True
 
     def wait_until_heard(self) -> None:
         """Wait until the last statuses are acknowledged: others are lost when this slave leaves."""
-        if self.link is not Link.REGISTERED:
+        if self.link is not MasterLink.REGISTERED:
             return
         if not self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS)):
             _log.info("the master did not acknowledge the last statuses within %g s", _LAST_WORDS)
@@ -425,7 +426,7 @@ class SlaveEndpoint:
             kept: all instances, if the slave leaves them running; (): it stops them.
         """
         self._leaves = kept
-        if self.link is Link.REGISTERED:
+        if self.link is MasterLink.REGISTERED:
             self._send_leave(kept, done)
         else:
             done()
@@ -441,6 +442,6 @@ class SlaveEndpoint:
         )
 
 
-def _speaker(said: msg.MasterBeat | srv.Handshake.Response) -> tuple[str, int, int]:
+def _master_identity(message: msg.MasterBeat | srv.Handshake.Response) -> tuple[str, int, int]:
     """Return the identity of a master as far as a greeting contains it."""
-    return said.hostname, said.pid, said.epoch
+    return message.hostname, message.pid, message.epoch

@@ -38,7 +38,7 @@ _KEPT: Final = 1.0
 _MOST_KEPT: Final = 1000
 
 
-class HealthEar:
+class HealthMonitor:
     """Checks the health of one run of one instance.
 
     Args:
@@ -49,8 +49,8 @@ class HealthEar:
     """
 
     def __init__(self, node: Node, graph: GraphWatch, watch: Watch, now: float) -> None:
-        self._topic = _TopicEar(node, graph, watch) if watch.topics else None
-        self._state = _StateEar(node, watch, now) if watch.services else None
+        self._topic = _TopicMonitor(node, graph, watch) if watch.topics else None
+        self._state = _StateMonitor(node, watch, now) if watch.services else None
 
     def topic(self, pids: Iterable[int], now: float) -> tuple[int | None, str]:
         """Return the messages since the last check, or None and why the topic cannot be checked.
@@ -72,11 +72,11 @@ class HealthEar:
                 ear.close()
 
 
-class _TopicEar:
+class _TopicMonitor:
     def __init__(self, node: Node, graph: GraphWatch, watch: Watch) -> None:
         self._node, self._graph = node, graph
         self._names = watch.topics
-        kept = math.ceil(_KEPT * watch.wanted.rate) + 1
+        kept = math.ceil(_KEPT * watch.checks.rate) + 1
         self._qos = QoSProfile(
             history=HistoryPolicy.KEEP_LAST, depth=min(kept, _MOST_KEPT),
             reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE,
@@ -156,12 +156,12 @@ class _TopicEar:
             self._subscription, self._source, self._last = None, ("", ""), 0
 
 
-class _StateEar:
+class _StateMonitor:
     def __init__(self, node: Node, watch: Watch, now: float) -> None:
         self._node = node
         self._clients: list[Any] = []
         self._state: str | None = None
-        self._period = min(_ASK_PERIOD, watch.wanted.timeout / _ASKS)
+        self._period = min(_ASK_PERIOD, watch.checks.timeout / _ASKS)
         self._asked = -math.inf
         self._answered = now
         self._kind = import_module("lifecycle_msgs.srv").GetState
@@ -174,7 +174,7 @@ class _StateEar:
 
     def look(self, now: float) -> str | None:
         for client in self._clients:
-            self._hear(client, now)
+            self._take_answer(client, now)
         if now - self._answered > self._period + _PATIENCE:
             self._state = NO_ANSWER
         if now - self._asked >= self._period:
@@ -184,7 +184,7 @@ class _StateEar:
                     client.handle.send_request(self._kind.Request())
         return self._state
 
-    def _hear(self, client: Any, now: float) -> None:
+    def _take_answer(self, client: Any, now: float) -> None:
         """Take every received answer; the newest counts, to whichever request."""
         while True:
             with client.handle:

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 _LONGEST: Final = 1000
 
 
-class Seen(NamedTuple):
+class Watermark(NamedTuple):
     """Watermark of the journal of one run of a master.
 
     Attributes:
@@ -29,10 +29,10 @@ class Seen(NamedTuple):
     master: str
 
 
-_NOTHING: Final = Seen(0, 0, "")
+_NOTHING: Final = Watermark(0, 0, "")
 
 
-class JournalSeen:
+class JournalWatermark:
     """Stores the newest record that the master has reported.
 
     Args:
@@ -44,7 +44,7 @@ class JournalSeen:
         self._file = -1
         self._newest = _read(path) if path is not None else _NOTHING
 
-    def note(self, newest: Seen) -> None:
+    def note(self, newest: Watermark) -> None:
         """Store the journal's watermark from the master that this slave is registered with."""
         known = self._newest
         if newest.incarnation == known.incarnation and newest.sequence <= known.sequence:
@@ -57,7 +57,7 @@ class JournalSeen:
         except OSError:
             return  # stored in memory; the next watermark is written to the file again
 
-    def _keep(self, path: Path, newest: Seen) -> None:
+    def _keep(self, path: Path, newest: Watermark) -> None:
         if self._file < 0:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
         line = f"{newest.sequence:020d} {newest.incarnation:020d} {newest.master}\n".encode()
@@ -71,10 +71,10 @@ class JournalSeen:
         return newest.sequence if former else 0
 
 
-def _read(path: Path) -> Seen:
+def _read(path: Path) -> Watermark:
     try:
         line, end, _ = path.read_bytes()[:_LONGEST].decode().partition("\n")
         sequence, incarnation, master = line.split(" ", 2)
-        return Seen(int(sequence), int(incarnation), master) if end else _NOTHING
+        return Watermark(int(sequence), int(incarnation), master) if end else _NOTHING
     except (OSError, ValueError):
         return _NOTHING

@@ -57,10 +57,10 @@ def await_second_publisher(
         )  # fmt: skip
         try:
             names = frozenset((source, destination))
-            heard, both = _listen(node, topic, kind, names, begun + timeout)
+            received, both = _listen(node, topic, kind, names, begun + timeout)
             if both:
-                return {"heard": heard, "seconds": time.monotonic() - begun}
-            reason = _missing(node, topic, type_name, heard)
+                return {"heard": received, "seconds": time.monotonic() - begun}
+            reason = _missing(node, topic, type_name, received)
         finally:
             node.destroy_node()
     finally:
@@ -73,7 +73,7 @@ def _listen(
 ) -> tuple[int, bool]:
     """Return the number of messages received, and True if they came from both publishers."""
     subscription = node.create_subscription(kind, topic, _never_called, _ANY, raw=True)
-    heard, last, two = 0, 0, False
+    received, last, two = 0, 0, False
     handle = subscription.handle
     while time.monotonic() < deadline:
         with handle:
@@ -81,31 +81,31 @@ def _listen(
         if taken is None:
             time.sleep(_EVERY)
             continue
-        heard += 1
+        received += 1
         count = int(taken[1]["publication_sequence_number"])
         two = two or count <= last
         last = count
         if two and _are_alone(node, topic, names):
-            return heard, True
-    return heard, False
+            return received, True
+    return received, False
 
 
 def _are_alone(node: Node, topic: str, names: frozenset[str]) -> bool:
     """Return True if just these nodes publish there; the graph learns node names after topics."""
     found = {info.node_name for info in node.get_publishers_info_by_topic(topic)}
-    strangers = sorted(found - names - {_UNKNOWN})
-    if strangers:
+    others = sorted(found - names - {_UNKNOWN})
+    if others:
         raise ValueError(
-            f"{topic} is also published by {', '.join(strangers)}, so that nobody can tell whether "
+            f"{topic} is also published by {', '.join(others)}, so that nobody can tell whether "
             f"the destination speaks: with `protocol: paper` only the node itself may publish its "
             f"state"
         )
     return found == names
 
 
-def _missing(node: Node, topic: str, type_name: str, heard: int) -> str:
-    if heard:
-        return f"only one publisher of {topic} was heard ({heard} messages)"
+def _missing(node: Node, topic: str, type_name: str, received: int) -> str:
+    if received:
+        return f"only one publisher of {topic} was heard ({received} messages)"
     types = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
     if not types:
         return f"nobody publishes {topic}"

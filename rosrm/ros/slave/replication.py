@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, NamedTuple, Protocol
 from rosrm.ros import names, qos
 from rosrm.ros.control import ControlClient, accepted, refused, version_refusal
 from rosrm.ros.participant import OpenRequest, Participant
-from rosrm.snapshots import Part
+from rosrm.snapshots import TransferPart
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import srv
 
@@ -33,15 +33,15 @@ class NotStored(NamedTuple):
     message: str
 
 
-class KeptHost(Protocol):
+class ReplicationHost(Protocol):
     """Interface of the slave for its replication endpoint."""
 
-    def take_part(self, part: Part, answer: Callable[[NotStored | None], None]) -> None:
+    def take_part(self, part: TransferPart, answer: Callable[[NotStored | None], None]) -> None:
         """Store a part of a replica; `answer` with None, or with the reason of a refusal."""
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,
-        answer: Callable[[Part | None], None],
+        answer: Callable[[TransferPart | None], None],
     ) -> None:  # fmt: skip
         """Read a part of a snapshot; `answer` with it, or with None."""
 
@@ -52,7 +52,7 @@ class _Peer:
     used: float
 
 
-class KeptEndpoint:
+class ReplicationEndpoint:
     """The replication services of one slave, and its clients.
 
     Args:
@@ -67,7 +67,7 @@ class KeptEndpoint:
         self._client = ControlClient(participant, f"slave {name}")
         self._peers: dict[tuple[Any, str], _Peer] = {}
 
-    def serve(self, host: KeptHost) -> None:
+    def serve(self, host: ReplicationHost) -> None:
         """Offer the services."""
 
         def take(request: srv.KeepState.Request, open_request: OpenRequest) -> None:
@@ -80,7 +80,7 @@ class KeptEndpoint:
             if fault:
                 answer(NotStored("version", fault))
                 return
-            part = Part(
+            part = TransferPart(
                 request.process, request.number, request.sequence, request.offset, request.total,
                 request.digest, bytes(request.data),
             )  # fmt: skip
@@ -89,7 +89,7 @@ class KeptEndpoint:
         def read(request: srv.ReadKept.Request, open_request: OpenRequest) -> None:
             fault = version_refusal(request.protocol_version, "a reader of snapshots")
 
-            def answer(part: Part | None) -> None:
+            def answer(part: TransferPart | None) -> None:
                 open_request.answer(_read_answer(part))
 
             if fault:
@@ -124,7 +124,7 @@ class KeptEndpoint:
         return peer.client
 
     def give(
-        self, host: str, part: Part, now: float, timeout: float,
+        self, host: str, part: TransferPart, now: float, timeout: float,
         done: Callable[[NotStored | None], None],
     ) -> None:  # fmt: skip
         """Send a part to a slave; `done` gets None when it was stored, else the reason."""
@@ -145,8 +145,8 @@ class KeptEndpoint:
         self._client.call(client, request, now + timeout, answered)
 
     def ask(
-        self, host: str, wanted: Part, now: float, timeout: float,
-        done: Callable[[Part | str], None],
+        self, host: str, wanted: TransferPart, now: float, timeout: float,
+        done: Callable[[TransferPart | str], None],
     ) -> None:  # fmt: skip
         """Request a part from another slave; `done` gets it, or the reason why there is none.
 
@@ -174,17 +174,17 @@ class KeptEndpoint:
             self._participant.node.destroy_client(self._peers.pop(key).client)
 
 
-def _part_of(response: srv.ReadKept.Response, wanted: Part) -> Part | str:
+def _part_of(response: srv.ReadKept.Response, wanted: TransferPart) -> TransferPart | str:
     answer = response.answer
     if not answer.accepted:
         return str(answer.message)
-    return Part(
+    return TransferPart(
         wanted.process, response.number, response.sequence, wanted.offset, response.total,
         response.digest, bytes(response.data),
     )  # fmt: skip
 
 
-def _read_answer(part: Part | None) -> srv.ReadKept.Response:
+def _read_answer(part: TransferPart | None) -> srv.ReadKept.Response:
     if part is None:
         return srv.ReadKept.Response(answer=refused("unknown", "there is no such snapshot here"))
     return srv.ReadKept.Response(

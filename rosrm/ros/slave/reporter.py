@@ -38,14 +38,14 @@ class Reporter:
         self._send = send
         self._period = period
         self._every = 1
-        self._untold = 0
+        self._unpublished = 0
         self._row = np.zeros((), LAYOUT)
         self._row["protocol_version"] = PROTOCOL_VERSION
         self._row["incarnation"] = incarnation
         self._facts: _Facts = (False, 0, 0, 0, 0)
-        self._told: _Facts | None = None
-        self._told_usage = self._told_limit = np.zeros(0, np.float32)
-        self._told_over = np.zeros(0, np.bool_)
+        self._published: _Facts | None = None
+        self._published_usage = self._published_limit = np.zeros(0, np.float32)
+        self._published_over = np.zeros(0, np.bool_)
 
     def begin(self, host_id: int, beat_period: float) -> None:
         """Start reporting to a master that accepted this host; the next reading is always sent.
@@ -57,7 +57,7 @@ class Reporter:
         self._row["host_id"] = host_id
         # The summand rounds up, because three periods of 0.1 s are slightly less than 0.3 s.
         self._every = min(max(1, int(beat_period / self._period + 1e-6)), MOST_QUIET + 1)
-        self._told = None
+        self._published = None
 
     def note_master(self, beat: int) -> None:
         """Store the newest received beat of the master, ns, for the next reading."""
@@ -76,31 +76,31 @@ class Reporter:
         row["sequence"] += 1
         row["usage"], row["limit"] = usage, limit
         self._facts = facts
-        self._untold += 1
-        if self._untold >= self._every or self._tells_more(usage, limit):
+        self._unpublished += 1
+        if self._unpublished >= self._every or self._has_news(usage, limit):
             self.tell()
 
-    def _tells_more(self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32]) -> bool:
+    def _has_news(self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32]) -> bool:
         """Return True if a decision may differ between this reading and the last published one."""
-        if self._facts != self._told:
+        if self._facts != self._published:
             return True
         return bool(
-            (np.abs(usage - self._told_usage) >= RESOLUTION).any()
-            or ((usage >= limit) != self._told_over).any()
-            or (limit != self._told_limit).any()
+            (np.abs(usage - self._published_usage) >= RESOLUTION).any()
+            or ((usage >= limit) != self._published_over).any()
+            or (limit != self._published_limit).any()
         )
 
     def tell(self) -> None:
         """Send the newest reading, unless it has been sent."""
-        if not self._untold:
+        if not self._unpublished:
             return
         row = self._row
         accepting, row["processes"], row["present"], row["stale"], statuses = self._facts
         row["status_sequence"] = statuses
-        row["flags"] = flags(accepting=accepting, quiet=self._untold - 1)
+        row["flags"] = flags(accepting=accepting, quiet=self._unpublished - 1)
         row["beat"] = time.monotonic_ns()
-        self._untold = 0
-        self._told = self._facts
-        self._told_usage, self._told_limit = row["usage"].copy(), row["limit"].copy()
-        self._told_over = self._told_usage >= self._told_limit
+        self._unpublished = 0
+        self._published = self._facts
+        self._published_usage, self._published_limit = row["usage"].copy(), row["limit"].copy()
+        self._published_over = self._published_usage >= self._published_limit
         self._send(encode(row))

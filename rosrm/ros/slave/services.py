@@ -14,7 +14,7 @@ from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetR
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
 from rosrm.ros import names
-from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
+from rosrm.ros.control import ControlServer, RequestGate, accepted, refused, version_refusal
 from rosrm.ros.orders import order_from_msg
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm_msgs import srv
@@ -89,7 +89,7 @@ class SlaveServices:
     ) -> None:  # fmt: skip
         self._duties = duties
         path = names.Names(participant.settings.namespace)
-        server = ControlServer(participant, Gate(time.monotonic_ns, max_age), epoch)
+        server = ControlServer(participant, RequestGate(time.monotonic_ns, max_age), epoch)
         server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
         participant.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
 

@@ -12,7 +12,7 @@ from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
 from rosrm.model.values import Assignment, ProcessSpec, RestartPolicy
 from rosrm.slave.launch import ament_index
-from rosrm.slave.launch.environment import Whereabouts, process_environment
+from rosrm.slave.launch.environment import ProcessLocation, process_environment
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ros_arguments
 from rosrm.supervisor.client import log_path
@@ -24,7 +24,7 @@ def launch_order(
     base_environment: Mapping[str, str],
     python: str,
     *,
-    where: Whereabouts,
+    where: ProcessLocation,
     state_directory: Path,
     launchers: Launchers,
     heard: float = 0.0,

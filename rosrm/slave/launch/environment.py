@@ -35,7 +35,7 @@ _IDENTITY: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Whereabouts:
+class ProcessLocation:
     """Host and cluster of a process, as passed in its environment.
 
     Attributes:
@@ -53,7 +53,7 @@ class Whereabouts:
     keep_every: float = 1.0
 
 
-def kept_directory(kept: Path, process: str) -> Path:
+def snapshot_directory(kept: Path, process: str) -> Path:
     """Return the directory of the snapshots of one process."""
     return kept / token(process)
 
@@ -61,7 +61,7 @@ def kept_directory(kept: Path, process: str) -> Path:
 def process_environment(
     assignment: Assignment,
     base: Mapping[str, str],
-    where: Whereabouts,
+    where: ProcessLocation,
     not_inherited: Sequence[str] = (),
 ) -> dict[str, str]:
     """Return all variables of an instance; those of its spec take precedence.
@@ -87,7 +87,7 @@ def process_environment(
     if assignment.shadow:
         environment[SHADOW] = "1"
     if assignment.has_snapshots and where.kept is not None:
-        environment[KEEP] = str(kept_directory(where.kept, spec.name))
+        environment[KEEP] = str(snapshot_directory(where.kept, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)

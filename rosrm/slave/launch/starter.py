@@ -11,17 +11,17 @@ from pathlib import Path
 
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, events
-from rosrm.core.slave.state import Held, SlaveState
+from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.errors import LaunchError
 from rosrm.model.values import Assignment, InstanceId, InstanceState
 from rosrm.ros.names import STATE_CONFIG, Names
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.slave.launch.command import launch_order
-from rosrm.slave.launch.environment import Whereabouts
+from rosrm.slave.launch.environment import ProcessLocation
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import to_memo
-from rosrm.slave.replication.service import Keeping
+from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.wording import one_line
@@ -39,7 +39,7 @@ class Starter:
         state: instances of the slave; read-only here.
         supervisor: executes the orders.
         endpoint: reports to the master.
-        keeping: fetches snapshots.
+        replication: fetches snapshots.
         graph: shows the nodes of the ROS graph.
         sessions: process tree of each instance.
         launchers: of this host.
@@ -51,7 +51,7 @@ class Starter:
     state: SlaveState
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint
-    keeping: Keeping
+    replication: ReplicationService
     graph: GraphWatch
     sessions: SessionTable
     launchers: Launchers
@@ -67,7 +67,7 @@ class Starter:
         """Start assignments, each as soon as its snapshot is on this host."""
         # A later event of the same batch may have removed an instance, as its supervisor is gone.
         wanted = [one for one in assignments if one.instance in self.state.held]
-        ready = [one for one in wanted if self.keeping.prepare(one, self._prepared)]
+        ready = [one for one in wanted if self.replication.prepare(one, self._prepared)]
         if ready:
             self._start(ready)
         # Fetching a snapshot may take long, and the supervisor reports nothing before the start.
@@ -90,10 +90,10 @@ class Starter:
         """
         if not isinstance(command, commands.Stop | commands.Fence | commands.Restart):
             return False
-        if not self.keeping.is_preparing(command.instance):
+        if not self.replication.is_preparing(command.instance):
             return False
         if not isinstance(command, commands.Restart):  # a restart needs nothing: the start follows
-            self.keeping.forget(command.instance)
+            self.replication.forget(command.instance)
             refusal = "it was stopped before it was started"
             self.take(events.LaunchRefused(command.instance, refusal))
         return True
@@ -104,9 +104,9 @@ class Starter:
 
     def has_begun(self, instance: InstanceId) -> bool:
         """Return True if the supervisor has or had the instance."""
-        return instance not in self.state.waiting and not self.keeping.is_preparing(instance)
+        return instance not in self.state.waiting and not self.replication.is_preparing(instance)
 
-    def look_at_graph(self, awaited: Mapping[InstanceId, Held]) -> None:
+    def look_at_graph(self, awaited: Mapping[InstanceId, HeldInstance]) -> None:
         """Report the awaited nodes that are in the ROS graph now."""
         for instance, held in awaited.items():
             before = self._graph_before.get(instance, frozenset())
@@ -126,7 +126,7 @@ class Starter:
 
     def _start(self, assignments: Sequence[Assignment]) -> None:
         orders = []
-        where = self._whereabouts()
+        where = self._location()
         for assignment in assignments:
             held = self.state.held[assignment.instance]
             if held.awaited is not None:
@@ -136,7 +136,7 @@ class Starter:
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
                     state_directory=self.supervisor.state, launchers=self.launchers,
-                    heard=self.state.heard_at,
+                    heard=self.state.last_contact,
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
@@ -147,9 +147,9 @@ class Starter:
         if orders:
             self.supervisor.start(orders)
 
-    def _whereabouts(self) -> Whereabouts:
+    def _location(self) -> ProcessLocation:
         config = self.config
-        return Whereabouts(
+        return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
             self.kept, config.keep.every,
         )  # fmt: skip

@@ -8,8 +8,8 @@ from functools import partial
 from typing import Final
 
 from rosrm.model.values import Assignment
-from rosrm.ros.slave.replication import KeptEndpoint, NotStored
-from rosrm.snapshots import Head, Part
+from rosrm.ros.slave.replication import NotStored, ReplicationEndpoint
+from rosrm.snapshots import Head, TransferPart
 
 #: Seconds for the discovery of a slave, or its answer; then the next host is asked.
 PATIENCE: Final = 3.0
@@ -30,8 +30,8 @@ class Fetch:
     """
 
     def __init__(
-        self, assignment: Assignment, hosts: tuple[str, ...], endpoint: KeptEndpoint, *,
-        here: Head | None, take: Callable[[Part, Callable[[NotStored | None], None]], None],
+        self, assignment: Assignment, hosts: tuple[str, ...], endpoint: ReplicationEndpoint, *,
+        here: Head | None, take: Callable[[TransferPart, Callable[[NotStored | None], None]], None],
         ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._assignment = assignment
@@ -40,15 +40,15 @@ class Fetch:
         self._here = here
         self._take = take
         self._ended = ended
-        self._over = self._waits = False
+        self._has_ended = self._waits = False
         self._failures: list[str] = []
-        self._wanted = Part(assignment.spec.name, 0, 0, 0, 0, 0, b"")
+        self._wanted = TransferPart(assignment.spec.name, 0, 0, 0, 0, 0, b"")
         now = time.monotonic()
         self._deadline, self._host_by = now + LONGEST, now + PATIENCE
 
     def go_on(self, now: float) -> None:
         """Ask for the next part, or try the next host if this one does not answer."""
-        if self._over:
+        if self._has_ended:
             return
         if now >= self._deadline:
             self._next_host(f"it takes longer than {LONGEST:g} s", now, last=True)
@@ -62,8 +62,8 @@ class Fetch:
             elif now >= self._host_by:
                 self._next_host(f"its slave was not found within {PATIENCE:g} s", now)
 
-    def _answered(self, part: Part | str) -> None:
-        if self._over:
+    def _answered(self, part: TransferPart | str) -> None:
+        if self._has_ended:
             return
         now = time.monotonic()
         if isinstance(part, str):
@@ -75,8 +75,8 @@ class Fetch:
         else:
             self._take(part, partial(self._taken, part))
 
-    def _taken(self, part: Part, refusal: NotStored | None) -> None:
-        if self._over:
+    def _taken(self, part: TransferPart, refusal: NotStored | None) -> None:
+        if self._has_ended:
             return
         now = time.monotonic()
         if refusal is not None:
@@ -93,7 +93,7 @@ class Fetch:
 
     def _next_host(self, why: str, now: float, *, last: bool = False) -> None:
         self._failures.append(f"{self._hosts.pop(0)}: {why}" if self._hosts else why)
-        self._wanted = Part(self._assignment.spec.name, 0, 0, 0, 0, 0, b"")
+        self._wanted = TransferPart(self._assignment.spec.name, 0, 0, 0, 0, 0, b"")
         self._waits = False
         self._host_by = now + PATIENCE
         if last or not self._hosts:
@@ -102,7 +102,7 @@ class Fetch:
             self.go_on(now)
 
     def _end(self, good: str) -> None:
-        self._over = True
+        self._has_ended = True
         here = self._here
         start = "from nothing" if here is None else f"from cycle {here.sequence}, which is here"
         why = "; ".join(self._failures) or "no other host keeps one"

@@ -18,18 +18,18 @@ from typing import Any, Final
 
 from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
-from rosrm.model.values import Assignment, InstanceId, KeptState
-from rosrm.ros.slave.replication import MOST, KeptEndpoint, NotStored
+from rosrm.model.values import Assignment, InstanceId, SnapshotReport
+from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
 from rosrm.slave.replication.fetch import Fetch
-from rosrm.slave.replication.store import KeptStore
-from rosrm.snapshots import Head, Part
+from rosrm.slave.replication.store import SnapshotStore
+from rosrm.snapshots import Head, TransferPart
 
 _log = logging.getLogger("rosrm.slave")
 
 #: Seconds between two scans of the snapshots on this host.
 _SCAN_EVERY: Final = 1.0
 #: Seconds after which the report to the master is repeated without a change.
-_SAY_EVERY: Final = 10.0
+_REPORT_PERIOD: Final = 10.0
 #: Seconds for the acknowledgement of one part. A slave that was just discovered may not be able to
 #: answer yet.
 _PART_TIMEOUT: Final = 1.0
@@ -50,7 +50,7 @@ class _Shipment:
     Attributes:
         sent: age of the newest snapshot that each host accepted.
         due: monotonic time of the next transfer to each host, seconds.
-        said: code with which each host refused the last snapshot.
+        refusals: code with which each host refused the last snapshot.
     """
 
     instance: InstanceId
@@ -58,7 +58,7 @@ class _Shipment:
     every: float
     sent: dict[str, tuple[int, int]] = field(default_factory=dict)
     due: dict[str, float] = field(default_factory=dict)
-    said: dict[str, str] = field(default_factory=dict)
+    refusals: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -79,7 +79,7 @@ class _Transfer:
     waits: bool = True
 
 
-class Keeping:
+class ReplicationService:
     """Snapshots and replicas of one host.
 
     Args:
@@ -92,23 +92,23 @@ class Keeping:
     """
 
     def __init__(
-        self, root: Path, host: str, settings: KeepSettings, endpoint: KeptEndpoint, *,
+        self, root: Path, host: str, settings: KeepSettings, endpoint: ReplicationEndpoint, *,
         post: Callable[[Callable[[], None]], None],
-        publish: Callable[[Sequence[KeptState]], bool],
+        publish: Callable[[Sequence[SnapshotReport]], bool],
     ) -> None:  # fmt: skip
         self._host = host
         self._settings = settings
         self._endpoint = endpoint
         self._post, self._publish = post, publish
-        self._store = KeptStore(root, settings.max_bytes)
+        self._store = SnapshotStore(root, settings.max_bytes)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._shipments: dict[str, _Shipment] = {}
         self._transfers: dict[str, _Transfer] = {}
         #: Instances that wait for a snapshot; None: the local search is running.
         self._preparing: dict[InstanceId, Fetch | None] = {}
-        self._kept = self._store.scan()
-        self._told: tuple[KeptState, ...] | None = None
-        self._told_at = 0.0
+        self._snapshots = self._store.scan()
+        self._reported: tuple[SnapshotReport, ...] | None = None
+        self._reported_at = 0.0
         self._next_scan = 0.0
         self._budget = float(settings.max_rate)
         self._budget_at = time.monotonic()
@@ -152,7 +152,7 @@ class Keeping:
             return
         new = _Shipment(instance, wanted, max(every, 0.1))
         if known is not None:
-            new.sent, new.due, new.said = known.sent, known.due, known.said
+            new.sent, new.due, new.refusals = known.sent, known.due, known.refusals
         self._shipments[instance.process] = new
 
     def drop(self, instance: InstanceId, *, lives: bool) -> None:
@@ -166,10 +166,10 @@ class Keeping:
         self._in_thread(drop, lambda _: None)
         self._next_scan = 0.0
 
-    def say_again(self) -> None:
+    def report_again(self) -> None:
         """Report all snapshots to a master that has just registered this host."""
-        self._told = None
-        self._tell(time.monotonic())
+        self._reported = None
+        self._report(time.monotonic())
 
     # --- the loop ------------------------------------------------------------------------
 
@@ -181,7 +181,7 @@ class Keeping:
         self._budget_at = now
         if now >= self._next_scan:
             self._next_scan = now + _SCAN_EVERY
-            if self._kept or self._store.is_used():
+            if self._snapshots or self._store.is_used():
                 self._in_thread(self._store.scan, self._scanned)
         for shipment in list(self._shipments.values()):
             self._begin_due(shipment, now)
@@ -191,21 +191,23 @@ class Keeping:
             if fetch is not None:
                 fetch.go_on(now)
 
-    def states(self) -> tuple[KeptState, ...]:
+    def states(self) -> tuple[SnapshotReport, ...]:
         """Return the snapshots on this host, as of the last scan."""
-        return self._kept
+        return self._snapshots
 
-    def _scanned(self, states: tuple[KeptState, ...] | None) -> None:
+    def _scanned(self, states: tuple[SnapshotReport, ...] | None) -> None:
         if states is not None:
-            self._kept = states
-            self._tell(time.monotonic())
+            self._snapshots = states
+            self._report(time.monotonic())
 
-    def _tell(self, now: float) -> None:
-        quiet = not self._kept and not self._told
-        if self._kept == self._told and (quiet or now - self._told_at < _SAY_EVERY):
+    def _report(self, now: float) -> None:
+        quiet = not self._snapshots and not self._reported
+        if self._snapshots == self._reported and (
+            quiet or now - self._reported_at < _REPORT_PERIOD
+        ):
             return
-        if self._publish(self._kept):
-            self._told, self._told_at = self._kept, now
+        if self._publish(self._snapshots):
+            self._reported, self._reported_at = self._snapshots, now
 
     # --- to other hosts ------------------------------------------------------------------
 
@@ -242,7 +244,7 @@ class Keeping:
         if transfer.waits or head is None or self._budget <= 0.0:
             return
         data = transfer.content[transfer.offset : transfer.offset + MOST]
-        part = Part(
+        part = TransferPart(
             head.process, head.instance, head.sequence, transfer.offset, len(transfer.content),
             transfer.digest, data,
         )  # fmt: skip
@@ -262,7 +264,7 @@ class Keeping:
         transfer.waits = False
         if head is not None and transfer.offset >= len(transfer.content):
             shipment.sent[host] = head.age
-            shipment.said.pop(host, None)
+            shipment.refusals.pop(host, None)
             self._end(transfer)
         else:
             self._go_on(transfer, now)
@@ -278,8 +280,8 @@ class Keeping:
             shipment.due[host] = now
         else:
             shipment.due[host] = now + max(_AGAIN, shipment.every)
-        if shipment.said.get(host) != refusal.code:
-            shipment.said[host] = refusal.code
+        if shipment.refusals.get(host) != refusal.code:
+            shipment.refusals[host] = refusal.code
             instance, why = shipment.instance, refusal.message
             _log.info("%s does not keep the state of %s: %s", host, instance, why)
 
@@ -290,7 +292,7 @@ class Keeping:
 
     # --- from other hosts ----------------------------------------------------------------
 
-    def take_part(self, part: Part, answer: Callable[[NotStored | None], None]) -> None:
+    def take_part(self, part: TransferPart, answer: Callable[[NotStored | None], None]) -> None:
         """Store a part of a snapshot from another host."""
 
         def taken(refusal: NotStored | None) -> None:
@@ -302,7 +304,7 @@ class Keeping:
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,
-        answer: Callable[[Part | None], None],
+        answer: Callable[[TransferPart | None], None],
     ) -> None:  # fmt: skip
         """Answer another host's request for a part of a snapshot."""
         read = partial(self._store.read, process, age, offset, size, time.monotonic())
@@ -359,7 +361,7 @@ class Keeping:
         )  # fmt: skip
         fetch.go_on(time.monotonic())
 
-    def _take_fetched(self, part: Part, then: Callable[[NotStored | None], None]) -> None:
+    def _take_fetched(self, part: TransferPart, then: Callable[[NotStored | None], None]) -> None:
         self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)
 
     def is_preparing(self, instance: InstanceId) -> bool:

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Final
 
 from rosrm import snapshots
-from rosrm.model.values import InstanceId, KeptState
+from rosrm.model.values import InstanceId, SnapshotReport
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
-from rosrm.snapshots import Part
+from rosrm.snapshots import TransferPart
 
 #: Seconds for which a snapshot stays in memory between reads of its parts.
 _READ_FOR: Final = 10.0
 
 
 @dataclass(slots=True)
-class _Coming:
+class _Incoming:
     age: tuple[int, int]
     total: int
     writer: snapshots.CopyWriter
@@ -34,7 +34,7 @@ class _BeingRead:
     until: float
 
 
-class KeptStore:
+class SnapshotStore:
     """Snapshot files of all processes below one directory.
 
     Args:
@@ -45,7 +45,7 @@ class KeptStore:
     def __init__(self, root: Path, max_bytes: int) -> None:
         self._root = root
         self._max_bytes = max_bytes
-        self._coming: dict[str, _Coming] = {}
+        self._incoming: dict[str, _Incoming] = {}
         self._being_read: dict[str, _BeingRead] = {}
 
     def directory(self, process: str) -> Path:
@@ -64,7 +64,7 @@ class KeptStore:
         """Return True if this host ever stored a snapshot."""
         return self._root.exists()
 
-    def scan(self) -> tuple[KeptState, ...]:
+    def scan(self) -> tuple[SnapshotReport, ...]:
         """Return the newest snapshot of each process."""
         try:
             directories = sorted(path for path in self._root.iterdir() if path.is_dir())
@@ -72,7 +72,7 @@ class KeptStore:
             return ()
         heads = [head for one in directories if (head := snapshots.newest_head(one)) is not None]
         return tuple(
-            KeptState(InstanceId(head.process, head.instance), head.sequence, head.size)
+            SnapshotReport(InstanceId(head.process, head.instance), head.sequence, head.size)
             for head in heads
         )
 
@@ -94,7 +94,7 @@ class KeptStore:
 
     # --- incoming snapshots --------------------------------------------------------------
 
-    def take(self, part: Part, *, bounded: bool) -> NotStored | None:
+    def take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
         """Write a part of a snapshot; the last part completes the replica.
 
         Args:
@@ -108,7 +108,7 @@ class KeptStore:
             refusal = self._begin(part, bounded=bounded)
             if refusal is not None:
                 return refusal
-        coming = self._coming.get(part.process)
+        coming = self._incoming.get(part.process)
         if coming is None or coming.age != part.age or coming.writer.size != part.offset:
             return NotStored("order", "it does not follow the part before it: send all parts again")
         try:
@@ -123,7 +123,7 @@ class KeptStore:
             return NotStored("damaged", str(fault))
         return None
 
-    def _begin(self, part: Part, *, bounded: bool) -> NotStored | None:
+    def _begin(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
         self._abandon(part.process)
         directory = self.directory(part.process)
         newest = snapshots.newest_head(directory)
@@ -144,13 +144,13 @@ class KeptStore:
             writer = snapshots.CopyWriter(directory)
         except OSError as error:
             return NotStored("full", f"it cannot be written: {error.strerror}")
-        self._coming[part.process] = _Coming(part.age, part.total, writer)
+        self._incoming[part.process] = _Incoming(part.age, part.total, writer)
         return None
 
-    def _has_room(self, part: Part) -> bool:
+    def _has_room(self, part: TransferPart) -> bool:
         """Return True if a snapshot fits beside other replicas and running transfers."""
         own = self.directory(part.process)
-        used = sum(one.total for one in self._coming.values())
+        used = sum(one.total for one in self._incoming.values())
         with contextlib.suppress(OSError):
             for directory in self._root.iterdir():
                 if directory != own:
@@ -158,8 +158,8 @@ class KeptStore:
                         used += (directory / snapshots.COPY).stat().st_size
         return used + part.total <= self._max_bytes
 
-    def _finish(self, part: Part, coming: _Coming) -> None:
-        del self._coming[part.process]
+    def _finish(self, part: TransferPart, coming: _Incoming) -> None:
+        del self._incoming[part.process]
         if coming.digest != part.digest:
             coming.writer.abandon()
             raise snapshots.Damaged("what came does not match its checksum")
@@ -169,7 +169,7 @@ class KeptStore:
             raise snapshots.Damaged(f"it is a state of {head.process!r}")
 
     def _abandon(self, process: str) -> None:
-        coming = self._coming.pop(process, None)
+        coming = self._incoming.pop(process, None)
         if coming is not None:
             coming.writer.abandon()
 
@@ -177,7 +177,7 @@ class KeptStore:
 
     def read(
         self, process: str, age: tuple[int, int], offset: int, size: int, now: float
-    ) -> Part | None:
+    ) -> TransferPart | None:
         """Return a part of a snapshot; None: this host does not hold the snapshot (any more).
 
         Args:
@@ -199,6 +199,6 @@ class KeptStore:
         head, data = one.head, one.content[offset : offset + size]
         if offset + len(data) >= len(one.content):
             self._being_read.pop(process, None)
-        return Part(
+        return TransferPart(
             process, head.instance, head.sequence, offset, len(one.content), one.digest, data
         )

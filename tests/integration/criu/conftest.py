@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine.binary import Criu, default_prefix, find, opened
+from rosrm_criu.engine.binary import CriuBinary, default_prefix, find, opened
 from rosrm_criu.engine.probe import probe
 
 ROOT = Path(__file__).parents[3]
@@ -38,7 +38,7 @@ def install_criu(folder: Path, **environment: object) -> subprocess.CompletedPro
 
 
 @pytest.fixture(scope="session")
-def criu() -> Criu:
+def criu() -> CriuBinary:
     """Return the working CRIU that `make setup` installs."""
     try:
         found = find()
@@ -60,10 +60,10 @@ def cached() -> Path:
 
 
 @pytest.fixture(scope="session")
-def old() -> Callable[[str], Criu]:
+def old() -> Callable[[str], CriuBinary]:
     """Return a function for a Debian release's own CRIU: Debian 12 has 3.17, Debian 13 has 4.1."""
 
-    def of(suite: str) -> Criu:
+    def of(suite: str) -> CriuBinary:
         if platform.freedesktop_os_release()["ID"] != "debian":
             pytest.skip(f"only Debian has the release {suite}")
         OLDER.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from rosrm_criu.engine.binary import Criu
+from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.compatibility import FACTS
 from rosrm_criu.engine.probe import ability, probe
 
@@ -145,7 +145,7 @@ def test_one_that_hangs_is_given_up_in_time_and_leaves_nothing_behind(tmp_path, 
     hanging = tmp_path / "criu"
     hanging.write_text("#!/bin/sh\nexec sleep 1000\n")
     hanging.chmod(0o755)
-    able = probe(Criu((str(hanging),), "4.2"), timeout=3.0)
+    able = probe(CriuBinary((str(hanging),), "4.2"), timeout=3.0)
     assert able.works is False
     assert able.reason.startswith("CRIU 4.2 could not dump: it was not done after ")
     hanging.unlink()
@@ -157,11 +157,11 @@ def test_one_that_only_claims_to_have_restored_does_not_work(tmp_path):
     lying = tmp_path / "criu"
     lying.write_text('#!/bin/sh\nif [ "$1" = dump ]; then kill -9 "$3"; fi\n')
     lying.chmod(0o755)
-    able = probe(Criu((str(lying),), "4.2"), timeout=3.0)
+    able = probe(CriuBinary((str(lying),), "4.2"), timeout=3.0)
     assert able.reason == "a child that was restored does not answer over UDP on loopback"
 
 
-def reachable(criu: Criu, public: Path) -> Path:
+def reachable(criu: CriuBinary, public: Path) -> Path:
     """Copy the program into a folder that every user can read."""
     copy = Path(shutil.copy(os.path.realpath(criu.command[0]), public / "criu"))
     copy.chmod(0o755)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine.binary import Criu, default_prefix, find, opened
+from rosrm_criu.engine.binary import CriuBinary, default_prefix, find, opened
 
 ANSWERS = 'if [ "$1" = --version ]; then echo "Version: {}"; exit; fi\n'
 
@@ -33,12 +33,12 @@ def nothing_else(tmp_path, monkeypatch):
 
 def test_the_variable_goes_before_the_prefix_and_that_before_path(tmp_path, monkeypatch):
     script(tmp_path / "path/criu", version="1.1")
-    assert find(tmp_path / "prefix") == Criu((str(tmp_path / "path/criu"),), "1.1")
+    assert find(tmp_path / "prefix") == CriuBinary((str(tmp_path / "path/criu"),), "1.1")
     private = script(tmp_path / "prefix/bin/criu", version="2.2.2")
-    assert find(tmp_path / "prefix") == Criu((str(private),), "2.2.2")
+    assert find(tmp_path / "prefix") == CriuBinary((str(private),), "2.2.2")
     named = script(tmp_path / "named", version="3.3")
     monkeypatch.setenv("ROSRM_CRIU", str(named))
-    assert find(tmp_path / "prefix") == Criu((str(named),), "3.3")
+    assert find(tmp_path / "prefix") == CriuBinary((str(named),), "3.3")
 
 
 def test_it_is_found_where_debian_puts_it_although_a_user_s_path_leaves_that_out(tmp_path):

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm_criu.transfer import Offer, Sent
+from rosrm_criu.transfer import Offer, OfferResult
 from rosrm_criu.transfer.archive import Archive
 from rosrm_criu.transfer.sending import serve
 from tests.faults.disks import small_disk
@@ -97,7 +97,7 @@ def test_nobody_at_any_address(source, target, sender, destination):
 
 def test_an_offer_ends_by_itself(source, target, sender, destination):
     offer = sender.offer(source, seconds=0.2, to=destination.certificate)
-    assert sender.wait(PATIENCE) == Sent("expired", 0)
+    assert sender.wait(PATIENCE) == OfferResult("expired", 0)
     assert not listens(offer.port)
     with pytest.raises(TransferError, match=r"its offer, which stands for 0\.2 s, may be over"):
         destination.fetch(offer, target)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm_criu.transfer import Fetcher, Offer, Sender, Sent
+from rosrm_criu.transfer import Fetcher, Offer, OfferResult, Sender
 from tests.integration.transfer.trees import PATIENCE, digests, listens, nothing_left, slowly, until
 
 
@@ -128,7 +128,7 @@ def is_dead(process: Path) -> bool:
 def test_a_sender_that_is_killed_says_so(source, sender, destination):
     sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     sender._process.kill()
-    assert sender.wait(PATIENCE) == Sent("failed", 0)
+    assert sender.wait(PATIENCE) == OfferResult("failed", 0)
 
 
 def test_closing_twice_and_from_several_threads_does_no_harm(source, destination):
@@ -139,7 +139,7 @@ def test_closing_twice_and_from_several_threads_does_no_harm(source, destination
         thread.start()
     for thread in threads:
         thread.join(PATIENCE)
-    assert sender.close() == Sent("withdrawn", 0)
+    assert sender.close() == OfferResult("withdrawn", 0)
 
 
 def test_a_destination_that_was_not_introduced_fetches_nothing(source, target, sender, destination):

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm_criu.transfer import Offer, Sender, Sent
+from rosrm_criu.transfer import Offer, OfferResult, Sender
 from tests.integration.transfer.trees import (
     PATIENCE,
     Destination,
@@ -47,7 +47,7 @@ def test_100_mb_arrive_as_they_were(tmp_path, target, sender, fetcher):
     for path in (target, *target.rglob("*")):
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)
     sent = sender.wait(PATIENCE)
-    assert sent == Sent("taken", fetched.received)
+    assert sent == OfferResult("taken", fetched.received)
     assert not listens(offer.port)
     assert [path.name for path in target.parent.iterdir()] == ["target"]
 
@@ -62,7 +62,7 @@ def test_a_directory_without_files_arrives(tmp_path, target, sender, destination
 def test_nothing_listens_before_there_is_something_to_fetch(sender):
     """A process that was started in advance has no socket."""
     assert psutil.Process(sender._process.pid).net_connections("inet") == []
-    assert sender.close() == Sent("failed", 0)
+    assert sender.close() == OfferResult("failed", 0)
 
 
 def test_a_rate_is_kept(source, target, sender, destination):
@@ -116,7 +116,7 @@ def test_a_destination_that_was_introduced_is_the_only_one(source, target, sende
     assert nothing_left(target)
     fetched = destination.fetch(offer, target)
     assert digests(target) == digests(source)
-    assert sender.wait(PATIENCE) == Sent("taken", fetched.received)
+    assert sender.wait(PATIENCE) == OfferResult("taken", fetched.received)
 
 
 def test_who_shows_no_certificate_is_not_spoken_with(source, sender, destination):
@@ -155,7 +155,7 @@ def test_another_server_is_told_nothing(source, target, sender, destination):
         mistaken = dataclasses.replace(offer, port=elsewhere.port)
         with pytest.raises(TransferError, match="another server answers"):
             destination.fetch(mistaken, target)
-        assert other.close() == Sent("withdrawn", 0)
+        assert other.close() == OfferResult("withdrawn", 0)
 
 
 def test_what_travels_is_no_plain_text(source, target, sender, tmp_path, destination):

@@ -34,6 +34,6 @@ def test_faults_are_numbered_and_each_has_a_target_of_its_own():
 
 def test_every_kind_can_be_done():
     """The harness implements each kind."""
-    from benchmarks.chaos.harm import Harmer
+    from benchmarks.chaos.fault_injector import FaultInjector
 
-    assert [kind for kind in KINDS if not hasattr(Harmer, f"_{kind}")] == []
+    assert [kind for kind in KINDS if not hasattr(FaultInjector, f"_{kind}")] == []

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 import benchmarks.chaos
-from benchmarks.chaos.excuses import OVERLOAD, Harm, Promise
+from benchmarks.chaos.allowances import OVERLOAD, Disturbance, Guarantees
 from benchmarks.chaos.outputs import Outputs, Run
 from benchmarks.chaos.rules import Judgement, chain, judge_job, judge_line, judge_service
 
 FOLDER = Path(benchmarks.chaos.__file__).parent
-JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py", "excuses.py"]
+JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py", "allowances.py"]
 
 
 @pytest.mark.parametrize("name", JUDGES)
@@ -39,42 +39,42 @@ def kinds(*arguments):
 
 
 FIRST, SECOND = run(), run("a#2", "host2", 21.0, 30.0, (101, 200))
-KILLED = Harm("process_kill", 20.0, 20.0, process="a")
-CUT = Harm("host_cut", 12.0, 19.0, frozenset({"host1"}), hides=True)
-OFF = Harm("host_off", 20.0, 25.0, frozenset({"host1"}), kills=True, hides=True)
+KILLED = Disturbance("process_kill", 20.0, 20.0, process="a")
+CUT = Disturbance("host_cut", 12.0, 19.0, frozenset({"host1"}), hides=True)
+OFF = Disturbance("host_off", 20.0, 25.0, frozenset({"host1"}), kills=True, hides=True)
 
 
 def test_nobody_may_end_to_whom_nothing_was_done():
     """Only a killed process, or one on a host that lost its power, may end."""
-    plain = Promise()
+    plain = Guarantees()
     assert kinds(plain, [FIRST, SECOND], []) == (["touched"], {})
     assert kinds(plain, [FIRST, SECOND], [KILLED]) == ([], {})
     assert kinds(plain, [FIRST, SECOND], [OFF]) == ([], {})
     assert kinds(plain, [FIRST, SECOND], [CUT]) == (["touched"], {})
-    assert kinds(Promise(elsewhere=True), [FIRST, SECOND], [CUT]) == ([], {})
-    other = Harm("host_off", 20.0, 25.0, frozenset({"host2"}), kills=True)
+    assert kinds(Guarantees(elsewhere=True), [FIRST, SECOND], [CUT]) == ([], {})
+    other = Disturbance("host_off", 20.0, 25.0, frozenset({"host2"}), kills=True)
     assert kinds(plain, [FIRST, SECOND], [other]) == (["touched"], {})
 
 
 def test_two_active_owners_only_while_they_were_parted():
     """The allowance covers one second after the partition; with `isolation: stop` there is none."""
     longer, beside = run(last=24.0), run("a#2", "host2", 16.0, 30.0)
-    elsewhere = Promise(elsewhere=True)
+    elsewhere = Guarantees(elsewhere=True)
     assert kinds(elsewhere, [run(last=19.5), beside], [CUT]) == ([], {"partitioned": 1})
     parted = judge_service("a", elsewhere, [run(last=19.5), beside], [CUT]).parted
     assert parted == pytest.approx([0.5])
     assert kinds(elsewhere, [longer, beside], [CUT])[0] == ["doubled"]
-    assert kinds(Promise(), [longer, beside], [KILLED])[0] == ["doubled"]
-    isolated = Promise(elsewhere=True, isolated=True)
+    assert kinds(Guarantees(), [longer, beside], [KILLED])[0] == ["doubled"]
+    isolated = Guarantees(elsewhere=True, isolated=True)
     assert kinds(isolated, [run(last=17.0), beside], [CUT])[0] == ["doubled"]
-    overlap = Harm("overlap", 15.0, 15.0, process="a")
-    assert kinds(Promise(), [longer, beside], [overlap]) == ([], {"overlaps": 1})
+    overlap = Disturbance("overlap", 15.0, 15.0, process="a")
+    assert kinds(Guarantees(), [longer, beside], [overlap]) == ([], {"overlaps": 1})
 
 
 def test_a_host_that_comes_up_late_is_given_its_second_from_then_on():
     """The host has reached the master at the latest when it begins a job."""
     late, beside = run(last=40.5), run("a#2", "host2", 16.0, 50.0)
-    elsewhere = Promise(elsewhere=True)
+    elsewhere = Guarantees(elsewhere=True)
     assert judge_service("a", elsewhere, [late, beside], [CUT]).violations != []
     assert judge_service("a", elsewhere, [late, beside], [CUT], {"host1": 40.0}).violations == []
 
@@ -82,8 +82,8 @@ def test_a_host_that_comes_up_late_is_given_its_second_from_then_on():
 def test_an_overloaded_machine_explains_what_nothing_else_does():
     """An overload does not delay the cut of a host."""
     late, beside = run(last=29.0), run("a#2", "host2", 16.0, 30.0)
-    overload = Harm(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True)
-    elsewhere = Promise(elsewhere=True)
+    overload = Disturbance(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True)
+    elsewhere = Guarantees(elsewhere=True)
     assert kinds(elsewhere, [late, beside], [overload]) == ([], {"partitioned": 1})
     assert kinds(elsewhere, [late, beside], [overload, CUT])[0] == ["doubled"]
 
@@ -93,37 +93,37 @@ def test_who_comes_back_for_a_moment_does_not_end_the_owner():
     old, owner = run(last=20.0), run("a#2", "host2", 24.0, 40.0)
     back = run("a#1", "host1", 25.5, 25.6, pid=9)
     assert chain([old, owner, back]) == [old, back, owner]
-    excused = kinds(Promise(elsewhere=True), chain([old, owner, back]), [OFF])
+    excused = kinds(Guarantees(elsewhere=True), chain([old, owner, back]), [OFF])
     assert excused == ([], {"partitioned": 1})
 
 
 def test_a_move_loses_and_repeats_nothing():
-    stateful, move = Promise(stateful=True), Harm("move", 15.0, 15.0, process="a")
+    stateful, move = Guarantees(stateful=True), Disturbance("move", 15.0, 15.0, process="a")
     assert kinds(stateful, [FIRST, SECOND], [move]) == ([], {})
     for first in (1, 100, 102):
         follower = run("a#2", "host2", 21.0, 30.0, (first, first + 9))
         assert kinds(stateful, [FIRST, follower], [move])[0] == ["state"]
 
 
-SHORT = Harm("host_cut", 19.6, 19.9, frozenset({"host1"}), hides=True)
+SHORT = Disturbance("host_cut", 19.6, 19.9, frozenset({"host1"}), hides=True)
 
 
 def test_a_silence_too_short_to_lose_a_host_or_to_be_fenced_excuses_nothing():
     """Two seconds may lose a host; for `isolation: stop`, 0.8 s is less than its fence may take."""
-    elsewhere, isolated = Promise(elsewhere=True), Promise(elsewhere=True, isolated=True)
+    elsewhere, isolated = Guarantees(elsewhere=True), Guarantees(elsewhere=True, isolated=True)
     bounds = [(elsewhere, 1.9, ["touched"]), (elsewhere, 2.1, []),
               (isolated, 0.7, ["touched"]), (isolated, 0.9, [])]  # fmt: skip
-    for promise, seconds, violations in bounds:
-        cut = Harm("host_cut", 20.0 - seconds, 20.0, frozenset({"host1"}), hides=True)
-        assert kinds(promise, [FIRST, SECOND], [cut])[0] == violations
+    for guarantees, seconds, violations in bounds:
+        cut = Disturbance("host_cut", 20.0 - seconds, 20.0, frozenset({"host1"}), hides=True)
+        assert kinds(guarantees, [FIRST, SECOND], [cut])[0] == violations
 
 
 def test_silences_add_up_and_a_part_that_starts_again_is_silent_until_it_is_up():
     """Overlapping silences count once, and time after the end of a run does not count."""
-    elsewhere, everywhere = Promise(elsewhere=True), frozenset({"*"})
-    long = Harm("host_cut", 17.0, 18.8, frozenset({"host1"}), hides=True)
+    elsewhere, everywhere = Guarantees(elsewhere=True), frozenset({"*"})
+    long = Disturbance("host_cut", 17.0, 18.8, frozenset({"host1"}), hides=True)
     beside = replace(long, kind="master_stop", hosts=everywhere, ended=18.5)
-    killed = Harm("master_kill", 17.0, 17.2, everywhere, hides=True, restarts=True)
+    killed = Disturbance("master_kill", 17.0, 17.2, everywhere, hides=True, restarts=True)
     late = replace(long, begun=19.5, ended=25.0)
     assert kinds(elsewhere, [FIRST, SECOND], [long])[0] == ["touched"]
     assert kinds(elsewhere, [FIRST, SECOND], [long, SHORT])[0] == []
@@ -134,8 +134,8 @@ def test_silences_add_up_and_a_part_that_starts_again_is_silent_until_it_is_up()
 
 def test_a_slave_that_is_stopped_lets_its_host_fence_sooner_than_the_host_is_lost():
     """A killed supervisor ends nothing."""
-    elsewhere = Promise(elsewhere=True)
-    slave = Harm("slave_stop", 18.5, 20.0, frozenset({"host1"}), hides=True, deafens=True)
+    elsewhere = Guarantees(elsewhere=True)
+    slave = Disturbance("slave_stop", 18.5, 20.0, frozenset({"host1"}), hides=True, deafens=True)
     assert kinds(elsewhere, [FIRST, SECOND], [slave])[0] == []
     assert kinds(elsewhere, [FIRST, SECOND], [replace(slave, deafens=False)])[0] == ["touched"]
 
@@ -145,12 +145,17 @@ def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
 
     Without a replica, a start on another host is from nothing.
     """
-    kept, copied = Promise(stateful=True, kept=True), Promise(stateful=True, kept=True, copied=5)
+    kept, copied = (
+        Guarantees(stateful=True, kept=True),
+        Guarantees(stateful=True, kept=True, copied=5),
+    )
 
-    def after(promise, first, host, *harms):
-        return kinds(promise, [FIRST, run("a#2", host, 21.0, 30.0, (first, 200))], [*harms, KILLED])
+    def after(guarantees, first, host, *disturbances):
+        return kinds(
+            guarantees, [FIRST, run("a#2", host, 21.0, 30.0, (first, 200))], [*disturbances, KILLED]
+        )
 
-    full = Harm("disk_full", 5.0, 30.0, frozenset({"host1"}), fills=True)
+    full = Disturbance("disk_full", 5.0, 30.0, frozenset({"host1"}), fills=True)
     late = replace(full, begun=18.0)
     allowed = [
         (kept, 99, "host1", "state_cycles_repeated"), (kept, 90, "host1", "state_seconds_repeated"),
@@ -159,21 +164,21 @@ def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
         (copied, 80, "host2", "state_older_disk_full", late),
         (copied, 96, "host2", "state_seconds_repeated"),
     ]  # fmt: skip
-    for promise, first, host, kind, *harms in allowed:
-        assert after(promise, first, host, *harms) == ([], {kind: 1})
+    for guarantees, first, host, kind, *disturbances in allowed:
+        assert after(guarantees, first, host, *disturbances) == ([], {kind: 1})
     violated = [
         *((kept, first, "host1") for first in (88, 102, 1)), (kept, 50, "host1", late),
         (kept, 50, "host1", replace(full, hosts=frozenset({"host3"}))), (kept, 50, "host2"),
         (copied, 95, "host2"), (copied, 1, "host2"),
-        (Promise(stateful=True, standby=True), 1, "host2"),
+        (Guarantees(stateful=True, standby=True), 1, "host2"),
     ]  # fmt: skip
-    for promise, first, host, *harms in violated:
-        assert after(promise, first, host, *harms)[0] == ["state"]
+    for guarantees, first, host, *disturbances in violated:
+        assert after(guarantees, first, host, *disturbances)[0] == ["state"]
 
 
 def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
     """Missing cycles count from the cut on, at ten a second."""
-    guarded = Promise(stateful=True, standby=True, elsewhere=True)
+    guarded = Guarantees(stateful=True, standby=True, elsewhere=True)
     alone = run(first=10.0, last=19.5, numbers=(1, 96))  # cut off from 12.0 on
 
     def taken_over(first):
@@ -185,10 +190,10 @@ def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
 
 def test_a_state_that_came_to_no_other_host_in_time_is_lost():
     """The process was young, or the host of the replica was struck as well."""
-    copied = Promise(stateful=True, kept=True, copied=5, elsewhere=True)
+    copied = Guarantees(stateful=True, kept=True, copied=5, elsewhere=True)
     anew = run("a#2", "host2", 23.0, 30.0, (1, 50))
-    other = Harm("host_off", 19.0, 25.0, frozenset({"host3"}), kills=True, hides=True)
-    overload = Harm(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True, deafens=True)
+    other = Disturbance("host_off", 19.0, 25.0, frozenset({"host3"}), kills=True, hides=True)
+    overload = Disturbance(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True, deafens=True)
     assert kinds(copied, [FIRST, anew], [OFF])[0] == ["state"]
     same, short = replace(other, hosts=OFF.hosts), replace(SHORT, hosts=other.hosts)
     for none in (overload, KILLED, same, short):
@@ -204,12 +209,12 @@ def test_a_state_that_came_to_no_other_host_in_time_is_lost():
 
 def test_a_standby_bears_one_fault_and_the_copy_another():
     """With `isolation: stop`, a silent master costs both the primary and its standby."""
-    guarded = Promise(stateful=True, standby=True, elsewhere=True, kept=True, copied=5)
-    isolated = Promise(
+    guarded = Guarantees(stateful=True, standby=True, elsewhere=True, kept=True, copied=5)
+    isolated = Guarantees(
         stateful=True, standby=True, elsewhere=True, isolated=True, kept=True, copied=5
     )
-    silent = Harm("master_stop", 18.0, 25.0, frozenset({"*"}), hides=True)
-    other = Harm("slave_kill", 20.0, 22.0, frozenset({"host3"}), hides=True)
+    silent = Disturbance("master_stop", 18.0, 25.0, frozenset({"*"}), hides=True)
+    other = Disturbance("slave_kill", 20.0, 22.0, frozenset({"host3"}), hides=True)
     behind = run("a#2", "host2", 23.0, 30.0, (97, 200))
     assert kinds(guarded, [FIRST, behind], [OFF])[0] == ["state"]
     assert kinds(guarded, [FIRST, behind], [OFF, other]) == ([], {"state_seconds_repeated": 1})
@@ -219,7 +224,7 @@ def test_a_standby_bears_one_fault_and_the_copy_another():
 def test_one_run_never_goes_back():
     backwards = run()
     backwards.backwards = 1
-    assert kinds(Promise(), [backwards], [])[0] == ["state"]
+    assert kinds(Guarantees(), [backwards], [])[0] == ["state"]
 
 
 def test_a_job_is_done_once_unless_something_was_done_to_it():

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from benchmarks.paper import __main__ as paper
 from benchmarks.paper import fig6, fig8, fig9, fig10, pictures, table3
 from benchmarks.paper.judging import Line
-from benchmarks.paper.labs import Desk, Failed, Part
+from benchmarks.paper.labs import Failed, LabClient, Part
 from benchmarks.paper.page import section, update_page
 from benchmarks.paper.report import FIGURES, Result
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, host_settings
@@ -273,7 +273,7 @@ def test_a_desk_that_has_ended_is_told_with_its_last_words(ends, tmp_path):
             )
         return Part("the client at the desk", process, log)
 
-    with Desk(start, lambda: None) as desk:
+    with LabClient(start, lambda: None) as desk:
         if ends == "before it is asked":
             desk._part.process.wait(30.0)
         with pytest.raises(Failed, match="desk ended with exit code 3:\n  no master"):

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from rosrm.cli import connection
 from rosrm.cli.commands import app
-from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow, Snapshot
+from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.values import HostDescription
 
 NAN = float("nan")
@@ -135,7 +135,7 @@ class FakeClient:
         self._note("list", {"process": process, "host": host, "after": after, "newest": newest})
         chosen = [row for row in self.events if row.sequence > after]
         chosen = [one for one in chosen if process in ("", one.process) and host in ("", one.host)]
-        return Snapshot(
+        return Listing(
             master="lab", uptime=125.0, trouble=self.trouble,
             last_sequence=max((row.sequence for row in self.events), default=0),
             hosts=self.hosts if hosts else (), processes=self.processes if processes else (),

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine.binary import Criu
-from rosrm_criu.engine.probe import Ability
+from rosrm_criu.engine.binary import CriuBinary
+from rosrm_criu.engine.probe import CriuSupport
 from tests.criu_kit import HOST_FACTS
 
 
@@ -20,9 +20,9 @@ def here(monkeypatch):
         def find(prefix):
             if missing:
                 raise CriuError(missing)
-            return Criu((f"{prefix}/bin/criu",), version)
+            return CriuBinary((f"{prefix}/bin/criu",), version)
 
-        able = Ability(not reason, reason, {**HOST_FACTS, "version": version})
+        able = CriuSupport(not reason, reason, {**HOST_FACTS, "version": version})
         monkeypatch.setattr("rosrm_criu.engine.binary.find", find)
         monkeypatch.setattr("rosrm_criu.engine.probe.probe", lambda criu: able)
 

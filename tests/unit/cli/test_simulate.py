@@ -10,7 +10,7 @@ from rich.console import Console
 
 from rosrm.cli.output import tables
 from rosrm_simulate import picture
-from rosrm_simulate.runs import Request, carry_out
+from rosrm_simulate.runs import SimulationRequest, carry_out
 from tests.unit.tools.simulate.workloads import host, plan, recorded, simulation
 
 WORKLOAD = """
@@ -202,5 +202,5 @@ def test_wrong_arguments_are_refused_before_the_run(
 
 
 def test_how_closely_a_run_was_simulated_can_be_asked_for(record, workload):
-    assert carry_out(Request(record)).agreement.same_host == 1.0
-    assert carry_out(Request(workload)).agreement is None
+    assert carry_out(SimulationRequest(record)).agreement.same_host == 1.0
+    assert carry_out(SimulationRequest(workload)).agreement is None

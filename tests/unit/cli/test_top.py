@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from rosrm.cli.output import top
-from rosrm.model.rows import Snapshot
+from rosrm.model.rows import Listing
 from tests.unit.core.cluster import Cluster
 from tests.unit.core.cluster import process as core_process
 
@@ -22,7 +22,7 @@ def drawn(snapshot, width=80, **more):
 
 
 def test_it_shows_hosts_processes_queue_and_newest_events():
-    snapshot = Snapshot("lab", 65.0, 9, HOSTS, PROCESSES, events=[event(i) for i in range(9)])
+    snapshot = Listing("lab", 65.0, 9, HOSTS, PROCESSES, events=[event(i) for i in range(9)])
     text = drawn(snapshot, events=3)
     assert text.startswith("lab  65 s   1 running   1 queued   1 failed   1 finished")
     for name in ("alpha", "beta", "gamma", "talker", "next", "crashed"):
@@ -35,21 +35,21 @@ def test_it_keeps_to_the_width_of_the_terminal(width):
     many = [process(f"process_with_a_long_name_{i}", reason="x" * 90) for i in range(40)]
     wide = [host(f"h{i}", resources=[resource(n) for n in ("memory", "cpu", "disk", "gpu")])
             for i in range(4)]  # fmt: skip
-    text = drawn(Snapshot("lab", 1.0, 1, wide, many, events=[event(1, message="y" * 200)]), width)
+    text = drawn(Listing("lab", 1.0, 1, wide, many, events=[event(1, message="y" * 200)]), width)
     assert max(len(line) for line in text.splitlines()) <= width
     assert "and 22 more" in text
 
 
 def lines_of(*rows, hosts=HOSTS, width=80, **more):
     """Return the lines of a table of these processes."""
-    return drawn(Snapshot("lab", 1.0, 1, hosts, list(rows)), width, **more).splitlines()
+    return drawn(Listing("lab", 1.0, 1, hosts, list(rows)), width, **more).splitlines()
 
 
 def test_a_title_is_broken_between_states():
     """At 80 columns a number stays beside its state."""
     states = ("running", "starting", "set_aside", "queued", "failed", "cancelled", "finished")
     rows = [process(f"{state}{i}", state) for state in states for i in range(4)]
-    first, second, *_ = drawn(Snapshot("laboratory", 650.0, 1, HOSTS, rows)).splitlines()
+    first, second, *_ = drawn(Listing("laboratory", 650.0, 1, HOSTS, rows)).splitlines()
     assert first.endswith("4 failed")
     assert second == "  4 cancelled   4 finished"
 
@@ -142,7 +142,7 @@ def test_sorting(sort, order):
 
 
 def test_an_empty_cluster_is_a_picture_too():
-    text = drawn(Snapshot("lab", 1.0, 0), note="the master does not answer")
+    text = drawn(Listing("lab", 1.0, 0), note="the master does not answer")
     assert "no host yet" in text
     assert "no process" in text
     assert "the master does not answer" in text

@@ -46,12 +46,12 @@ from rosrm.model.plan import (
 )
 from rosrm.model.values import (
     EMPTY,
-    KeptState,
     Kind,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
     RestartPolicy,
+    SnapshotReport,
 )
 from rosrm_simulate.world import World
 from tests.unit.core.machine import GIB, MIB, Machine
@@ -268,7 +268,7 @@ class Cluster(World[Machine]):
         return machine
 
     def register(
-        self, machine: Machine, kept: tuple[KeptState, ...] = (), *, journal_seen: int = 0
+        self, machine: Machine, kept: tuple[SnapshotReport, ...] = (), *, journal_seen: int = 0
     ) -> Reply:
         """Register a slave; once accepted, it sends a reading and requests work."""
         reply = self.enter(machine, journal_seen, kept)
@@ -278,7 +278,7 @@ class Cluster(World[Machine]):
         self.settle()
         return reply
 
-    def enter(self, machine: Machine, journal_seen: int, kept: tuple[KeptState, ...]) -> Reply:
+    def enter(self, machine: Machine, journal_seen: int, kept: tuple[SnapshotReport, ...]) -> Reply:
         """Register a slave, which sends no reading yet."""
         machine.begin_to_register()
         reply = self.join(machine, self.now, machine.slave.statuses(), journal_seen, kept)
@@ -393,8 +393,8 @@ class Cluster(World[Machine]):
             for machine in self.machines.values():
                 if machine.connected and machine.host_id:
                     machine.tell(events.TimePassed(), self.now)
-                    if machine.host_id not in self.state.hosts.unheard():
-                        machine.tell(events.MasterHears(self.now), self.now)
+                    if machine.host_id not in self.state.hosts.silent_hosts():
+                        machine.tell(events.ContactConfirmed(self.now), self.now)
                     self.ask_for_work(machine)
                     self.tell(machine.usages(self.now))
             self.tell(happened.TimePassed())

@@ -18,12 +18,12 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
-    KeptState,
     ResourceDescription,
     RestartPolicy,
+    SnapshotReport,
 )
 from rosrm_simulate import host
-from rosrm_simulate.host import Host, Reading
+from rosrm_simulate.host import Host, SimulatedReading
 from tests.unit.core.nodes import Node
 
 MIB = 2.0**20
@@ -69,7 +69,7 @@ class Machine(Host[Program]):
     busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
     shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     ordered: deque[SendOrder] = field(default_factory=deque)
-    kept: dict[str, KeptState] = field(default_factory=dict)
+    kept: dict[str, SnapshotReport] = field(default_factory=dict)
     ships: dict[str, tuple[str, ...]] = field(default_factory=dict)
     connected: bool = True
     takes: bool = True
@@ -94,7 +94,7 @@ class Machine(Host[Program]):
         if self.fresh:
             self.ordered.clear()
 
-    def reading(self, now: float) -> Reading:
+    def reading(self, now: float) -> SimulatedReading:
         reading = super().reading(now)
         return reading._replace(accepts=self.takes and reading.accepts)
 
@@ -179,14 +179,14 @@ class Machine(Host[Program]):
         elif name in self.kept and self.kept[name].instance.number <= order.instance.number:
             del self.kept[name]
 
-    def keep_state(self, instance: InstanceId) -> KeptState:
+    def keep_state(self, instance: InstanceId) -> SnapshotReport:
         """Publish a snapshot that is newer than the one before."""
         before = self.kept.get(instance.process)
         cycles = before.sequence if before is not None and before.instance == instance else 0
-        self.kept[instance.process] = KeptState(instance, cycles + 1, 100)
+        self.kept[instance.process] = SnapshotReport(instance, cycles + 1, 100)
         return self.kept[instance.process]
 
-    def take_state(self, state: KeptState) -> None:
+    def take_state(self, state: SnapshotReport) -> None:
         """Receive a replica from another host; the slave keeps only the newest."""
         own = self.kept.get(state.instance.process)
         age = (state.instance.number, state.sequence)

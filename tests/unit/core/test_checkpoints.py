@@ -286,7 +286,7 @@ def test_a_strategy_may_refuse_a_process() -> None:
     cluster.wait(0.5)
     cluster.submit(process("p"))
     assert "p holds a camera" in cluster.checkpoint("p").message
-    assert (cluster.phase("p"), cluster.state.runs) == ("running", {})
+    assert (cluster.phase("p"), cluster.state.migrations) == ("running", {})
 
 
 def test_a_host_that_is_closed_or_away_restores_nothing() -> None:
@@ -330,8 +330,8 @@ def test_a_restore_needs_the_room_that_the_process_used() -> None:
     shelf.machine.busy["memory"] = 0.1
     cluster.wait(0.3)
     assert cluster.restore("p").accepted
-    charged = cluster.state.instances[cluster["p"].owner].amounts["memory"]
-    assert charged == pytest.approx(6 * GIB)
+    reserved = cluster.state.instances[cluster["p"].owner].demand["memory"]
+    assert reserved == pytest.approx(6 * GIB)
 
 
 def test_a_drained_host_says_that_images_stay() -> None:
@@ -549,7 +549,10 @@ def calm(cluster: Cluster) -> str:
     """Return the phase of p once no plan is in progress."""
     for _ in range(60):
         cluster.wait(0.5)
-        if cluster.phase("p") in ("running", "checkpointed") and "p" not in cluster.state.runs:
+        if (
+            cluster.phase("p") in ("running", "checkpointed")
+            and "p" not in cluster.state.migrations
+        ):
             return cluster.phase("p")
     raise AssertionError(f"p is {cluster.phase('p')}: {cluster['p'].reason}")
 

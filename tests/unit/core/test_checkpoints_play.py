@@ -113,7 +113,7 @@ class Life(RuleBasedStateMachine):
     def it_is_neither_queued_nor_over(self) -> None:
         """Check that p is neither queued nor terminal, because its memory still exists."""
         assert not self.cluster.queue()
-        assert not self.cluster["p"].phase.over
+        assert not self.cluster["p"].phase.is_terminal
 
     def teardown(self) -> None:
         """Check that p comes to rest without faults and accepts the opposite request."""
@@ -122,7 +122,7 @@ class Life(RuleBasedStateMachine):
         for wanted, action in (("checkpointed", "checkpoint"), ("running", "restore")):
             for _ in range(90):
                 self.cluster.wait(1.0, tick=0.5)
-                if "p" not in self.cluster.state.runs and self.cluster.phase("p") == wanted:
+                if "p" not in self.cluster.state.migrations and self.cluster.phase("p") == wanted:
                     break
                 getattr(self.cluster, action)("p")
             assert self.cluster.phase("p") == wanted, self.cluster["p"].reason

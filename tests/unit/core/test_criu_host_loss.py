@@ -100,7 +100,7 @@ def heard(cluster: Cluster) -> list[str]:
 
 def runs_alone(cluster: Cluster, *on: str) -> None:
     """Check that p runs on one of these hosts, reachable and without a plan in progress."""
-    assert "p" not in cluster.state.runs, cluster["p"].reason
+    assert "p" not in cluster.state.migrations, cluster["p"].reason
     assert cluster.phase("p") == "running", cluster["p"].reason
     owner = cluster.state.instances[cluster["p"].owner]
     assert owner.host.name in on
@@ -225,7 +225,7 @@ def test_the_end_of_a_source_whose_host_is_silent_for_a_while_is_waited_for() ->
     cluster = story("elsewhere")
     move_and_lose(cluster, JOIN, of="b", lost="a", heard=True)
     wait(cluster, LEASE - 3.0)
-    assert ("p" in cluster.state.runs, heard(cluster)) == (True, ["b"])
+    assert ("p" in cluster.state.migrations, heard(cluster)) == (True, ["b"])
     back(cluster, "a")
     assert not cluster.told("given_up")
     runs_alone(cluster, "b")

@@ -85,7 +85,7 @@ class Life(RuleBasedStateMachine):
             machine.mute.clear()
 
     def lose_hosts_of_the_move(self, roles: str, room: bool, power: bool) -> None:
-        run = self.cluster.state.runs.get("p")
+        run = self.cluster.state.migrations.get("p")
         if run is None:
             return
         both = {"source": run.source_host.name, "destination": run.destination_host.name}
@@ -174,7 +174,7 @@ class Life(RuleBasedStateMachine):
         wait(self.cluster, 2.0)
         self.changed_at = self.cluster.now
 
-    @precondition(lambda self: self.cluster["p"].phase.over)
+    @precondition(lambda self: self.cluster["p"].phase.is_terminal)
     @rule()
     def begins_again(self) -> None:
         self.cluster.restart("p")
@@ -200,7 +200,7 @@ class Life(RuleBasedStateMachine):
         process = self.cluster["p"]
         calm = self.cluster.now - self.changed_at > self.patience
         if calm and self.up() and process.spec.host_loss.then != "wait":
-            assert "p" not in self.cluster.state.runs, process.reason
+            assert "p" not in self.cluster.state.migrations, process.reason
             owner = self.cluster.state.instances.get(process.owner)
             assert owner is None or owner.host.name in self.up()
 

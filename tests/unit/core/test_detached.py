@@ -74,7 +74,7 @@ def test_a_process_goes_elsewhere_no_sooner_than_after_a_loss() -> None:
 def test_beats_name_a_detached_host() -> None:
     """A slave that is still stopping must not take a beat as contact with the master."""
     cluster = detached(process("p"))
-    assert cluster.state.hosts.unheard() == [cluster.machines["a"].host_id]
+    assert cluster.state.hosts.silent_hosts() == [cluster.machines["a"].host_id]
 
 
 def test_what_ended_before_the_slave_stopped_is_known_with_its_end() -> None:

@@ -57,12 +57,12 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         np.add(table.usage, table.load, out=table.busy)
         table.sequence[column] = draw(usually)
         table.accepting[column], table.asking[column] = draw(usually), draw(usually)
-        table.untold[column] = draw(rarely)
+        table.report_due[column] = draw(rarely)
         table.stale[column] = 1 if described and draw(rarely) else 0
         table.set_closed(host, cordoned=draw(rarely), draining=draw(rarely))
         table.set_condition(host, draw(conditions))
         load = np.array([draw(fractions) / 4 for _ in table.resources])
-        table.charge(host, load, processes=draw(st.sampled_from([0, 0, 1])))
+        table.add_reservation(host, load, processes=draw(st.sampled_from([0, 0, 1])))
         if draw(rarely):
             table.prune(host)
     return table
@@ -137,7 +137,7 @@ def test_a_ranking_that_was_refreshed_equals_a_new_one(
         host = (fitting or table.hosts)[number % len(fitting or table.hosts)]
         own = bool(fitting) and number % 3 > 0
         need = ranking.need[:, host.column] if own else np.full(len(table.resources), 0.1)
-        table.charge(host, need, processes=1)
+        table.add_reservation(host, need, processes=1)
         if own:
             ranking.took()
         ranking.refresh()

@@ -87,7 +87,7 @@ def has_moved(cluster: Cluster) -> None:
 
 
 def settled(cluster: Cluster) -> None:
-    assert not cluster.state.runs
+    assert not cluster.state.migrations
     assert not cluster.intents["migration"]
     assert said(cluster)[-1] == "DONE"
     assert not cluster.air.channels
@@ -602,4 +602,4 @@ def test_reports_of_another_handoff_are_not_heard() -> None:
     begin(cluster, HandoffPhase.SHADOW)
     for report in (("p", 7, 2), ("q", 2, 2), ("p", 2, 9)):
         cluster.tell(happened.HandoffReported(*report, ReportPhase.ACTIVE))
-    assert not cluster.state.runs["p"].heard
+    assert not cluster.state.migrations["p"].handoff_reports

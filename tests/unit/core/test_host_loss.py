@@ -358,12 +358,12 @@ def test_a_time_of_ones_own_is_kept() -> None:
 def test_beats_name_the_hosts_that_are_not_heard() -> None:
     """Beats name suspect and lost hosts, not expected ones or those that have left."""
     cluster = Cluster("a", "b", "c")
-    assert cluster.state.hosts.unheard() == []
+    assert cluster.state.hosts.silent_hosts() == []
     lose(cluster, "b", seconds=2.0)
     lose(cluster, "c", seconds=10.0)
-    assert cluster.state.hosts.unheard() == [2, 3]
+    assert cluster.state.hosts.silent_hosts() == [2, 3]
     back(cluster, "b")
-    assert cluster.state.hosts.unheard() == [3]
+    assert cluster.state.hosts.silent_hosts() == [3]
 
 
 @pytest.mark.parametrize(("then", "phase"), [("wait", "running"), ("stop", "failed")])

@@ -446,4 +446,4 @@ def test_an_instance_that_nobody_intends_is_stopped_until_it_has_ended() -> None
     machine.let_go("ghost", cluster.now)
     cluster.settle()
     assert cluster.submit(process("ghost")).accepted
-    assert not cluster.state.orphans
+    assert not cluster.state.unowned_instances

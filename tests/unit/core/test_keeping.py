@@ -13,10 +13,10 @@ from rosrm.model.orders import DropReplica, ReplicateSnapshot
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceId,
-    KeptState,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
+    SnapshotReport,
 )
 from tests.unit.core.cluster import Cluster, job, process
 
@@ -45,7 +45,7 @@ def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
     """Report all snapshots of a host: process, instance, sequence."""
     machine = cluster.machines[host]
     kept = tuple(
-        KeptState(InstanceId(name, number), sequence, 100) for name, number, sequence in states
+        SnapshotReport(InstanceId(name, number), sequence, 100) for name, number, sequence in states
     )
     cluster.tell(happened.KeptStatesReceived(machine.host_id, machine.incarnation, kept))
 
@@ -53,7 +53,7 @@ def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
 def running(policy: Asked | None, *hosts: str, spec: ProcessSpec | None = None) -> Cluster:
     """Return a cluster with a running stateful process whose snapshot is on its own host."""
     cluster = Cluster(*(hosts or ("a", "b", "c")), lease=3.0)
-    cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "asked"
+    cluster.state.replication.policy, cluster.state.replication.policy_name = policy, "asked"
     cluster.submit(spec or stateful())
     cluster.wait(1.0)
     assert cluster.phase("p") == "running"
@@ -128,7 +128,7 @@ def test_it_is_asked_about_once_a_second_for_each_process():
     """The rate does not depend on the number of processes or of ticks."""
     policy = Asked()
     cluster = Cluster("a", "b")
-    cluster.state.keeping.policy = policy
+    cluster.state.replication.policy = policy
     names = [f"p{n}" for n in range(30)]
     cluster.submit(*(stateful(name) for name in names))
     cluster.wait(1.0)
@@ -177,7 +177,7 @@ def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer
     one, two = others(cluster)
     policy.answer = answer
     cluster.kill_master()
-    cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "asked"
+    cluster.state.replication.policy, cluster.state.replication.policy_name = policy, "asked"
     register(cluster, host, ("p", number, 9))
     register(cluster, one, ("p", number, 8))
     cluster.wait(3.0)
@@ -401,7 +401,7 @@ def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None
     """Register a slave, which reports its snapshots at once."""
     machine = cluster.machines[host]
     kept = tuple(
-        KeptState(InstanceId(name, number), sequence, 100) for name, number, sequence in states
+        SnapshotReport(InstanceId(name, number), sequence, 100) for name, number, sequence in states
     )
     cluster.register(machine, kept)
 
@@ -453,7 +453,7 @@ def test_the_last_copy_may_vanish_while_processes_are_looked_at():
     policy = Asked()
     cluster = running(policy)
     cluster.wait(3.0)
-    cluster.state.keeping.waiting = ["p"]
+    cluster.state.replication.waiting = ["p"]
     keep(cluster, where(cluster), ("another", cluster["p"].owner + 1, 5))
     cluster.wait(3.0)
     assert cluster.phase("p") == "running"

@@ -32,16 +32,16 @@ class Loss:
         cluster.intents.clear()
         cluster.intents.update(self._kept)
         cluster.kill_master()
-        begin(cluster, self._newest, fell=fell)
+        begin(cluster, self._newest, machine_rebooted=fell)
 
     def come_back(self, host: str, seen: int) -> None:
         """Register the host, which reports the newest record number it has seen."""
         self.cluster.register(self.cluster.machines[host], journal_seen=seen)
 
 
-def begin(cluster: Cluster, newest: int, *, fell: bool = False) -> None:
+def begin(cluster: Cluster, newest: int, *, machine_rebooted: bool = False) -> None:
     """Start a master, which writes its restart records at once."""
-    journal_gap.begin(cluster.state, newest, cluster.now, fell=fell)
+    journal_gap.begin(cluster.state, newest, cluster.now, machine_rebooted=machine_rebooted)
     cluster.journal([journal_gap.intent(cluster.state)])
 
 

@@ -180,7 +180,7 @@ def test_when_neither_side_can_run_it_the_process_returns_to_the_queue() -> None
     for name in "ab":
         cluster.machines[name].refuses["p"] = "no such executable"
     cluster.migrate("p")
-    assert not cluster.state.runs
+    assert not cluster.state.migrations
     assert cluster.where("p") == ["c"]
     assert sorted(cluster["p"].excluded) == ["a", "b"]
 

@@ -74,7 +74,7 @@ def running(policy: Any, *hosts: Host, spec: ProcessSpec | None = None) -> Clust
     """Return a cluster with a portable node that has run for a second."""
     machines = [host.machine for host in hosts]
     cluster = Cluster(*machines, strategies={"criu": Criu(CriuOptions())})
-    cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "pacing"
+    cluster.state.replication.policy, cluster.state.replication.policy_name = policy, "pacing"
     cluster.submit(spec or portable())
     cluster.wait(1.0)
     assert cluster.phase("p") == "running"
@@ -178,7 +178,7 @@ def test_where_criu_does_not_work_there_are_none():
     """The record names the host's own reason."""
     machine = Machine("a")
     cluster = Cluster(machine, strategies={"criu": Criu(CriuOptions())})
-    cluster.state.keeping.policy = Pacing()
+    cluster.state.replication.policy = Pacing()
     cluster.submit(portable())
     cluster.wait(30.0)
     (said,) = cluster.told("periodic_failed")
@@ -227,7 +227,7 @@ def test_a_step_with_a_field_of_a_wrong_type_is_not_ordered(fields, reason):
     host, strategy = Host(), Unsound(CriuOptions())
     strategy.fields = fields
     cluster = Cluster(host.machine, strategies={"criu": strategy})
-    cluster.state.keeping.policy, cluster.state.keeping.policy_name = Pacing(), "pacing"
+    cluster.state.replication.policy, cluster.state.replication.policy_name = Pacing(), "pacing"
     cluster.submit(portable())
     cluster.wait(15.0)
     assert host.dumps == []
@@ -246,7 +246,7 @@ def test_a_strategy_that_fails_to_name_its_removal_is_asked_again():
     """Otherwise the images of the instance stay on the host."""
     host = Host()
     cluster = Cluster(host.machine, strategies={"criu": Criu(CriuOptions())})
-    cluster.state.keeping.policy, cluster.state.keeping.policy_name = Pacing(), "pacing"
+    cluster.state.replication.policy, cluster.state.replication.policy_name = Pacing(), "pacing"
     cluster.submit(portable())
     limit, cluster.state.plugins.limit = cluster.state.plugins.limit, late
     cluster.wait(2.0)
@@ -265,7 +265,7 @@ def test_a_restarted_master_goes_on():
     cluster.wait(12.0)
     made = len(host.dumps)
     cluster.restart_master()
-    cluster.state.keeping.policy = Pacing()
+    cluster.state.replication.policy = Pacing()
     cluster.wait(30.0)
     assert len(host.dumps) > made
     assert len({dump["attempt"] for dump in host.dumps}) == len(host.dumps)

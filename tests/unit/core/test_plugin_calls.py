@@ -10,7 +10,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
-from rosrm.extensions.plugin_calls import TOLD_AGAIN, WORKS_AFTER, PluginCalls, required
+from rosrm.extensions.plugin_calls import RECORD_PERIOD, WORKS_AFTER, PluginCalls, required
 from rosrm.model.values import MigrationPolicy, Readiness
 from tests.unit.core.cluster import Cluster, Eq1, StartFirstOrStopFirst, process
 
@@ -146,7 +146,7 @@ def test_another_error_of_a_failing_plugin_is_recorded_once_a_minute() -> None:
     for error in ("unplugged", "no permission", "too hot"):
         fails_there(cluster, {"lidar": error})
     assert cluster.state.hosts.by_name["a"].failing["probe", "lidar"].error == "too hot"
-    cluster.wait(TOLD_AGAIN + 1.0)
+    cluster.wait(RECORD_PERIOD + 1.0)
     fails_there(cluster, {"lidar": "too cold"})
     said = "the probe of lidar on a fails: "
     assert cluster.told("plugin_failed") == [f"{said}unplugged", f"{said}too cold"]
@@ -172,7 +172,7 @@ def test_a_property_of_a_plugin_that_raises_costs_one_decision(members: str) -> 
     raising = {name: property(leave) for name in members.split()}
     strategy = type("Strategy", (StartFirstOrStopFirst,), dict(PERIODIC | raising))()
     cluster = Cluster("a", "b", strategies={"criu": strategy})
-    cluster.state.keeping.policy = type("Policy", (), dict(raising))()
+    cluster.state.replication.policy = type("Policy", (), dict(raising))()
     migration = MigrationPolicy("criu", options={"checkpoint_every": 10.0})
     cluster.submit(process("p", ros=True, readiness=Readiness("running"), migration=migration))
     cluster.wait(2.0)

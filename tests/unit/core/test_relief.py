@@ -187,12 +187,12 @@ def test_at_most_max_migrations_are_under_way() -> None:
     cluster.add(machine("b"))
     cluster.set_host("a", "drain")
     cluster.wait(1.0)
-    assert len(cluster.state.runs) == 2
-    for name in list(cluster.state.runs):
+    assert len(cluster.state.migrations) == 2
+    for name in list(cluster.state.migrations):
         cluster.machines["b"].seen_in_graph(name, cluster.now)
     cluster.settle()
     cluster.wait(0.4)
-    assert len(cluster.state.runs) == 2
+    assert len(cluster.state.migrations) == 2
     assert cluster.counts()["b"] == 4
 
 

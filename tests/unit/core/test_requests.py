@@ -232,7 +232,7 @@ def test_cancel_of_one_that_moves_ends_both_instances(overlap: bool) -> None:
     cluster.cancel("p")
     assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
     assert len(cluster.orders(StartInstance)) == 1
-    assert not cluster.state.runs
+    assert not cluster.state.migrations
     assert not cluster.intents["migration"]
 
 

@@ -144,7 +144,7 @@ def test_a_primary_keeps_its_restarts_beside_its_standby() -> None:
     """The plan is paused before SWITCH, and its step that suspends them is left out until then."""
     cluster = with_standby()
     assert not cluster.orders(SetRestartPolicy)
-    assert cluster.state.standbys["p"].step_in_hand == Configure(HandoffPhase.SWITCH, ANY, undo=ANY)
+    assert cluster.state.standbys["p"].current_step == Configure(HandoffPhase.SWITCH, ANY, undo=ANY)
     assert not cluster.told("migration_step")
 
 

@@ -18,19 +18,19 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import demand_of
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
-from rosrm.core.master.master_state import ProcessPhase, Wanted
+from rosrm.core.master.master_state import DesiredState, ProcessPhase
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
-    KeptState,
     Kind,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
     RestartPolicy,
+    SnapshotReport,
     StandbyPolicy,
 )
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
@@ -59,7 +59,7 @@ FENCED_WITHIN = 1.0
 def is_open(hosts: HostTable, column: int) -> bool:
     """Return True if a host may take work at all; independent of the filters."""
     is_up = hosts.condition[column] == HostCondition.UP and not hosts.closed[column]
-    has_told = not hosts.untold[column] and not hosts.stale[column]
+    has_told = not hosts.report_due[column] and not hosts.stale[column]
     return bool(is_up and has_told and hosts.accepting[column] and hosts.asking[column])
 
 
@@ -111,7 +111,7 @@ class Play(RuleBasedStateMachine):
                 "criu": Everywhere(seconds=1.0),
             },
         )  # fmt: skip
-        self.cluster.state.keeping.policy = OneOther()
+        self.cluster.state.replication.policy = OneOther()
         for name in HOSTS:
             labels = {"arm": "yes"} if name == LABELLED else {}
             machine = Portable(
@@ -131,7 +131,7 @@ class Play(RuleBasedStateMachine):
         self.heard: dict[str, float] = {}
         self.records_seen = 0
         #: Snapshots that each host has reported to this run of the master, by name.
-        self.told_kept: dict[str, tuple[KeptState, ...]] = {}
+        self.told_kept: dict[str, tuple[SnapshotReport, ...]] = {}
         #: For the present submission of each name: its first instance, and its newest snapshot.
         self.newest: dict[str, tuple[int, tuple[int, int]]] = {}
         self.prompt = True
@@ -273,7 +273,7 @@ class Play(RuleBasedStateMachine):
     @rule(name=names)
     def restart(self, name: str) -> None:
         process = self.cluster.state.processes.get(name)
-        ended = process is not None and process.phase.over
+        ended = process is not None and process.phase.is_terminal
         if self.ask(happened.RestartRequested, (name,)) and ended:
             self.completed.discard(name)
             self.failed.discard(name)
@@ -627,7 +627,7 @@ class Play(RuleBasedStateMachine):
         self.late.clear()
         self.told_kept.clear()
         self.cluster.kill_master()
-        self.cluster.state.keeping.policy = OneOther()
+        self.cluster.state.replication.policy = OneOther()
         for host in registering:
             self.register(self.machine(host))
 
@@ -710,14 +710,14 @@ class Play(RuleBasedStateMachine):
             name, phase = process.name, process.phase
             assert (phase is ProcessPhase.QUEUED) == (name in queued), (name, phase)
             assert (phase is ProcessPhase.SET_ASIDE) == (name in state.set_aside), (name, phase)
-            moving = name in state.runs
+            moving = name in state.migrations
             assert moving or phase not in (ProcessPhase.MIGRATING, ProcessPhase.STUCK)
-            if phase.over or name in queued or name in state.set_aside:
+            if phase.is_terminal or name in queued or name in state.set_aside:
                 assert not process.owner, (name, phase)
                 assert not moving
-                assert phase.over or not process.instances
+                assert phase.is_terminal or not process.instances
             elif not moving:
-                waits_for_an_end = process.wanted is not Wanted.RUN and process.instances
+                waits_for_an_end = process.wanted is not DesiredState.RUN and process.instances
                 assert process.owner in state.instances or waits_for_an_end, (name, phase)
         assert queued <= set(state.processes)
 
@@ -733,15 +733,17 @@ class Play(RuleBasedStateMachine):
             assert number in instance.host.instances
         for process in state.processes.values():
             assert process.instances == of_process.pop(process.name, set())
-        assert {name: numbers for name, numbers in state.orphans.items() if numbers} == of_process
+        assert {
+            name: numbers for name, numbers in state.unowned_instances.items() if numbers
+        } == of_process
         for host in state.hosts.hosts:
             held = [state.instances[number] for number in host.instances]
             assert all(instance.host is host for instance in held)
             assert state.hosts.processes[host.column] == len(held)
             total = np.zeros(len(state.hosts.resources))
             for instance in held:
-                assert (instance.charged >= 0.0).all()
-                total[: len(instance.charged)] += instance.charged
+                assert (instance.reserved >= 0.0).all()
+                total[: len(instance.reserved)] += instance.reserved
             assert np.allclose(state.hosts.load[:, host.column], total, atol=1e-6)
             assert (state.hosts.load[:, host.column] >= 0.0).all()
 
@@ -828,7 +830,7 @@ class Play(RuleBasedStateMachine):
         for process in self.cluster.state.processes.values():
             name, born = process.name, process.born
             before = self.newest.pop(name, (born, (0, 0)))
-            if process.phase.over or process.wanted is Wanted.CANCEL:
+            if process.phase.is_terminal or process.wanted is DesiredState.CANCEL:
                 continue
             ages = [
                 (kept.instance.number, kept.sequence)
@@ -899,14 +901,14 @@ class Play(RuleBasedStateMachine):
 
     def _cancel_all(self) -> None:
         cluster = self.cluster
-        live = [p.name for p in cluster.state.processes.values() if not p.phase.over]
+        live = [p.name for p in cluster.state.processes.values() if not p.phase.is_terminal]
         if live:
             assert cluster.cancel(*live).accepted
         cluster.wait(5.0, tick=0.5)
-        assert all(process.phase.over for process in cluster.state.processes.values())
+        assert all(process.phase.is_terminal for process in cluster.state.processes.values())
         assert not any(machine.programs for machine in cluster.machines.values())
         assert not cluster.state.instances
-        assert not cluster.state.runs
+        assert not cluster.state.migrations
         assert not cluster.state.standbys
         assert not len(cluster.state.queue)
         assert np.allclose(cluster.state.hosts.load, 0.0, atol=1e-6)

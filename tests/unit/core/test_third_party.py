@@ -54,7 +54,7 @@ def test_snapshots_are_kept_of_a_state_on_topics():
     """The slave keeps them, the master orders replicas, and the next start gets the newest."""
     policy = Asked()
     cluster = cluster_with(Capabilities(state="topics"), "a", "b", "c")
-    cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "asked"
+    cluster.state.replication.policy, cluster.state.replication.policy_name = policy, "asked"
     cluster.submit(teleported(host_loss=HostLossPolicy("elsewhere")))
     cluster.wait(1.0)
     assert assigned(cluster).has_snapshots
@@ -89,7 +89,7 @@ def test_a_process_is_dumped_that_its_launcher_can_restart_from_the_image():
         executors["teleport.sweep"] = lambda _: {}
         machine = Machine("a", executors=executors)
         cluster = cluster_with(Capabilities(state="memory", restart_from_image=able), machine)
-        cluster.state.keeping.policy, cluster.state.keeping.policy_name = Pacing(), "pacing"
+        cluster.state.replication.policy, cluster.state.replication.policy_name = Pacing(), "pacing"
         cluster.submit(process("p", migration=TELEPORT, restart=RestartPolicy("on-failure")))
         cluster.wait(13.0)
         assert len(dumps) == 2 * able

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm_criu.engine.binary import Criu
+from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.compatibility import FACTS, facts_of, features, mismatch
 from tests.criu_kit import HOST_FACTS as HERE
 
@@ -77,7 +77,7 @@ def test_what_one_host_does_not_tell_makes_no_match(name):
 
 
 def test_this_host_tells_every_fact_and_takes_its_own_images():
-    told = facts_of(Criu(("criu",), "4.2.1"))
+    told = facts_of(CriuBinary(("criu",), "4.2.1"))
     assert told.keys() == FACTS.keys()
     assert all(told.values())
     assert mismatch(told, told) == ""

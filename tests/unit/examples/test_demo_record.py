@@ -9,7 +9,7 @@ import math
 import pytest
 from rich.console import Console
 
-from rosrm.model.rows import EventRow, HostRow, ProcessRow, ResourceRow, Snapshot
+from rosrm.model.rows import EventRow, HostRow, Listing, ProcessRow, ResourceRow
 from rosrm.model.values import HostDescription
 from rosrm_examples import demo_plots
 from rosrm_examples.demo_plots import draw_usage, memory_of, stacked, title_of
@@ -34,7 +34,7 @@ def host(name, usage, *, stale=False):
 
 def view(*processes, events=(), usage=(0.25, 0.5)):
     hosts = [host(name, value) for name, value in zip(HOSTS, usage, strict=True)]
-    return Snapshot("demo", 12.5, 7, hosts=hosts, processes=processes, events=events)
+    return Listing("demo", 12.5, 7, hosts=hosts, processes=processes, events=events)
 
 
 def event(sequence, elapsed, kind, name="", on="", **facts):
@@ -69,7 +69,7 @@ def record():
 def test_a_sample_has_what_is_known_and_null_for_what_is_not():
     seen = sample_of(view(process("a", "running"), process("b", "queued"), usage=(0.25, math.nan)))
     assert seen == Sample(12.5, {"memory": {"host1": 0.25, "host2": None}}, running=1, waiting=1)
-    stale = Snapshot("demo", 1.0, 0, hosts=[host("host1", 0.5, stale=True)])
+    stale = Listing("demo", 1.0, 0, hosts=[host("host1", 0.5, stale=True)])
     assert sample_of(stale).usage == {"memory": {"host1": None}}
 
 

@@ -13,7 +13,7 @@ from rosrm_examples.drives import Drive
 from rosrm_examples.map_part import MapPart
 from rosrm_examples.migration_job import LiveDrive, host_configs, recorder_spec, slam_spec
 from rosrm_examples.migration_results import LiveRun, differences, summarise
-from rosrm_examples.observer import Heard
+from rosrm_examples.observer import ReceivedPose
 from rosrm_examples.poses import make_pose
 
 SCANS, PERIOD = 6, 0.2
@@ -31,7 +31,7 @@ def run() -> LiveRun:
     """Return a run without errors: three scans here, three there, the fourth 30 ms late."""
     late = [0.0, 0.0, 0.0, 0.03, 0.0, 0.0]
     heard = [
-        Heard(100.0 + PERIOD * index + late[index], index * 100_000_000, pose)
+        ReceivedPose(100.0 + PERIOD * index + late[index], index * 100_000_000, pose)
         for index, pose in enumerate(POSES)
     ]
     return LiveRun(DRIVE, SCANS, heard, [part("a", 0, 3), part("b", 3, 6)], PERIOD)

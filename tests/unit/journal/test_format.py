@@ -12,7 +12,7 @@ import pytest
 from rosrm.core.master.master_state import WAITING, MasterState
 from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.master.state.images import Unwanted
+from rosrm.core.master.state.images import UnwantedImage
 from rosrm.extensions.contracts import Intent
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.codec import to_plain
@@ -155,10 +155,10 @@ def test_every_process_is_written_back_as_it_was_read(state: MasterState, name: 
 def test_every_migration_is_taken_up_where_it_was(state: MasterState, name: str) -> None:
     """Plan, present step, undo, results and ends are written back as they were read."""
     state.take()
-    run = state.runs[name]
-    state.save_run(run)
+    run = state.migrations[name]
+    state.save_migration(run)
     assert written(state)["migration", name] == INTENTS["migration", name]
-    in_hand = run.step_in_hand
+    in_hand = run.current_step
     assert in_hand is not None
     steps = {
         "checkpointing": "execute", "restoring": "execute", "handoff_released": "stop",
@@ -180,10 +180,10 @@ def test_hosts_numbers_and_everything_else_are_as_they_were(state: MasterState) 
     ]  # fmt: skip
     learned = state.learned.estimate(ProcessSpec("new", command=("run", "it")), {}).amounts
     assert learned == INTENTS["learned", "run it"]
-    assert state.keeping.removed == {"removed": 5}
-    assert state.images.unwanted == {31: Unwanted("unwanted", "shelf_off", "drop", (31,))}
+    assert state.replication.removed == {"removed": 5}
+    assert state.images.unwanted == {31: UnwantedImage("unwanted", "shelf_off", "drop", (31,))}
     assert state.next_instance == state.reserved_instances == 1001
-    assert (state.tail.fell, state.tail.short) == (True, True)
+    assert (state.journal_gap.machine_rebooted, state.journal_gap.records_missing) == (True, True)
     assert set(state.standbys) == {"standby"}
     assert state.wants_standby == {"standby"}
     assert state.next_order == 1 + max(one.order for one in state.processes.values())

@@ -10,7 +10,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Record
 from rosrm.master import journal_stall
-from rosrm.master.journal_stall import Standstill
+from rosrm.master.journal_stall import JournalStall
 from rosrm.model.values import InstanceId
 from tests.unit.core.cluster import Cluster, process
 
@@ -27,11 +27,11 @@ NEWEST = {happened.ProcessRequested, happened.KeptStatesReceived}
 DROPPED = {happened.TimePassed, happened.UsagesReceived, happened.PeerRefused}
 
 
-def still(now: float = 100.0) -> Standstill:
-    return Standstill([Record("n")], "the disk is full", since=5.0, core_now=now, tried=5.0)
+def still(now: float = 100.0) -> JournalStall:
+    return JournalStall([Record("n")], "the disk is full", since=5.0, core_now=now, tried=5.0)
 
 
-def take(held: Standstill, *events: happened.Event, cluster: Cluster | None = None) -> list:
+def take(held: JournalStall, *events: happened.Event, cluster: Cluster | None = None) -> list:
     replies: list = []
     held.take((cluster or Cluster()).state, events, replies.append)
     return replies
@@ -87,7 +87,7 @@ def test_no_host_falls_silent_by_it() -> None:
     take(held, cluster.readings(list(cluster.machines.values())), cluster=cluster)
     column = cluster.state.hosts.by_name["a"].column
     assert cluster.state.hosts.usage[0, column] == pytest.approx(0.7)
-    assert np.all(cluster.state.hosts.heard == cluster.now)
+    assert np.all(cluster.state.hosts.last_contact == cluster.now)
     cluster.tell(happened.TimePassed())
     cluster.wait(3.0)
     assert not [one for one in cluster.records if one.kind in ("host_suspect", "host_lost")]
@@ -105,11 +105,11 @@ def test_a_suspect_host_that_is_heard_is_so_no_more() -> None:
     cluster.machines["a"].connected = False
     cluster.wait(2.0)
     a, b, _ = (cluster.state.hosts.by_name[name].host_id for name in "abc")
-    assert cluster.state.hosts.unheard() == [a, b]
+    assert cluster.state.hosts.silent_hosts() == [a, b]
     held = still(cluster.now)
     for machine in cluster.machines.values():
         machine.connected = True
     take(held, cluster.readings(list(cluster.machines.values())), cluster=cluster)
-    assert cluster.state.hosts.unheard() == [b]
+    assert cluster.state.hosts.silent_hosts() == [b]
     cluster.wait(1.0)
-    assert cluster.state.hosts.unheard() == []
+    assert cluster.state.hosts.silent_hosts() == []

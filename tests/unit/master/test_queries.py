@@ -8,7 +8,7 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.errors import PluginError
-from rosrm.master.queries import Reading
+from rosrm.master.queries import MasterQueries
 from rosrm.model.rows import PluginRow
 from tests.unit.core.cluster import Cluster
 
@@ -17,7 +17,7 @@ SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")
 
 def rows(cluster: Cluster, *, failing: bool = False) -> list[PluginRow]:
     """Return the rows of `rosrm plugins`, or those that `rosrm status` requests."""
-    reading = Reading(
+    reading = MasterQueries(
         "m", cluster.state, SimpleNamespace(last_sequence=0), [SELECTED],
         uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
     )  # fmt: skip

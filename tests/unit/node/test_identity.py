@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.node.identity import Identity, identity_from
+from rosrm.node.identity import NodeIdentity, identity_from
 
 FULL = {
     "ROSRM_INSTANCE": "robot/p#12",
@@ -18,7 +18,7 @@ FULL = {
 def test_a_slave_tells_who_a_process_is():
     """A process whose name has a slash has its identity, too."""
     identity = identity_from(FULL)
-    assert identity == Identity("robot/p", 12, "/ns/p", "/rosrm/state_config", "lab", 4, False)
+    assert identity == NodeIdentity("robot/p", 12, "/ns/p", "/rosrm/state_config", "lab", 4, False)
 
 
 def test_a_shadow_is_told_so():

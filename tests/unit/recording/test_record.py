@@ -22,12 +22,12 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
-    KeptState,
     Kind,
     MigrationPolicy,
     ProcessSpec,
     ResourceDescription,
     RestartPolicy,
+    SnapshotReport,
 )
 from rosrm.recording.encoding import decode, encode
 from tests.unit.tools.simulate.workloads import host, plan, read, recorded, simulation
@@ -97,7 +97,7 @@ EVENTS = {
         happened.KeptStatesReceived,
         INT,
         INT,
-        st.lists(st.builds(KeptState, INSTANCE, INT, INT), max_size=3).map(tuple),
+        st.lists(st.builds(SnapshotReport, INSTANCE, INT, INT), max_size=3).map(tuple),
     ),
     happened.SubmissionReceived: st.builds(
         happened.SubmissionReceived, INT, st.lists(SPEC, max_size=2).map(tuple)

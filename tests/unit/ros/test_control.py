@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.ros.control import Gate, check_answer, refused, version_refusal
+from rosrm.ros.control import RequestGate, check_answer, refused, version_refusal
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import Envelope
 
@@ -29,8 +29,8 @@ def envelope(beat: int, **changes) -> Envelope:
     return Envelope(**{**fields, **changes})
 
 
-def gate(now: float = 100.0, max_age: float = 5.0) -> Gate:
-    return Gate(lambda: int(now * S), max_age)
+def gate(now: float = 100.0, max_age: float = 5.0) -> RequestGate:
+    return RequestGate(lambda: int(now * S), max_age)
 
 
 def test_a_fresh_request_passes() -> None:

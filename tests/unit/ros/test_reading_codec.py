@@ -67,7 +67,7 @@ def test_decoding_what_rclpy_writes() -> None:
 
     readings = decoded.readings
     assert decoded.received == 1
-    assert decoded.strangers == ()
+    assert decoded.refusals == ()
     assert readings.host_id.tolist() == [5]
     assert readings.incarnation.tolist() == [9]
     assert readings.sequence.tolist() == [4]
@@ -140,12 +140,12 @@ def test_strangers_are_refused(raw, said) -> None:
     """Another version, size or byte order is refused with a message, and not decoded."""
     alone = decode([raw])
     assert alone.readings is None
-    assert len(alone.strangers) == 1
-    assert said in alone.strangers[0]
+    assert len(alone.refusals) == 1
+    assert said in alone.refusals[0]
 
     among_ours = decode([raw, serialize_message(info(host_id=3)), raw])
     assert among_ours.readings.host_id.tolist() == [3]
-    assert len(among_ours.strangers) == 1
+    assert len(among_ours.refusals) == 1
     assert among_ours.received == 1
 
 

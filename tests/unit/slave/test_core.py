@@ -14,10 +14,10 @@ from rosrm.core.slave import commands as slave_commands
 from rosrm.core.slave import reducer
 from rosrm.core.slave.events import (
     AssignmentsReceived,
+    ContactConfirmed,
     FenceOrdered,
     LaunchRefused,
     LookedAt,
-    MasterHears,
     MasterLost,
     Registered,
     ReportRequested,
@@ -32,8 +32,8 @@ from rosrm.core.slave.events import (
 )
 from rosrm.core.slave.handlers import REMEMBER_END
 from rosrm.core.slave.health import LOOK_PERIOD
-from rosrm.core.slave.state import Held, SlaveState, awaits_graph, under_limits
-from rosrm.core.slave.watches import Look, Memo
+from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph, under_limits
+from rosrm.core.slave.watches import Memo, Observation
 from rosrm.model.values import (
     Assignment,
     Fence,
@@ -72,7 +72,7 @@ class Slave:
         self.now += after
         return list(reducer.step(self.state, event, self.now))
 
-    def of(self, name="p", number=1) -> Held:
+    def of(self, name="p", number=1) -> HeldInstance:
         return self.state.held[InstanceId(name, number)]
 
 
@@ -589,7 +589,7 @@ class AnySlave(RuleBasedStateMachine):
     @rule(ago=st.sampled_from([0.0, 0.0, 0.05, 3.0]))
     def hear(self, ago) -> None:
         self.heard_at = max(self.heard_at, self.now - ago)
-        self.feed(MasterHears(self.now - ago))
+        self.feed(ContactConfirmed(self.now - ago))
 
     @rule(spec=SPECS, number=NUMBERS)
     def fence(self, spec, number) -> None:
@@ -640,7 +640,7 @@ class AnySlave(RuleBasedStateMachine):
             self.feed(SupervisorReported((InstanceStatus(instance, STATE.RUNNING, 7),)))
         for _ in range(5):
             self.now += LOOK_PERIOD
-            self.feed(LookedAt(instance, pid, Look(stopped=True)))
+            self.feed(LookedAt(instance, pid, Observation(stopped=True)))
 
     @rule(seconds=st.sampled_from([0.1, 5.0, 11.0, 61.0]))
     def wait(self, seconds) -> None:

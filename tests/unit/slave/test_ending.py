@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.core.slave.state import Held, SlaveState
+from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, ProcessSpec, StopPolicy
 from rosrm.slave import shutdown
-from rosrm.slave.shutdown import Ending
+from rosrm.slave.shutdown import Shutdown
 
 STOP = StopPolicy(interrupt_grace=1.0, terminate_grace=1.0)
 
@@ -28,7 +28,7 @@ class Slave:
         self.state = SlaveState()
         for name in "pq":
             self.report(name, InstanceState.RUNNING)
-        self.ending = Ending(
+        self.ending = Shutdown(
             SimpleNamespace(host="h0", on_stop="stop"), self.state,
             SimpleNamespace(close=lambda: None, has_begun=lambda _instance: True),
             SimpleNamespace(pid=7, shut_down=self.shut_down),
@@ -49,7 +49,7 @@ class Slave:
     def report(self, name: str, state: InstanceState) -> None:
         instance = InstanceId(name, 1)
         spec = ProcessSpec(name, command=("sleep",), stop=STOP)
-        self.state.held[instance] = Held(InstanceStatus(instance, state), spec)
+        self.state.held[instance] = HeldInstance(InstanceStatus(instance, state), spec)
 
     def end(self) -> int:
         return self.ending.carry_out("SIGINT")

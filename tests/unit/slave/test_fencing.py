@@ -29,7 +29,7 @@ class Slave:
     def __init__(self, **bounds) -> None:
         self.state = SlaveState(**bounds)
         self.now = 100.0
-        self.step(events.MasterHears(self.now))
+        self.step(events.ContactConfirmed(self.now))
         self.step(events.Registered(1))
 
     def step(self, event, after=0.0):
@@ -48,7 +48,7 @@ class Slave:
 
     def hears(self, after=0.0):
         self.now += after
-        return self.step(events.MasterHears(self.now))
+        return self.step(events.ContactConfirmed(self.now))
 
 
 def refusals(commands) -> list[str]:
@@ -75,10 +75,10 @@ def test_an_older_word_puts_nothing_off() -> None:
     one = Slave()
     one.assign()
     one.hears(1.0)
-    assert one.step(events.MasterHears(one.now - 0.5), 0.5) == [
+    assert one.step(events.ContactConfirmed(one.now - 0.5), 0.5) == [
         slave_commands.Renew(one.now - 0.5, one.now)
     ]
-    assert one.state.heard_at == one.now - 0.5
+    assert one.state.last_contact == one.now - 0.5
 
 
 def test_a_fence_is_known_again_from_the_supervisor() -> None:

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from rosrm.core.slave import events, reducer
 from rosrm.core.slave.commands import Command, Fail, Remember
-from rosrm.core.slave.health import LOOK_PERIOD, Judgement, resolve, watch_of
+from rosrm.core.slave.health import LOOK_PERIOD, InstanceHealth, resolve, watch_of
 from rosrm.core.slave.state import SlaveState
-from rosrm.core.slave.watches import Awaited, Look, Memo, Watch
+from rosrm.core.slave.watches import Awaited, Memo, Observation, Watch
 from rosrm.model.values import (
     Assignment,
     Health,
@@ -43,7 +43,7 @@ class Node:
     """
 
     def __init__(self, health: Health = SCAN) -> None:
-        self.judgement = Judgement(watched(health), 7, 0.0)
+        self.judgement = InstanceHealth(watched(health), 7, 0.0)
         self.now = 0.0
 
     def goes_on(self, seconds: float, rate: float | None = None, period: float = 0.2, **look):
@@ -55,7 +55,7 @@ class Node:
             if rate is not None:
                 said = int((self.now - begun) * rate + 1e-9)
                 heard, told = said - told, said
-            verdict = self.judgement.look(Look(heard=heard, **look), self.now)
+            verdict = self.judgement.look(Observation(messages=heard, **look), self.now)
             if verdict:
                 return verdict
         return ""
@@ -238,7 +238,7 @@ class Slave:
         ordered, until = [], self.now + seconds
         while self.now < until and not ordered:
             self.now += LOOK_PERIOD
-            ordered = self.step(events.LookedAt(LIDAR, pid, Look(**look)))
+            ordered = self.step(events.LookedAt(LIDAR, pid, Observation(**look)))
         return ordered
 
 

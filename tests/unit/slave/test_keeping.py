@@ -18,8 +18,8 @@ from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.ros.slave.replication import NotStored
 from rosrm.slave.replication import fetch
-from rosrm.slave.replication.service import Keeping
-from rosrm.snapshots import Block, Part, SlotWriter
+from rosrm.slave.replication.service import ReplicationService
+from rosrm.snapshots import Block, SlotWriter, TransferPart
 
 P7 = InstanceId("p", 7)
 PATIENCE = 20.0
@@ -31,7 +31,7 @@ class Wire:
     def __init__(self, net: Net, name: str) -> None:
         self.net, self.name = net, name
         self.host = None
-        self.given: list[Part] = []
+        self.given: list[TransferPart] = []
 
     def serve(self, host) -> None:
         self.host = host
@@ -49,7 +49,7 @@ class Wire:
             self.net.slaves[host].take_part(part, done)
 
     def ask(self, host, wanted, now, timeout, done) -> None:
-        def answer(part: Part | None) -> None:
+        def answer(part: TransferPart | None) -> None:
             done("there is no such snapshot here" if part is None else part)
 
         age = (wanted.number, wanted.sequence)
@@ -73,7 +73,7 @@ class Net:
     def __init__(self, tmp_path, log) -> None:
         self.root, self.log = tmp_path, log
         self.posted: queue.Queue[Callable[[], None]] = queue.Queue()
-        self.slaves: dict[str, Keeping] = {}
+        self.slaves: dict[str, ReplicationService] = {}
         self.wires: dict[str, Wire] = {}
         self.hidden: set[str] = set()
         self.silent: set[str] = set()
@@ -81,7 +81,7 @@ class Net:
         self.told: dict[str, list] = {}
         self.now = time.monotonic()
 
-    def add(self, name: str, **settings) -> Keeping:
+    def add(self, name: str, **settings) -> ReplicationService:
         self.told[name] = []
         wire = self.wires[name] = Wire(self, name)
 
@@ -89,7 +89,7 @@ class Net:
             self.told[name].append(states)
             return True
 
-        self.slaves[name] = Keeping(
+        self.slaves[name] = ReplicationService(
             self.root / name, name, KeepSettings(**settings), wire,
             post=self.posted.put, publish=publish,
         )  # fmt: skip
@@ -256,7 +256,7 @@ def test_a_state_that_is_damaged_on_its_way_is_refused(net):
     net.write("b", 1, number=6)
     good = snapshots.newest_content(net.directory("b"))[1]
     answers = []
-    part = Part("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
+    part = TransferPart("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
     taker.take_part(part, answers.append)
     net.settle()
     assert answers[0].code == "damaged"
@@ -268,7 +268,7 @@ def test_parts_out_of_order_begin_anew(net):
     """A part was lost, or two senders send at the same time."""
     taker = net.add("b")
     answers = []
-    taker.take_part(Part("p", 7, 5, 100, 200, 0, b"x" * 50), answers.append)
+    taker.take_part(TransferPart("p", 7, 5, 100, 200, 0, b"x" * 50), answers.append)
     net.settle()
     assert answers[0].code == "order"
 
@@ -309,7 +309,7 @@ def test_the_master_is_told_what_is_kept_when_it_changes(net):
     ((one,),) = [net.told["a"][-1]]
     assert (one.instance, one.sequence) == (P7, 3)
     before = len(net.told["a"])
-    slave.say_again()
+    slave.report_again()
     assert len(net.told["a"]) == before + 1
 
 

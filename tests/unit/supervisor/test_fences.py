@@ -12,7 +12,7 @@ import pytest
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.commands import Signal, Unspawn
 from rosrm.core.supervisor.instance import BACKOFF, EXITED, FAILED, FENCED, REFUSED
-from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 
 ONE = ("one", 7)
@@ -23,7 +23,7 @@ ALWAYS = RestartRule("always", delay=1.0)
 
 def ordered(fence=FENCE, restart=ALWAYS, stop=GRACES, heard=None):
     """Return a state machine with a start order at time 0, and its instance."""
-    core = Supervision()
+    core = SupervisorState()
     core.handle(events.StartOrdered(ONE, restart, stop, fence, heard), 0.0)
     return core, core.instances[ONE]
 
@@ -81,11 +81,13 @@ def test_a_late_look_at_the_clock_kills():
 def test_every_word_puts_it_off_from_when_it_was_true():
     """The deadline counts from the contact, not from the message; older ones have no effect."""
     core, _ = running()
-    core.handle(events.Heard(8.0), 9.5)
+    core.handle(events.ContactReported(8.0), 9.5)
     assert core.deadline() == 18.0
-    core.handle(events.Heard(7.0), 9.6)
+    core.handle(events.ContactReported(7.0), 9.6)
     assert core.deadline() == 18.0
-    core.handle(events.Heard(99.0), 10.0)  # no master contact is possible at this future time
+    core.handle(
+        events.ContactReported(99.0), 10.0
+    )  # no master contact is possible at this future time
     assert core.deadline() == 20.0
 
 
@@ -101,7 +103,7 @@ def test_a_word_that_comes_after_it_has_begun_is_too_late():
     """Its successor may rely on its end."""
     core, instance = running()
     core.handle(events.TimePassed(), 10.0)
-    core.handle(events.Heard(10.5), 10.5)
+    core.handle(events.ContactReported(10.5), 10.5)
     core.handle(events.Exited(ONE), 10.6)
     assert instance.phase == FENCED
 
@@ -168,7 +170,7 @@ def test_what_had_ended_by_itself_keeps_its_end(code, when, phase):
     core, instance = running(restart=RestartRule(when))
     core.handle(events.Exited(ONE, code, leftovers=True), 9.5)
     core.handle(events.TimePassed(), 10.0)
-    core.handle(events.Cleared(ONE), 10.5)
+    core.handle(events.SessionEnded(ONE), 10.5)
     assert instance.phase == phase
 
 
@@ -206,7 +208,7 @@ def test_the_order_to_fence_ends_what_waits():
 
 def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
     """A late start is refused."""
-    core = Supervision()
+    core = SupervisorState()
     core.handle(events.FenceOrdered(ONE), 0.0)
     core.handle(events.StartOrdered(ONE, ALWAYS, GRACES), 1.0)
     assert core.instances[ONE].phase == REFUSED

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core.supervisor.events import Heard
+from rosrm.core.supervisor.events import ContactReported
 from rosrm.supervisor import lease_file
 
 
 def test_the_newest_is_read_back(tmp_path):
     """The order in which the times arrived makes no difference."""
-    kept = lease_file.LastHeard(str(tmp_path))
+    kept = lease_file.LastContact(str(tmp_path))
     for at, alive in ((5.0, 1.0), (123456789.25, 3.0), (7.0, 2.0)):
-        kept.keep(Heard(at, alive))
-    assert lease_file.read(str(tmp_path)) == Heard(123456789.25, 3.0)
+        kept.keep(ContactReported(at, alive))
+    assert lease_file.read(str(tmp_path)) == ContactReported(123456789.25, 3.0)
     assert len((tmp_path / "heard").read_bytes().splitlines()) == 1
 
 
 def test_what_another_boot_heard_does_not_count(tmp_path, monkeypatch):
     """The clock of another boot does not compare."""
-    lease_file.LastHeard(str(tmp_path)).keep(Heard(5.0))
+    lease_file.LastContact(str(tmp_path)).keep(ContactReported(5.0))
     monkeypatch.setattr(lease_file.procfs, "boot_id", lambda: "another")
-    assert lease_file.read(str(tmp_path)) == Heard(0.0)
+    assert lease_file.read(str(tmp_path)) == ContactReported(0.0)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"torn", b"\xff\xff \xff", b"boot not-a-number\n"])
@@ -29,13 +29,13 @@ def test_what_cannot_be_read_does_not_count(tmp_path, content):
     """Each instance's own start counts then, which fences it earlier."""
     if content is not None:
         (tmp_path / "heard").write_bytes(content)
-    assert lease_file.read(str(tmp_path)) == Heard(0.0)
+    assert lease_file.read(str(tmp_path)) == ContactReported(0.0)
 
 
 def test_what_cannot_be_written_is_said_once(tmp_path, capsys):
     """Fences then rely on the contacts known to this supervisor."""
     (tmp_path / "heard").mkdir()
-    kept = lease_file.LastHeard(str(tmp_path))
-    kept.keep(Heard(5.0))
-    kept.keep(Heard(6.0))
+    kept = lease_file.LastContact(str(tmp_path))
+    kept.keep(ContactReported(5.0))
+    kept.keep(ContactReported(6.0))
     assert capsys.readouterr().err.count("heard cannot be written: Is a directory") == 1

@@ -21,11 +21,15 @@ from rosrm.model.values import (
 )
 from rosrm.slave.launch.ament_index import find_executable
 from rosrm.slave.launch.command import launch_order
-from rosrm.slave.launch.environment import Whereabouts, process_environment, without_bootstrapper
+from rosrm.slave.launch.environment import (
+    ProcessLocation,
+    process_environment,
+    without_bootstrapper,
+)
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text
 
-HERE = Whereabouts("robot1", "fleet", "/rosrm/state_config")
+HERE = ProcessLocation("robot1", "fleet", "/rosrm/state_config")
 VENV = "/home/robot/venv"
 SITE = f"{VENV}/lib/python3.12/site-packages"
 

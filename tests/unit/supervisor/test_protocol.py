@@ -8,12 +8,12 @@ from hypothesis import given
 
 from rosrm.core.supervisor.events import (
     AmendOrdered,
+    ContactReported,
     FailOrdered,
     FenceOrdered,
-    Forgotten,
-    Heard,
     RestartOrdered,
     ShutdownOrdered,
+    StatusStored,
     StopOrdered,
 )
 from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
@@ -53,12 +53,12 @@ ORDERS = st.one_of(
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(FenceOrdered, KEYS),
-    st.builds(Heard, SECONDS, SECONDS),
+    st.builds(ContactReported, SECONDS, SECONDS),
     st.builds(RestartOrdered, KEYS),
     st.builds(FailOrdered, KEYS, st.integers(1, 2**31), st.text(), st.booleans()),
     st.builds(messages.Amend, st.builds(AmendOrdered, KEYS, RULES), CHANGES),
     st.builds(messages.Remember, KEYS, st.text()),
-    st.builds(messages.Forget, st.lists(st.builds(Forgotten, KEYS)).map(tuple)),
+    st.builds(messages.Forget, st.lists(st.builds(StatusStored, KEYS)).map(tuple)),
     st.just(ShutdownOrdered()),
 )
 
@@ -78,7 +78,7 @@ def test_lines_are_cut_wherever_the_stream_is(lines, data):
     """The lines do not depend on the sizes of the received parts."""
     stream = b"".join(line + b"\n" for line in lines)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
-    cutter, found = ls.Lines(), []
+    cutter, found = ls.LineSplitter(), []
     for begin, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         found += cutter.feed(stream[begin:end])
     assert found == lines
@@ -109,4 +109,4 @@ def test_what_is_not_understood_is_refused(line, said):
 def test_a_line_without_end_is_refused():
     """A peer cannot fill the memory."""
     with pytest.raises(ls.ProtocolError, match="longer than"):
-        ls.Lines().feed(b"x" * (ls.LONGEST_LINE + 1))
+        ls.LineSplitter().feed(b"x" * (ls.LONGEST_LINE + 1))

@@ -10,7 +10,7 @@ import pytest
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import EXITED, Instance
-from rosrm.core.supervisor.reducer import Supervision
+from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import RestartRule, StopRule
 from rosrm.supervisor import instance_record as rc
 from rosrm.supervisor.messages import Amend, Launch
@@ -21,7 +21,7 @@ LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, RestartRule(), StopRul
 
 @pytest.fixture
 def core():
-    core = Supervision()
+    core = SupervisorState()
     core.handle(events.StartOrdered(TALKER, RestartRule("always"), StopRule(1.0, 2.0)), 0.0)
     core.handle(events.Spawned(TALKER, 100), 0.0)
     return core
@@ -29,7 +29,7 @@ def core():
 
 @pytest.fixture
 def record(tmp_path, core):
-    record = rc.Record(str(tmp_path))
+    record = rc.InstanceRecord(str(tmp_path))
     record.rewrite(core, {TALKER: LAUNCH}, {"base": {"A": "1"}}, lambda key: 55)
     return record
 
@@ -121,7 +121,7 @@ def test_the_forgotten_are_gone_but_stay_dead(tmp_path, record):
     recorded = rc.read(str(tmp_path))
     assert recorded.instances == {}
     assert recorded.dead == {"talker": 7}
-    core = Supervision()
+    core = SupervisorState()
     core.dead.update(recorded.dead)
     record.rewrite(core, {}, {}, lambda key: 0)
     assert rc.read(str(tmp_path)).dead == {"talker": 7}

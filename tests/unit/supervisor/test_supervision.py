@@ -13,21 +13,21 @@ from hypothesis import given, settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rosrm.core.supervisor import events, reducer
-from rosrm.core.supervisor.commands import Leave, Signal, Spawn, Tell, Unspawn
+from rosrm.core.supervisor.commands import Leave, ReportStatus, Signal, Spawn, Unspawn
 from rosrm.core.supervisor.events import (
     AmendOrdered,
-    Cleared,
     ClientLost,
+    ContactReported,
     Exited,
     FailOrdered,
     FenceOrdered,
-    Forgotten,
-    Heard,
     RestartOrdered,
+    SessionEnded,
     ShutdownOrdered,
     Spawned,
     SpawnFailed,
     StartOrdered,
+    StatusStored,
     StopOrdered,
     TimePassed,
 )
@@ -59,7 +59,7 @@ def kinds(commands):
 
 def started(**policies):
     """Return a state machine with one running instance, started at time 0."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     core.handle(
         StartOrdered(
             TALKER, policies.get("restart", RestartRule()), policies.get("stop", StopRule())
@@ -104,29 +104,29 @@ def test_rules_stand_in_the_table_of_the_module():
         phase = first or phase
         documented.append((phase, event))
     runs = {(row, event.__name__) for row, event in TRANSITIONS}
-    runs |= {("-", event.__name__) for event in get_args(reducer._OrderOfStranger)}
-    runs |= {("ended", "Forgotten")}
+    runs |= {("-", event.__name__) for event in get_args(reducer._OrderForUnknown)}
+    runs |= {("ended", "StatusStored")}
     assert sorted(documented) == sorted(runs)
     assert all(event.__name__ in reducer.__doc__ for event in get_args(events.Event))
 
 
 def test_start_is_recorded_before_it_is_tried():
     """The start is reported, and so recorded, before the spawn."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     commands = core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 0.0)
-    assert kinds(commands) == ["Tell", "Spawn"]
+    assert kinds(commands) == ["ReportStatus", "Spawn"]
 
 
 def test_repeated_start_only_tells_again():
     """DDS repeats messages: a start of a known instance spawns nothing."""
     core, _ = started()
     commands = core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 1.0)
-    assert kinds(commands) == ["Tell"]
+    assert kinds(commands) == ["ReportStatus"]
 
 
 def test_late_start_of_a_stopped_stranger_is_refused():
     """A stop that overtakes its start wins."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     core.handle(StopOrdered(TALKER), 0.0)
     core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 1.0)
     assert core.instances[TALKER].phase == REFUSED
@@ -137,7 +137,7 @@ def test_forgotten_numbers_never_start(number, starts):
     """A forgotten instance and the older ones of its process are refused."""
     core, _ = started()
     core.handle(Exited(TALKER), 1.0)
-    core.handle(Forgotten(TALKER), 2.0)
+    core.handle(StatusStored(TALKER), 2.0)
     order = StartOrdered(("talker", number), RestartRule(), StopRule())
     commands = core.handle(order, 3.0)
     assert ("Spawn" in kinds(commands)) is starts
@@ -146,7 +146,7 @@ def test_forgotten_numbers_never_start(number, starts):
 def test_what_runs_is_not_forgotten():
     """Only a final status can be forgotten."""
     core, instance = started()
-    assert kinds(core.handle(Forgotten(TALKER), 1.0)) == ["Tell"]
+    assert kinds(core.handle(StatusStored(TALKER), 1.0)) == ["ReportStatus"]
     assert instance.phase == RUNNING
 
 
@@ -179,7 +179,7 @@ def test_backoff_grows_to_its_bound_and_restarts_run_out():
             break
         waits.append(core.deadline() - now)
         now = core.deadline()
-        assert kinds(core.handle(TimePassed(), now)) == ["Tell", "Spawn"]
+        assert kinds(core.handle(TimePassed(), now)) == ["ReportStatus", "Spawn"]
         core.handle(Spawned(TALKER, 100), now)
     assert [0.8 * most <= wait <= most for wait, most in zip(waits, (1, 2, 4, 5, 5), strict=True)]
     assert instance.message == "exit code 1; its restart policy allows 5 restarts within 300 s"
@@ -205,7 +205,7 @@ def test_backoff_is_bounded(done, delay, most, factor):
 
 def crashed(count, rule):
     """Return this many instances that ended at once."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     keys = [(f"p{number}", number) for number in range(count)]
     for key in keys:
         core.handle(StartOrdered(key, rule, StopRule()), 0.0)
@@ -261,8 +261,8 @@ def test_stopped_process_is_not_restarted():
 def test_forced_restart_stops_then_starts():
     """A forced restart spawns when nothing is left, and the policy does not count it."""
     core, instance = started()
-    assert kinds(core.handle(RestartOrdered(TALKER), 1.0)) == ["Tell", "Signal"]
-    assert kinds(core.handle(Exited(TALKER, signal=2), 2.0)) == ["Tell", "Spawn"]
+    assert kinds(core.handle(RestartOrdered(TALKER), 1.0)) == ["ReportStatus", "Signal"]
+    assert kinds(core.handle(Exited(TALKER, signal=2), 2.0)) == ["ReportStatus", "Spawn"]
     assert instance.restarts == 0
 
 
@@ -279,9 +279,9 @@ def test_a_restart_while_its_own_end_is_in_hand_is_carried_out():
     """The leader has ended, and leftovers are being stopped: then the instance restarts."""
     core, instance = started()
     core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
-    assert kinds(core.handle(RestartOrdered(TALKER), 1.1)) == ["Tell"]
+    assert kinds(core.handle(RestartOrdered(TALKER), 1.1)) == ["ReportStatus"]
     assert instance.message.startswith("to restart it: SIGINT")
-    assert kinds(core.handle(Cleared(TALKER), 2.0)) == ["Tell", "Spawn"]
+    assert kinds(core.handle(SessionEnded(TALKER), 2.0)) == ["ReportStatus", "Spawn"]
     assert instance.restarts == 0
 
 
@@ -326,7 +326,7 @@ def test_what_is_stopped_is_killed_at_once():
 def test_a_run_is_not_failed_for_the_one_before():
     """The order names a pid of a former run, so it does not affect the present one."""
     core, instance = started(restart=ON_FAILURE)
-    assert kinds(core.handle(FailOrdered(TALKER, 99, "late"), 1.0)) == ["Tell"]
+    assert kinds(core.handle(FailOrdered(TALKER, 99, "late"), 1.0)) == ["ReportStatus"]
     assert instance.phase == RUNNING
     core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
     core.handle(Exited(TALKER, 0), 1.1)
@@ -348,7 +348,7 @@ def test_a_stop_of_what_is_failing_wins():
 def test_another_policy_counts_at_the_next_end():
     """A source with a suspended policy ends for good; a former shadow restarts."""
     core, instance = started(restart=ON_FAILURE)
-    assert kinds(core.handle(AmendOrdered(TALKER, NEVER), 1.0)) == ["Tell"]
+    assert kinds(core.handle(AmendOrdered(TALKER, NEVER), 1.0)) == ["ReportStatus"]
     core.handle(Exited(TALKER, signal=9), 2.0)
     assert instance.phase == FAILED
     core, instance = started(restart=NEVER)
@@ -361,7 +361,7 @@ def test_a_repeated_policy_only_tells_again():
     """DDS repeats messages, and so does a restarted master."""
     core, instance = started()
     core.handle(AmendOrdered(TALKER, ON_FAILURE), 1.0)
-    assert kinds(core.handle(AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
+    assert kinds(core.handle(AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["ReportStatus"]
     assert (instance.phase, instance.restart) == (RUNNING, ON_FAILURE)
 
 
@@ -382,7 +382,7 @@ def test_a_policy_that_allows_no_restart_ends_the_wait_for_one(restart, phase):
     core.handle(Exited(TALKER, 1), 2.0)
     due = core.deadline()
     assert 3.0 < due <= 4.0
-    assert kinds(core.handle(AmendOrdered(TALKER, restart), 3.0)) == ["Tell"]
+    assert kinds(core.handle(AmendOrdered(TALKER, restart), 3.0)) == ["ReportStatus"]
     assert instance.phase == phase
     assert core.deadline() == (due if phase == BACKOFF else None)
     if phase == FAILED:
@@ -394,7 +394,7 @@ def test_a_policy_for_what_is_being_stopped_counts_afterwards():
     core, instance = started(restart=ON_FAILURE)
     core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
     core.handle(AmendOrdered(TALKER, NEVER), 1.5)
-    core.handle(Cleared(TALKER), 2.0)
+    core.handle(SessionEnded(TALKER), 2.0)
     assert instance.phase == FAILED
 
 
@@ -402,7 +402,7 @@ def test_a_policy_for_what_has_ended_tells_its_end():
     """The order starts nothing; for an unknown instance it has no effect either."""
     core, instance = started()
     core.handle(Exited(TALKER, 1), 1.0)
-    assert kinds(core.handle(AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
+    assert kinds(core.handle(AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["ReportStatus"]
     assert (instance.phase, instance.restart) == (FAILED, RestartRule())
     core.handle(AmendOrdered(("stranger", 8), ON_FAILURE), 2.0)
     assert core.instances["stranger", 8].phase == REFUSED
@@ -412,9 +412,9 @@ def test_leftovers_are_stopped_before_it_counts_as_ended():
     """The leader exits and leaves other processes: they are stopped, then its exit code counts."""
     core, instance = started()
     commands = core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
-    assert kinds(commands) == ["Tell", "Signal"]
+    assert kinds(commands) == ["ReportStatus", "Signal"]
     assert instance.phase == STOPPING
-    core.handle(Cleared(TALKER), 2.0)
+    core.handle(SessionEnded(TALKER), 2.0)
     assert (instance.phase, instance.exit_code) == (FAILED, 3)
 
 
@@ -430,7 +430,7 @@ def test_leftovers_of_a_killed_leader_are_killed_at_once():
 
 def test_final_spawn_failure_is_not_repeated():
     """Waiting does not provide a missing executable, but another host may have it."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     core.handle(StartOrdered(TALKER, RestartRule("always"), StopRule()), 0.0)
     core.handle(SpawnFailed(TALKER, "no executable"), 0.0)
     assert core.instances[TALKER].phase == REFUSED
@@ -438,7 +438,7 @@ def test_final_spawn_failure_is_not_repeated():
 
 def test_transient_spawn_failure_follows_the_policy():
     """A lack of memory may pass."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     core.handle(StartOrdered(TALKER, RestartRule("on-failure"), StopRule()), 0.0)
     core.handle(SpawnFailed(TALKER, "no memory", transient=True), 0.0)
     assert core.instances[TALKER].phase == BACKOFF
@@ -446,9 +446,9 @@ def test_transient_spawn_failure_follows_the_policy():
 
 def test_stop_before_the_spawn_gives_it_up():
     """A pending start is cancelled."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 0.0)
-    assert kinds(core.handle(StopOrdered(TALKER), 0.0)) == ["Tell", "Unspawn"]
+    assert kinds(core.handle(StopOrdered(TALKER), 0.0)) == ["ReportStatus", "Unspawn"]
     core.handle(SpawnFailed(TALKER, ""), 0.0)
     assert core.instances[TALKER].phase == EXITED
 
@@ -459,7 +459,7 @@ def test_shutdown_leaves_when_all_have_ended():
     assert "Leave" not in kinds(core.handle(ShutdownOrdered(), 1.0))
     core.handle(StartOrdered(("late", 1), RestartRule(), StopRule()), 1.0)
     assert core.instances["late", 1].phase == REFUSED
-    assert kinds(core.handle(Exited(TALKER, signal=2), 2.0)) == ["Tell", "Leave"]
+    assert kinds(core.handle(Exited(TALKER, signal=2), 2.0)) == ["ReportStatus", "Leave"]
 
 
 @pytest.mark.parametrize("before", [None, Exited(TALKER, 1), RestartOrdered(TALKER)])
@@ -492,11 +492,11 @@ def test_a_lost_client_changes_nothing():
 
 def test_dead_numbers_are_bounded():
     """Thousands of jobs with different names need bounded memory."""
-    core = reducer.Supervision()
+    core = reducer.SupervisorState()
     for number in range(reducer.MOST_TOMBSTONES + 10):
         key = (f"job{number}", number)
         core.handle(StopOrdered(key), 0.0)
-        core.handle(Forgotten(key), 0.0)
+        core.handle(StatusStored(key), 0.0)
     assert len(core.dead) == reducer.MOST_TOMBSTONES
 
 
@@ -525,7 +525,7 @@ class Host(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.core = reducer.Supervision()
+        self.core = reducer.SupervisorState()
         self.now = 0.0
         self.newest = 0
         self.queue: list[Key] = []
@@ -571,7 +571,7 @@ class Host(RuleBasedStateMachine):
             assert key in self.leaders | self.strays, "a signal after the end"
             if command.number == signal.SIGKILL:
                 self.killed.add(key)
-        elif isinstance(command, Tell):
+        elif isinstance(command, ReportStatus):
             self.hear(key)
         else:
             assert key in self.final, "forgotten before its end"
@@ -596,15 +596,15 @@ class Host(RuleBasedStateMachine):
         self.look_at_fences()
 
     @rule(ago=st.sampled_from([-1.0, 0.0, 0.5, 4.0]))
-    def master_hears(self, ago):
+    def contact_confirmed(self, ago):
         """Report a contact with the master from this long ago; fenced instances stay fenced."""
-        self.happens(Heard(self.now - ago))
+        self.happens(ContactReported(self.now - ago))
         self.renew(min(self.now, self.now - ago), alive=False)
 
     @rule()
     def slave_is_at_work(self):
         """Report that the slave runs, without a newer contact with the master."""
-        self.happens(Heard(-99.0, self.now))
+        self.happens(ContactReported(-99.0, self.now))
         self.renew(self.now, alive=True)
 
     def renew(self, at, *, alive):
@@ -641,7 +641,7 @@ class Host(RuleBasedStateMachine):
         elif kind == "fail":
             self.happens(FailOrdered(key, 100, "unhealthy", data.draw(st.booleans())))
         elif kind == "forget":
-            self.happens(Forgotten(key))
+            self.happens(StatusStored(key))
         else:
             self.happens(StartOrdered(key, RestartRule("always"), StopRule()))
 
@@ -688,7 +688,7 @@ class Host(RuleBasedStateMachine):
     def strays_end(self, data):
         key = data.draw(st.sampled_from(sorted(self.strays)))
         self.strays.discard(key)
-        self.happens(Cleared(key))
+        self.happens(SessionEnded(key))
 
     @precondition(lambda self: self.core.deadline() is not None)
     @rule(seconds=st.sampled_from([0.0, 0.5, 1.0, 1.0, 6.0, 60.0]))
@@ -762,7 +762,7 @@ class Host(RuleBasedStateMachine):
                 self.happens(Exited(key, signal=signal.SIGKILL))
             for key in sorted(self.strays & self.killed):
                 self.strays.discard(key)
-                self.happens(Cleared(key))
+                self.happens(SessionEnded(key))
             self.now = self.core.deadline() or self.now
             self.happens(TimePassed())
         assert self.left

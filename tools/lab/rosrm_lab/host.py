@@ -115,7 +115,7 @@ def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file:
 
 def entrance(
     hierarchies: Sequence[Hierarchy],
-    record: store.Record,
+    record: store.LabRecord,
     host: str,
     command: Sequence[str],
     *,

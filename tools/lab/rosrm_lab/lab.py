@@ -18,7 +18,7 @@ from rosrm_lab import groups, needs, store
 from rosrm_lab.host import DATA, entrance
 from rosrm_lab.plan import HostPlan, LabPlan, check_name, check_usable, switch_namespace
 from rosrm_lab.status import HostStatus, host_status
-from rosrm_lab.store import Birth, Record
+from rosrm_lab.store import Birth, LabRecord
 from rosrm_lab.wires import Direction, check_delay, check_loss
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Lab:
                 with store.lock(""):  # two labs at once must not choose the same addresses
                     subnet = making.choose_subnet(self._subnet)
                     plan = LabPlan(self.name, self._hosts, subnet)
-                    record = Record(plan, boot=store.boot_id(), owner=owner)
+                    record = LabRecord(plan, boot=store.boot_id(), owner=owner)
                     store.write(record)
                 making.make(self._hierarchies, record, between)
             except BaseException:
@@ -333,7 +333,7 @@ class Lab:
             self._known = groups.find_hierarchies()
         return self._known
 
-    def _record(self) -> Record:
+    def _record(self) -> LabRecord:
         record = store.read(self.name)
         if record is None:
             others = ", ".join(sorted(store.labs())) or "none"

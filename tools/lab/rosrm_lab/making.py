@@ -12,7 +12,7 @@ from rosrm_lab import disks, groups, network, store
 from rosrm_lab.groups import Hierarchy
 from rosrm_lab.host import boot, power_off
 from rosrm_lab.plan import check_free, free_subnet, host_namespace, namespaces_of
-from rosrm_lab.store import Record
+from rosrm_lab.store import LabRecord
 from rosrm_lab.wires import Link
 
 
@@ -65,7 +65,7 @@ def choose_subnet(wanted: IPv4Network | None) -> IPv4Network:
     return wanted
 
 
-def make(hierarchies: Sequence[Hierarchy], record: Record, between: Callable[[], None]) -> None:
+def make(hierarchies: Sequence[Hierarchy], record: LabRecord, between: Callable[[], None]) -> None:
     """Make everything in a lab's record, and mark it as complete; raises `LabError`.
 
     Args:
@@ -84,7 +84,7 @@ def make(hierarchies: Sequence[Hierarchy], record: Record, between: Callable[[],
     store.write(record)
 
 
-def switch_on(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> None:
+def switch_on(hierarchies: Sequence[Hierarchy], record: LabRecord, host: str) -> None:
     """Connect a host and start its first process; raises `LabError`."""
     switch_off(hierarchies, record, host)  # remains of an earlier, partly killed run of the host
     plan = record.plan
@@ -92,7 +92,7 @@ def switch_on(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> No
     record.inits[host] = boot(hierarchies, plan.name, plan.host(host), plan.hosts_file())
 
 
-def switch_off(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> None:
+def switch_off(hierarchies: Sequence[Hierarchy], record: LabRecord, host: str) -> None:
     """Cut a host's power: first remove its network, then end its processes."""
     plan = record.plan
     network.unplug(plan, host)
@@ -101,7 +101,7 @@ def switch_off(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> N
     network.remove([name for name in network.existing() if name == mine])
 
 
-def change_link(record: Record, host: str, before: Link, after: Link) -> None:
+def change_link(record: LabRecord, host: str, before: Link, after: Link) -> None:
     """Apply the faults of a host's network: all of them, or none; raises `LabError`."""
     if record.is_up(host):
         network.set_delays(record.plan, host, before, after)

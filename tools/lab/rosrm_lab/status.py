@@ -9,7 +9,7 @@ from rosrm_lab import disks, groups
 from rosrm_lab.groups import Hierarchy
 from rosrm_lab.host import DATA
 from rosrm_lab.plan import HostPlan
-from rosrm_lab.store import Record
+from rosrm_lab.store import LabRecord
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class HostStatus:
     network: str
 
 
-def host_status(hierarchies: Sequence[Hierarchy], record: Record, host: HostPlan) -> HostStatus:
+def host_status(hierarchies: Sequence[Hierarchy], record: LabRecord, host: HostPlan) -> HostStatus:
     """Return the present status of a host."""
     lab, alive = record.plan.name, record.is_up(host.name)
     return HostStatus(

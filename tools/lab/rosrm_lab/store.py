@@ -56,7 +56,7 @@ class Birth:
 
 
 @dataclass(slots=True)
-class Record:
+class LabRecord:
     """The state of a lab in its file.
 
     Attributes:
@@ -97,7 +97,7 @@ class Record:
         }
 
     @classmethod
-    def from_plain(cls, plain: Mapping[str, Any]) -> Record:
+    def from_plain(cls, plain: Mapping[str, Any]) -> LabRecord:
         """Build a record from the result of `to_plain`."""
         if plain["version"] != _VERSION:
             raise ValueError(f"version {plain['version']}")
@@ -117,15 +117,15 @@ def boot_id() -> str:
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
-def read(lab: str) -> Record | None:
+def read(lab: str) -> LabRecord | None:
     """Return the state of a lab; None: there is none, or it is unreadable."""
     try:
-        return Record.from_plain(json.loads((RUN / lab / _FILE).read_text()))
+        return LabRecord.from_plain(json.loads((RUN / lab / _FILE).read_text()))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def write(record: Record) -> None:
+def write(record: LabRecord) -> None:
     """Write the state of a lab; a reader sees the old or the new file, never a part."""
     folder = RUN / record.plan.name
     folder.mkdir(parents=True, exist_ok=True)

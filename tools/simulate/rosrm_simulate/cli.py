@@ -63,11 +63,11 @@ def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
     the real run.
     """
     from rosrm_simulate import picture, tables
-    from rosrm_simulate.runs import Request, carry_out
+    from rosrm_simulate.runs import SimulationRequest, carry_out
 
     if plot is not None:
         picture.check(plot)
-    request = Request(
+    request = SimulationRequest(
         file, variants, tuple(variant or ()), tuple(policy or ()), tuple(hosts or ()), until, seed,
         cut,
     )  # fmt: skip

@@ -33,7 +33,7 @@ from rosrm_simulate.agenda import Agenda
 from rosrm_simulate.machine import Machine
 from rosrm_simulate.meter import Meter, Outcome
 from rosrm_simulate.nodes import Nodes
-from rosrm_simulate.workload import HostPlan, Workload
+from rosrm_simulate.workload import SimulatedHost, Workload
 from rosrm_simulate.world import World
 
 #: Events between two calls of `progress`.
@@ -84,9 +84,9 @@ class Simulation(World[Machine]):
         self.meter = Meter(workload.until)
         self.agenda = Agenda()
         self._plans = {plan.name: plan for plan in workload.processes}
-        self.publish = Nodes(self.agenda, workload.model, self.machines, self.tell).hear
+        self.publish = Nodes(self.agenda, workload.model, self.machines, self.tell).handle
         self._active = 0.0
-        self._usage_told = -1
+        self._usage_published_at = -1
         # After this long without any event, the passing of time alone has no further effect.
         self._patience = 2.0 + max(
             settings.settle, settings.hysteresis, settings.cooldown, settings.delivery_timeout,
@@ -143,7 +143,7 @@ class Simulation(World[Machine]):
         for time, event in self.workload.requests:
             self.agenda.at(time, partial(self.request, event))
 
-    def _join(self, plan: HostPlan) -> None:
+    def _join(self, plan: SimulatedHost) -> None:
         machine = Machine(
             plan, len(self.machines) + 1, self.agenda, self.workload.model, self._plans, self.tell
         )
@@ -151,7 +151,7 @@ class Simulation(World[Machine]):
         self.join(machine, inf)  # no simulated host is cut off
         self._read([machine])
 
-    def _leave(self, plan: HostPlan) -> None:
+    def _leave(self, plan: SimulatedHost) -> None:
         machine = self.machines[plan.name]
         if plan.lost:
             machine.lose()
@@ -170,8 +170,8 @@ class Simulation(World[Machine]):
         if there:
             self._read(there)
         turn = int(now / self.workload.model.usage_period)
-        if turn != self._usage_told:
-            self._usage_told = turn
+        if turn != self._usage_published_at:
+            self._usage_published_at = turn
             for machine in there:
                 self._tell_usages(machine)
                 machine.tell(TimePassed(), now)
@@ -190,8 +190,8 @@ class Simulation(World[Machine]):
     def _tell_usages(self, machine: Machine) -> None:
         """Deliver the usage of each instance, if it has changed since the last time."""
         used = machine.used(self.now)
-        if used != machine.told_usage:
-            machine.told_usage = used
+        if used != machine.published_usage:
+            machine.published_usage = used
             self.tell(machine.usages(self.now))
 
     # --- the world, on virtual time ------------------------------------------------------

@@ -26,7 +26,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Recording
-from rosrm_simulate.workload import Curve, HostPlan, Model, ProcessPlan, Workload
+from rosrm_simulate.workload import Curve, Model, ProcessPlan, SimulatedHost, Workload
 
 #: Points of a memory curve that are kept.
 _POINTS: Final = 64
@@ -82,7 +82,7 @@ class Extraction:
         self._stops: list[float] = []
         self._stops_since: dict[int, float] = {}
         for name, item in recording.header.intents.get("process", {}).items():
-            if not ProcessPhase(item["phase"]).over:  # the master restored it at its start
+            if not ProcessPhase(item["phase"]).is_terminal:  # the master restored it at its start
                 self._processes[name] = _Process(from_plain(ProcessSpec, item["spec"]), 0.0)
 
     def watch(self, state: MasterState, one: Happened, commands: Sequence[Command]) -> None:
@@ -99,7 +99,7 @@ class Extraction:
                 EventKind.HOST_LOST,
                 EventKind.HOST_BACK,
             ):
-                self._heard(command, at)
+                self._take_record(command, at)
 
     def _take(
         self, state: MasterState, event: happened.Event, commands: Sequence[Command], at: float
@@ -129,7 +129,7 @@ class Extraction:
         else:
             known.leaves, known.lost = inf, False
 
-    def _heard(self, record: Record, at: float) -> None:
+    def _take_record(self, record: Record, at: float) -> None:
         host = self._hosts.get(record.host)
         if host is not None and host.leaves == inf and record.kind is EventKind.HOST_LOST:
             host.leaves, host.lost = at, True
@@ -217,9 +217,9 @@ def _middle(values: Sequence[float], default: float) -> float:
     return float(np.median(values)) if values else default
 
 
-def _host_plan(seen: _Host) -> HostPlan:
+def _host_plan(seen: _Host) -> SimulatedHost:
     described = seen.description
-    return HostPlan(
+    return SimulatedHost(
         described.name, described.resources, seen.limits, described.labels,
         described.max_processes, {name: _middle(v, 0.0) for name, v in seen.others.items()},
         seen.joins, seen.leaves, seen.lost,

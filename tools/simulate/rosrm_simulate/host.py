@@ -56,7 +56,7 @@ class Program:
 ProgramT = TypeVar("ProgramT", bound=Program)
 
 
-class Reading(NamedTuple):
+class SimulatedReading(NamedTuple):
     """A slave's reading.
 
     Attributes:
@@ -177,7 +177,7 @@ class Host(ABC, Generic[ProgramT]):
             for one in self.resources
         }
 
-    def reading(self, now: float) -> Reading:
+    def reading(self, now: float) -> SimulatedReading:
         """Return the slave's reading."""
         used, count = self.usage(now), len(self.resources)
         usage = np.zeros(RESOURCE_SLOTS)
@@ -186,7 +186,7 @@ class Host(ABC, Generic[ProgramT]):
         accepts = under_limits(
             usage.astype(np.float32), self.limit.astype(np.float32), (1 << count) - 1, stale
         )
-        return Reading(now, usage, stale, accepts)
+        return SimulatedReading(now, usage, stale, accepts)
 
     def used(self, now: float) -> tuple[tuple[int, float, float], ...]:
         """Return number, cores and bytes of each instance."""

@@ -18,8 +18,8 @@ from rosrm.core.slave.events import SeenInGraph
 from rosrm.core.slave.state import awaits_graph
 from rosrm.model.values import EMPTY, Assignment, InstanceId, InstanceState, RestartPolicy
 from rosrm_simulate.agenda import Agenda, Entry
-from rosrm_simulate.host import Host, Program, Reading
-from rosrm_simulate.workload import HostPlan, Model, ProcessPlan
+from rosrm_simulate.host import Host, Program, SimulatedReading
+from rosrm_simulate.workload import Model, ProcessPlan, SimulatedHost
 
 #: Seconds of work left that count as none, because sums of fractions are not exact.
 _NONE_LEFT = 1e-9
@@ -59,7 +59,7 @@ class Machine(Host[Work]):
     """
 
     def __init__(
-        self, plan: HostPlan, incarnation: int, agenda: Agenda, model: Model,
+        self, plan: SimulatedHost, incarnation: int, agenda: Agenda, model: Model,
         processes: Mapping[str, ProcessPlan], deliver: Callable[[happened.Event], object],
     ) -> None:  # fmt: skip
         super().__init__(
@@ -70,7 +70,7 @@ class Machine(Host[Work]):
         self.up = True
         self.stopping = False
         self.asked = False
-        self.told_usage: tuple[tuple[int, float, float], ...] = ()
+        self.published_usage: tuple[tuple[int, float, float], ...] = ()
         self._agenda = agenda
         self._model = model
         self._processes = processes
@@ -80,7 +80,7 @@ class Machine(Host[Work]):
         self._worked_until = 0.0
         self._rate = 1.0
         self._level_from = 0.0
-        self._reading: Reading | None = None
+        self._reading: SimulatedReading | None = None
         self._end_of_work: Entry | None = None
 
     # --- messages, on virtual time ---------------------------------------------------------
@@ -237,7 +237,7 @@ class Machine(Host[Work]):
         """Return True if the memory of a process is still changing."""
         return now < self._level_from
 
-    def reading(self, now: float) -> Reading:
+    def reading(self, now: float) -> SimulatedReading:
         """Return the slave's reading, which changes only with its programs."""
         if self._reading is None or self.grows(self._reading.at):
             self._reading = super().reading(now)

@@ -135,7 +135,7 @@ class Meter:
     def begin(self, state: MasterState, now: float) -> None:
         """Begin with a core's state: unfinished processes arrive now, running ones have hosts."""
         for process in state.processes.values():
-            if process.phase.over:
+            if process.phase.is_terminal:
                 continue
             self._first = now
             self._arrivals[process.name] = now
@@ -231,7 +231,7 @@ class Meter:
         first = 0.0 if self._first == inf else self._first
         waits = [at - self._arrivals.get(name, at) for name, at in self._placed_at.items()]
         phases = [process.phase for process in state.processes.values()]
-        over = sum(phase.over for phase in phases)
+        over = sum(phase.is_terminal for phase in phases)
         finished = sum(phase is ProcessPhase.FINISHED for phase in phases)
         waiting = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
         never = {
@@ -242,7 +242,7 @@ class Meter:
         seconds = totals.seconds or 1.0
         return Outcome(
             processes=len(phases), finished=finished,
-            running=sum(phase not in waiting and not phase.over for phase in phases),
+            running=sum(phase not in waiting and not phase.is_terminal for phase in phases),
             waiting=sum(phase in waiting for phase in phases),
             ended_otherwise=over - finished,
             never_placed=never,
@@ -280,6 +280,6 @@ class Meter:
 
 def _why_not_placed(state: MasterState, process: Process) -> str:
     """Return the reason why a process got no host; one cancelled before may have none."""
-    if process.phase.over:
+    if process.phase.is_terminal:
         return process.reason or f"it {standing(process.phase.value)}"
     return process.reason or f"it waits behind {state.queue.head()}"

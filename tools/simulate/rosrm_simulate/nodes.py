@@ -30,7 +30,7 @@ class Nodes:
         self._machines = machines
         self._deliver = deliver
 
-    def hear(self, config: PublishStateConfig) -> None:
+    def handle(self, config: PublishStateConfig) -> None:
         """Process a phase of a handoff; the named node answers."""
         if config.phase is HandoffPhase.SHADOW:
             seconds = self._model.ready + self._model.handoff

@@ -10,7 +10,7 @@ import numpy as np
 
 from rosrm.errors import ConfigError, RosrmError
 from rosrm_simulate.meter import MEASURED
-from rosrm_simulate.runs import Report, Run
+from rosrm_simulate.runs import SimulationReport, SimulationRun
 
 _FORMATS: Final = (".png", ".svg", ".pdf")
 #: Most hosts with a legend beside the curves; more would hide them.
@@ -30,7 +30,7 @@ def check(path: Path) -> None:
         raise ConfigError(f"--plot {path}: there is no directory {path.absolute().parent}")
 
 
-def draw(report: Report, path: Path) -> None:
+def draw(report: SimulationReport, path: Path) -> None:
     """Draw all runs into a file; raises `RosrmError` where it cannot be written."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra: `check` has looked for it
 
@@ -49,7 +49,7 @@ def draw(report: Report, path: Path) -> None:
         raise RosrmError(f"--plot {path}: cannot be written: {error.strerror}") from None
 
 
-def _draw_usage(axis: Any, run: Run, resource: str) -> None:
+def _draw_usage(axis: Any, run: SimulationRun, resource: str) -> None:
     curves = run.outcome.curves
     for column, host in enumerate(curves.hosts):
         label = host if len(curves.hosts) <= _NAMED else None

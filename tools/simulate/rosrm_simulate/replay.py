@@ -86,7 +86,9 @@ def replay(
     restore(state, lambda table: header.intents.get(table, {}), header.started)
     tail = header.intents.get("cluster", {}).get("tail")
     if tail is not None:
-        journal_gap.begin(state, int(tail["newest"]), header.started, fell=bool(tail["fell"]))
+        journal_gap.begin(
+            state, int(tail["newest"]), header.started, machine_rebooted=bool(tail["fell"])
+        )
     end = header.started + min(until, recording.length)
     meter = Meter(end)
     meter.begin(state, header.started)

@@ -44,7 +44,7 @@ _LONGEST_OPENING: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class SimulationRequest:
     """The arguments of the command line; the fields are its options."""
 
     file: Path
@@ -58,7 +58,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class SimulationRun:
     """One row of the comparison.
 
     Attributes:
@@ -73,7 +73,7 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class SimulationReport:
     """The results of a command.
 
     Attributes:
@@ -83,13 +83,13 @@ class Report:
     """
 
     workload: Workload
-    runs: tuple[Run, ...]
+    runs: tuple[SimulationRun, ...]
     recording: Recording | None = None
     replayed: Replay | None = None
     agreement: Agreement | None = None
 
 
-def carry_out(request: Request) -> Report:
+def carry_out(request: SimulationRequest) -> SimulationReport:
     """Simulate; raises `ConfigError` or `RecordError` for errors in the files."""
     registry = Registry.discover()
     changes = _changes(request)
@@ -101,10 +101,10 @@ def carry_out(request: Request) -> Report:
     workload = _ended(comparison.workload, _end(request))
     with _progress() as shown:
         runs = [run(workload, one, registry, shown) for one in comparison.variants]
-    return Report(workload, tuple(runs))
+    return SimulationReport(workload, tuple(runs))
 
 
-def _changes(request: Request) -> list[Node]:
+def _changes(request: SimulationRequest) -> list[Node]:
     listed = read_variants(request.variants) if request.variants is not None else []
     return [
         *listed,
@@ -127,7 +127,7 @@ def _holds_record(path: Path) -> bool:
     return False
 
 
-def _end(request: Request) -> float:
+def _end(request: SimulationRequest) -> float:
     """Return the seconds after which each run ends; inf: when nothing can change any more."""
     if not request.until:
         return inf
@@ -144,7 +144,9 @@ def _ended(workload: Workload, until: float) -> Workload:
 # --- a record ---------------------------------------------------------------------------------
 
 
-def _of_record(request: Request, changes: Sequence[Node], registry: Registry) -> Report:
+def _of_record(
+    request: SimulationRequest, changes: Sequence[Node], registry: Registry
+) -> SimulationReport:
     if request.seed is not None:
         raise ConfigError(f"--seed is for workloads: the record {request.file} leaves no chance")
     until = _end(request)
@@ -154,13 +156,13 @@ def _of_record(request: Request, changes: Sequence[Node], registry: Registry) ->
     variants = load_variants(base, changes, request.file, registry, title="simulated")
     replayed, workload = replay_record(recording, registry, until)
     hosts = len(replayed.outcome.curves.hosts)
-    runs = [Run("recorded", hosts, replayed.outcome)]
+    runs = [SimulationRun("recorded", hosts, replayed.outcome)]
     workload = _ended(workload, until)
     if not workload.hosts:
         raise RecordError(f"{request.file}: no host ever registered in it: nothing to simulate")
     with _progress() as shown:
         runs += [run(workload, one, registry, shown) for one in variants]
-    return Report(
+    return SimulationReport(
         workload, tuple(runs), recording, replayed, compare(runs[0].outcome, runs[1].outcome)
     )
 
@@ -213,7 +215,7 @@ def replay_record(
 
 def run(
     workload: Workload, variant: Variant, registry: Registry, shown: Shown | None = None
-) -> Run:
+) -> SimulationRun:
     """Simulate one variant of a workload."""
     if variant.hosts is not None:
         workload = workload.with_hosts(variant.hosts)
@@ -221,7 +223,7 @@ def run(
     simulation = Simulation(workload, variant.cluster.core(), policy, strategies, declared)
     began = time.perf_counter()
     outcome = simulation.run(None if shown is None else shown.named(variant.name))
-    return Run(variant.name, len(workload.hosts), outcome, time.perf_counter() - began)
+    return SimulationRun(variant.name, len(workload.hosts), outcome, time.perf_counter() - began)
 
 
 def _plugins(

@@ -13,7 +13,7 @@ from rosrm.model.codec import to_plain
 from rosrm.wording import counted, few
 from rosrm_simulate.agreement import Agreement
 from rosrm_simulate.replay import Replay
-from rosrm_simulate.runs import Report, Run
+from rosrm_simulate.runs import SimulationReport, SimulationRun
 
 #: Number of never placed processes whose reason is shown.
 _TOLD: Final = 3
@@ -23,7 +23,7 @@ _HOSTS: Final = ("MEM GAP", "CPU GAP", "MOVES", "OVER LIMIT")
 _WIDE: Final = 125
 
 
-def show(report: Report) -> None:
+def show(report: SimulationReport) -> None:
     """Print the results of a command."""
     if report.recording is not None and report.replayed is not None:
         _say_of_record(report, report.replayed)
@@ -49,7 +49,7 @@ def show(report: Report) -> None:
     typer.echo(f"{counted(events, 'event')} in {seconds:.1f} s, {events / seconds:.0f} a second")
 
 
-def _cells(run: Run) -> dict[str, str]:
+def _cells(run: SimulationRun) -> dict[str, str]:
     outcome = run.outcome
     failed = f" ({outcome.failed_migrations} failed)" if outcome.failed_migrations else ""
     return {
@@ -71,7 +71,7 @@ def _seconds(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < 999.95 else f"{seconds:.0f} s"
 
 
-def _say_of_record(report: Report, replayed: Replay) -> None:
+def _say_of_record(report: SimulationReport, replayed: Replay) -> None:
     recording = report.recording
     assert recording is not None
     typer.echo(
@@ -111,7 +111,7 @@ def _points(of: Mapping[str, float]) -> str:
 # --- JSON -------------------------------------------------------------------------------------
 
 
-def report_form(report: Report) -> dict[str, Any]:
+def report_form(report: SimulationReport) -> dict[str, Any]:
     """Return all numbers, as printed by `--json`."""
     replayed, recording = report.replayed, report.recording
     return {
@@ -133,7 +133,7 @@ def report_form(report: Report) -> dict[str, Any]:
     }
 
 
-def _run_form(run: Run) -> dict[str, Any]:
+def _run_form(run: SimulationRun) -> dict[str, Any]:
     outcome = run.outcome
     kept = ("processes", "finished", "running", "waiting", "ended_otherwise", "never_placed",
             "makespan", "wait_mean", "wait_max", "migrations", "failed_migrations", "imbalance",

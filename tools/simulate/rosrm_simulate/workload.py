@@ -38,7 +38,7 @@ class Model:
 
 
 @dataclass(frozen=True, slots=True)
-class HostPlan:
+class SimulatedHost:
     """One host.
 
     Attributes:
@@ -150,7 +150,7 @@ class Workload:
     """
 
     name: str
-    hosts: tuple[HostPlan, ...]
+    hosts: tuple[SimulatedHost, ...]
     processes: tuple[ProcessPlan, ...]
     model: Model = Model()
     requests: tuple[tuple[float, Event], ...] = ()
@@ -162,7 +162,7 @@ class Workload:
         return replace(self, hosts=tuple(hosts))
 
 
-def _copy(hosts: Sequence[HostPlan], number: int) -> HostPlan:
+def _copy(hosts: Sequence[SimulatedHost], number: int) -> SimulatedHost:
     turn, index = divmod(number, len(hosts))
     host = hosts[index]
     if not turn:

@@ -25,7 +25,7 @@ from rosrm.extensions.units import Amount, Count, Fraction, PositiveSeconds, Qua
 from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
 from rosrm.wording import counted
 from rosrm_simulate.variants import Variant, check_keys, load_variants, text_of, variants_of
-from rosrm_simulate.workload import Curve, HostPlan, Model, ProcessPlan, Workload
+from rosrm_simulate.workload import Curve, Model, ProcessPlan, SimulatedHost, Workload
 
 _MODEL: Final = Model()
 _UNITS: Final = {"memory": "B", "cpu": "core", "disk": "B"}
@@ -218,7 +218,7 @@ def _listed(root: Node, section: str, problems: Problems) -> Iterator[Node]:
         yield from expanded(entry, problems)
 
 
-def _host(node: Node, problems: Problems) -> HostPlan | None:
+def _host(node: Node, problems: Problems) -> SimulatedHost | None:
     check_name(node.get("name"), "host", problems)
     host = validated(HostInFile, node, problems)
     if host is None:
@@ -239,14 +239,14 @@ def _host(node: Node, problems: Problems) -> HostPlan | None:
         for name, unit in _UNITS.items()
         if getattr(host, name) > 0.0
     )
-    return HostPlan(
+    return SimulatedHost(
         host.name, resources, {**_LIMITS, **host.limits}, host.labels, host.max_processes,
         host.busy, host.joins, inf if host.leaves is None else host.leaves, host.lost,
     )  # fmt: skip
 
 
 def _process(
-    node: Node, hosts: Sequence[HostPlan], random: np.random.Generator, plugins: PluginCheck,
+    node: Node, hosts: Sequence[SimulatedHost], random: np.random.Generator, plugins: PluginCheck,
     problems: Problems,
 ) -> ProcessPlan | None:  # fmt: skip
     node = merged(Node({}, node.place), written_out(node))
@@ -287,7 +287,7 @@ def _spec(given: ProcessInFile, needs: Mapping[str, float]) -> ProcessSpec:
 
 
 def _check_fits(
-    node: Node, given: ProcessInFile, hosts: Sequence[HostPlan], problems: Problems
+    node: Node, given: ProcessInFile, hosts: Sequence[SimulatedHost], problems: Problems
 ) -> None:
     """Add a problem for a process that is larger than every host, and so could only wait."""
     amounts = {"memory": given.memory[1], "disk": given.disk[1]}

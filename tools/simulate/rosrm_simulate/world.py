@@ -25,7 +25,7 @@ from rosrm.core.master.commands import (
 from rosrm.core.master.events import AssignmentWithdrawn, Event, HostRegistered, ReadingsReceived
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
-from rosrm.core.slave.events import MasterHears, Registered
+from rosrm.core.slave.events import ContactConfirmed, Registered
 from rosrm_simulate.host import Host
 
 HostT = TypeVar("HostT", bound=Host[Any])
@@ -146,7 +146,7 @@ class World(ABC, Generic[HostT]):
         if reply.accepted:
             host.host_id = reply.host_id
             host.tell(Registered(self.state.epoch), self.now)
-            host.tell(MasterHears(contact), self.now)
+            host.tell(ContactConfirmed(contact), self.now)
         return reply
 
     def readings(self, hosts: Sequence[HostT], **columns: Any) -> ReadingsReceived:

@@ -42,7 +42,7 @@ class Listener:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
-        self._over: deque[str] = deque(maxlen=_REMEMBERED)
+        self._ended: deque[str] = deque(maxlen=_REMEMBERED)
         self._seen: Request | None = None
         self._edition: tuple[int, ...] = ()
         self._fault = ""
@@ -58,21 +58,21 @@ class Listener:
         if request is None or request == self._seen:
             return None
         self._seen = request
-        if request.id in self._over:
+        if request.id in self._ended:
             return None
         standing = Want.JOIN if self.status.state is State.RUNNING else Want.LEAVE
         if request.want is not standing:
             return request
         # The node is already in the requested state: withdrawn before it left, or requested twice.
         if request.want is Want.JOIN:
-            self._over.append(request.id)
+            self._ended.append(request.id)
         self.say(Status(self.status.state, request.id))
         return None
 
     def say(self, status: Status) -> None:
         """Write the status. If that fails, log it; clients that wait have a timeout."""
         if self.status.request not in ("", status.request):
-            self._over.append(self.status.request)
+            self._ended.append(self.status.request)
         self.status = status
         self._said = time.monotonic()
         try:
@@ -86,7 +86,7 @@ class Listener:
 
     def done(self, status: Status) -> None:
         """Write the final status of a departure, successful or not."""
-        self._over.append(status.request)
+        self._ended.append(status.request)
         self.say(status)
 
     def close(self) -> None:

@@ -38,7 +38,7 @@ _PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin"
 
 
 @dataclass(frozen=True)
-class Criu:
+class CriuBinary:
     """A CRIU that starts; `rosrm_criu.engine.probe` tests its capability on this host.
 
     Args:
@@ -105,7 +105,7 @@ class Criu:
         raise CriuError(f"{what}: {why} (its log: {log})")
 
 
-def find(prefix: Path | None = None) -> Criu:
+def find(prefix: Path | None = None) -> CriuBinary:
     """Return the CRIU to use on this host.
 
     Args:
@@ -139,8 +139,8 @@ def find(prefix: Path | None = None) -> Criu:
 REMEDY: Final = "`scripts/install_criu.sh` of rosrm's repository installs one in a folder"
 
 
-def opened(program: Path) -> Criu:
-    """Return a program as a `Criu`; raise `CriuError` if it does not answer like CRIU."""
+def opened(program: Path) -> CriuBinary:
+    """Return a program as a `CriuBinary`; raise `CriuError` if it does not answer like CRIU."""
     try:
         answer = subprocess.run(
             [program, "--version"],
@@ -165,7 +165,7 @@ def opened(program: Path) -> Criu:
             f"{program} is no CRIU that works: `--version` ended with code {answer.returncode} "
             f"and said {said!r}"
         )
-    return Criu((str(program),), version[1])
+    return CriuBinary((str(program),), version[1])
 
 
 def may_do_all() -> bool:

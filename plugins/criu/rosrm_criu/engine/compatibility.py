@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.wording import listed
-from rosrm_criu.engine.binary import Criu, may_do_all
+from rosrm_criu.engine.binary import CriuBinary, may_do_all
 
 #: Real path of the running interpreter (`sys.executable` may be a link, or empty).
 INTERPRETER: Final = os.path.realpath("/proc/self/exe")
@@ -43,7 +43,7 @@ FACTS: Final = {
 }
 
 
-def facts_of(criu: Criu) -> Mapping[str, str]:
+def facts_of(criu: CriuBinary) -> Mapping[str, str]:
     """Return this host's facts, by the names of `FACTS`."""
     return {
         "version": criu.version,

@@ -20,7 +20,7 @@ from rosrm.errors import CriuError
 from rosrm.supervisor import paths, procfs
 from rosrm.supervisor.procfs import inner_pid
 from rosrm_criu.engine import criu_log, external_resources, image, open_files, process_tree
-from rosrm_criu.engine.binary import Criu
+from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.image import Manifest
 
 #: Options for both the dump and the restore.
@@ -36,7 +36,7 @@ Leave = Literal["stopped", "running", "killed"]
 
 
 def dump(
-    criu: Criu,
+    criu: CriuBinary,
     pid: int,
     directory: Path,
     *,
@@ -117,7 +117,7 @@ def kill(pid: int) -> None:
     process_tree.send(reversed(process_tree.tree(process_tree.root_of(pid))), signal.SIGKILL)
 
 
-def _run(criu: Criu, root: int, directory: Path, timeout: float, process: str) -> None:
+def _run(criu: CriuBinary, root: int, directory: Path, timeout: float, process: str) -> None:
     arguments = (
         "dump", "--tree", str(inner_pid(root)), "--images-dir", str(directory / image.PAGES),
         "--leave-stopped", *COMMON, "--timeout", str(_FREEZE),

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine.binary import OLDEST, REMEDY, Criu, find
+from rosrm_criu.engine.binary import OLDEST, REMEDY, CriuBinary, find
 from rosrm_criu.engine.compatibility import INTERPRETER, facts_of
 
 #: Seconds for the whole test, which normally takes a few tenths.
@@ -65,7 +65,7 @@ rm -rf -- "$0"
 
 
 @dataclass(frozen=True)
-class Ability:
+class CriuSupport:
     """The capability of CRIU on this host.
 
     Args:
@@ -79,15 +79,15 @@ class Ability:
     facts: Mapping[str, str]
 
 
-def ability(prefix: Path | None = None) -> Ability:
+def ability(prefix: Path | None = None) -> CriuSupport:
     """Find the CRIU to use on this host and test it."""
     try:
         return probe(find(prefix))
     except CriuError as error:
-        return Ability(False, str(error), {})
+        return CriuSupport(False, str(error), {})
 
 
-def probe(criu: Criu, *, timeout: float = TIMEOUT) -> Ability:
+def probe(criu: CriuBinary, *, timeout: float = TIMEOUT) -> CriuSupport:
     """Test a CRIU by a dump and a restore.
 
     Args:
@@ -101,10 +101,10 @@ def probe(criu: Criu, *, timeout: float = TIMEOUT) -> Ability:
         reason = _with_remedy(criu, str(error))
     except (OSError, subprocess.TimeoutExpired) as error:
         reason = f"CRIU could not be tried: {error}"
-    return Ability(not reason, reason, facts_of(criu))
+    return CriuSupport(not reason, reason, facts_of(criu))
 
 
-def setcap_command(criu: Criu) -> str:
+def setcap_command(criu: CriuBinary) -> str:
     """Return the command that gives an ordinary user's CRIU the capabilities that it needs."""
     capabilities = "cap_checkpoint_restore,cap_setpcap"
     with contextlib.suppress(OSError, ValueError):
@@ -113,7 +113,7 @@ def setcap_command(criu: Criu) -> str:
     return f"sudo setcap {capabilities}+eip {os.path.realpath(criu.command[-1])}"
 
 
-def _with_remedy(criu: Criu, reason: str) -> str:
+def _with_remedy(criu: CriuBinary, reason: str) -> str:
     """Return the reason with its remedy, if one is known."""
     if criu.number < OLDEST:
         least = ".".join(map(str, OLDEST))
@@ -135,7 +135,7 @@ def _with_remedy(criu: Criu, reason: str) -> str:
 # --- the trial --------------------------------------------------------------------------------
 
 
-def _exercise(criu: Criu, until: float) -> None:
+def _exercise(criu: CriuBinary, until: float) -> None:
     """Dump and restore a child; raise `CriuError` at the first step that fails."""
     with (
         _folder() as (folder, clearer),
@@ -144,7 +144,7 @@ def _exercise(criu: Criu, until: float) -> None:
         ours.bind(("127.0.0.1", 0))
         trial = _Trial(criu, until, folder, clearer)
         with _subject(ours.getsockname()[1], trial) as process:
-            address = _heard(ours, trial, "0", "started")
+            address = _receive(ours, trial, "0", "started")
             _ask(ours, address, trial, "1", "started")
             trial.run("dump", "--tree", str(process.pid))
             process.wait(max(1.0, trial.left))  # otherwise the zombie would still hold the pid
@@ -155,7 +155,7 @@ def _exercise(criu: Criu, until: float) -> None:
 
 @dataclass(frozen=True)
 class _Trial:
-    criu: Criu
+    criu: CriuBinary
     until: float
     folder: Path
     clearer: int
@@ -181,10 +181,10 @@ def _ask(
 ) -> None:
     """Make the child count one step further; raise `CriuError` if it does not."""
     ours.sendto(b"?", address)
-    _heard(ours, trial, count, after)
+    _receive(ours, trial, count, after)
 
 
-def _heard(ours: socket.socket, trial: _Trial, count: str, after: str) -> tuple[str, int]:
+def _receive(ours: socket.socket, trial: _Trial, count: str, after: str) -> tuple[str, int]:
     """Return the sender of the expected count; raise `CriuError` for another count or none."""
     ours.settimeout(max(0.1, trial.left))
     try:

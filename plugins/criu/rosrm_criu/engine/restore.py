@@ -19,7 +19,7 @@ from rosrm.errors import CriuError
 from rosrm.supervisor import paths
 from rosrm.supervisor.procfs import SUPERVISOR_MARK
 from rosrm_criu.engine import criu_log, image, relocation
-from rosrm_criu.engine.binary import Criu
+from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.dump import COMMON
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
 
@@ -151,7 +151,7 @@ def _make_tracing_file(mapped: MappedFile) -> None:
 
 
 def restore(
-    criu: Criu, directory: Path, manifest: Manifest, shelter: str, *, log: int, timeout: float
+    criu: CriuBinary, directory: Path, manifest: Manifest, shelter: str, *, log: int, timeout: float
 ) -> int:
     """Restore the process as a descendant of the caller, and return its pid.
 

@@ -36,7 +36,7 @@ if not __package__:
 from rosrm.errors import CriuError
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm_criu.engine import image, process_tree, restore, restore_result
-from rosrm_criu.engine.binary import Criu, opened
+from rosrm_criu.engine.binary import CriuBinary, opened
 from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.restore_result import Outcome
 
@@ -129,7 +129,7 @@ def _start_anew(directory: Path, command: list[str]) -> NoReturn:
 class _Restore:
     """One restore: its inputs and its report."""
 
-    criu: Criu
+    criu: CriuBinary
     directory: Path
     manifest: Manifest
     here: Manifest

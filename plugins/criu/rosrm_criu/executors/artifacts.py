@@ -20,7 +20,7 @@ from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.paths import checkpoint, incoming, outgoing
 from rosrm_criu.engine.restore_result import Outcome
-from rosrm_criu.executors.request import Asked, without_log_names
+from rosrm_criu.executors.request import StepArguments, without_log_names
 from rosrm_criu.transfer import Fetcher, Sender
 
 Answer = Mapping[str, Any]
@@ -209,7 +209,7 @@ def _dismiss(number: int, fetcher: Fetcher) -> None:
     fetcher.close()
 
 
-def await_restored(asked: Asked) -> Outcome:
+def await_restored(asked: StepArguments) -> Outcome:
     """Wait until the received image is restored; then remove it, except the result of the restore.
 
     Raises:

@@ -23,7 +23,7 @@ from rosrm_criu.engine import dump, external_resources, image, process_tree, udp
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import checkpoint, checkpoint_numbers, checkpoint_ports, incoming
 from rosrm_criu.executors import artifacts
-from rosrm_criu.executors.request import Asked, check_wanted, turn_back, without_log_names
+from rosrm_criu.executors.request import StepArguments, check_wanted, turn_back, without_log_names
 from rosrm_criu.plans import KEEP, TAKE
 
 #: Sockets that reserve the ports of checkpointed processes, by the number of the instance.
@@ -38,16 +38,16 @@ _LOOK: Final = 0.005
 
 def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Dump the process into an image; the process stays stopped."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     return artifacts.once(KEEP, asked.attempt, lambda: _keep(asked))
 
 
-def _keep(asked: Asked) -> Mapping[str, Any]:
+def _keep(asked: StepArguments) -> Mapping[str, Any]:
     with artifacts.alone(asked.source, asked.timeout):
         return _keep_alone(asked)
 
 
-def _keep_alone(asked: Asked) -> Mapping[str, Any]:
+def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
     pid = asked.leader(asked.source)
     root = process_tree.root_of(pid)
     if process_tree.is_stopped(root):  # by an earlier call, whose slave was killed
@@ -75,7 +75,7 @@ def _keep_alone(asked: Asked) -> Mapping[str, Any]:
 
 def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Undo a failed checkpoint: continue the process, unless it has ended."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     turn_back(asked.attempt)
     artifacts.after(KEEP, asked.attempt, asked.timeout)
     _discard(asked.state, asked.source)
@@ -87,7 +87,7 @@ def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Kill the process after the commit, and reserve its ports for the image that owns the name."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     pid = asked.pid(asked.source)
     if pid:
         members = process_tree.tree(process_tree.root_of(pid))
@@ -106,7 +106,7 @@ def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Copy the image by hard links, for the start that follows."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     if asked.pid(asked.destination):
         return {"taken": True}  # an earlier call took it, and the restore is under way
     if artifacts.was_restored(incoming(asked.state, asked.destination)):
@@ -134,7 +134,7 @@ def _link(source: str, target: str) -> None:
 
 def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait until the image is restored, and remove it."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     found = artifacts.await_restored(asked)
     _discard(asked.state, asked.source)
     return {"seconds": {"restore": found.seconds}}
@@ -145,7 +145,7 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
     A restore under way is awaited, because it must not be killed while it may succeed.
     """
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     directory = incoming(asked.state, asked.destination)
     if not directory.exists():
         gone = not checkpoint(asked.state, asked.source).exists()

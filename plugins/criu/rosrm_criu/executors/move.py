@@ -27,12 +27,12 @@ from rosrm_criu.executors import artifacts, periodic
 from rosrm_criu.executors.artifacts import Answer
 from rosrm_criu.executors.checkpoint import reserve_all
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
-from rosrm_criu.executors.request import Asked, check_wanted, turn_back, without_log_names
+from rosrm_criu.executors.request import StepArguments, check_wanted, turn_back, without_log_names
 from rosrm_criu.plans import CHECKPOINT, FETCH, INTRODUCE
 from rosrm_criu.transfer import Offer, Sender, missing
 
 
-def say_ability(arguments: Answer) -> Answer:
+def report_capability(arguments: Answer) -> Answer:
     """Return the facts of this host that decide about restores; raise `CriuError` without CRIU.
 
     A slave gets this call after its registration, so the rest of its predecessor is removed here.
@@ -57,16 +57,16 @@ def checkpoint(arguments: Answer) -> Answer:
 
     The node is frozen from then on; after any failure it is asked to continue.
     """
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     return artifacts.once(CHECKPOINT, asked.attempt, lambda: _checkpoint(asked))
 
 
-def _checkpoint(asked: Asked) -> Answer:
+def _checkpoint(asked: StepArguments) -> Answer:
     with artifacts.alone(asked.source, asked.timeout):
         return _checkpoint_alone(asked)
 
 
-def _checkpoint_alone(asked: Asked) -> Answer:
+def _checkpoint_alone(asked: StepArguments) -> Answer:
     pid = asked.leader(asked.source)
     control = control_of(pid)
     try:
@@ -95,7 +95,7 @@ def go_on(arguments: Answer) -> Answer:
 
     If the node has ended since, its restart policy applies.
     """
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     turn_back(asked.attempt)
     artifacts.after(CHECKPOINT, asked.attempt, asked.timeout)
     artifacts.withdraw(asked.state, asked.source)
@@ -116,7 +116,7 @@ def go_on(arguments: Answer) -> Answer:
 
 def end(arguments: Answer) -> Answer:
     """Remove the rest of the source after the commit to the destination."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     artifacts.withdraw(asked.state, asked.source)
     pid = asked.pid(asked.source)
     if pid:
@@ -129,7 +129,7 @@ def end(arguments: Answer) -> Answer:
     return {}
 
 
-def _dump(pid: int, asked: Asked) -> Path:
+def _dump(pid: int, asked: StepArguments) -> Path:
     directory = outgoing(asked.state, asked.source)
     artifacts.discard(directory)
     check_wanted(asked.attempt)
@@ -142,7 +142,7 @@ def _dump(pid: int, asked: Asked) -> Path:
     return directory
 
 
-def _offer(sender: Sender, directory: Path, asked: Asked) -> Offer:
+def _offer(sender: Sender, directory: Path, asked: StepArguments) -> Offer:
     seconds = float(asked.arguments["seconds"]["offer"])
     check_wanted(asked.attempt)
     offer = sender.offer(
@@ -158,7 +158,7 @@ def _offer(sender: Sender, directory: Path, asked: Asked) -> Offer:
 
 def introduce(arguments: Answer) -> Answer:
     """Prepare the fetch before the node is frozen; return the only certificate that may fetch."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     named = arguments.get("working_directory")
     if named and not Path(named).expanduser().is_dir():
         raise CriuError(f"its working directory {named} does not exist on {asked.host}: make it")
@@ -168,11 +168,11 @@ def introduce(arguments: Answer) -> Answer:
 
 def fetch_image(arguments: Answer) -> Answer:
     """Fetch the image to this host, for the start that follows."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     return artifacts.once(FETCH, asked.attempt, lambda: _fetch(asked))
 
 
-def _fetch(asked: Asked) -> Answer:
+def _fetch(asked: StepArguments) -> Answer:
     told = asked.results[CHECKPOINT]
     uid, control = int(told["uid"]), Path(told["control"])
     if control != control_directory(control.name, uid):
@@ -200,7 +200,7 @@ def _fetch(asked: Asked) -> Answer:
 
 def await_restored(arguments: Answer) -> Answer:
     """Wait until the image is restored; remove an image whose restore fails."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     try:
         found = artifacts.await_restored(asked)
     except CriuError:
@@ -211,7 +211,7 @@ def await_restored(arguments: Answer) -> Answer:
 
 def join(arguments: Answer) -> Answer:
     """Make the node rejoin the ROS graph here; kill one that never can, for its restart policy."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     pid = asked.pid(asked.destination)
     root, began = process_tree.root_of(pid), time.monotonic()
     try:

@@ -23,7 +23,7 @@ from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.slots import Rejoin
 from rosrm_criu.executors import artifacts
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
-from rosrm_criu.executors.request import Asked, without_log_names
+from rosrm_criu.executors.request import StepArguments, without_log_names
 
 #: File beside the images of an instance, with the id of its departure while the node is away.
 _AWAY: Final = "away"
@@ -34,7 +34,7 @@ _LOOK: Final = 0.01
 
 def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Make the node leave, dump it, and make it rejoin."""
-    asked = Asked.of(arguments)
+    asked = StepArguments.of(arguments)
     parent = paths.periodic(asked.state, asked.source)
     with artifacts.alone(asked.source, asked.timeout):
         try:
@@ -50,7 +50,7 @@ def why_not_written(parent: Path, error: OSError) -> str:
     return f"no image can be made in {parent}: {error.strerror}"
 
 
-def _dump(asked: Asked, parent: Path) -> Mapping[str, Any]:
+def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
     pid = asked.leader(asked.source)
     control, root = control_of(pid), process_tree.root_of(pid)
     for directory in (parent.parent, parent):
@@ -80,7 +80,7 @@ def _dump(asked: Asked, parent: Path) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-def _dump_away(asked: Asked, pid: int, control: Path, slot: Path) -> tuple[Manifest, float]:
+def _dump_away(asked: StepArguments, pid: int, control: Path, slot: Path) -> tuple[Manifest, float]:
     """Dump the node; return the manifest and the time of departure. The node always rejoins."""
     try:
         leave(pid, control, asked.attempt, _seconds(asked, "leave"))
@@ -101,7 +101,7 @@ def _add_checksums(slot: Path, manifest: Manifest) -> None:
     image.write(slot, replace(manifest, checksums=checksums))
 
 
-def _seconds(asked: Asked, part: str) -> float:
+def _seconds(asked: StepArguments, part: str) -> float:
     return float(asked.arguments["seconds"][part])
 
 

@@ -21,7 +21,7 @@ _turning: Final = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Asked:
+class StepArguments:
     """Arguments of every step.
 
     Attributes:
@@ -50,7 +50,7 @@ class Asked:
     arguments: Mapping[str, Any]
 
     @classmethod
-    def of(cls, arguments: Mapping[str, Any]) -> Asked:
+    def of(cls, arguments: Mapping[str, Any]) -> StepArguments:
         """Return the arguments that the slave passed, parsed."""
         here = arguments["here"]
         return cls(

@@ -21,7 +21,7 @@ _LOOK: Final = 0.005
 
 
 @dataclass(frozen=True)
-class Declared:
+class DeclaredParameter:
     """A parameter with its current value and its descriptor."""
 
     parameter: Parameter
@@ -46,7 +46,7 @@ class Departure:
         others: numbers of other nodes' endpoints on its topics, and of servers of its clients.
     """
 
-    parameters: Mapping[str, Declared]
+    parameters: Mapping[str, DeclaredParameter]
     timers: tuple[tuple[int, int], ...]
     peers: Mapping[str, int]
     others: Mapping[tuple[str, str], int]
@@ -107,7 +107,7 @@ def _first_in(one: TimerOf, due_ns: int) -> None:
 def departure_of(node: Any) -> Departure:
     """Return the state of a node, between two of its callbacks."""
     parameters = {
-        name: Declared(parameter, node.describe_parameter(name))
+        name: DeclaredParameter(parameter, node.describe_parameter(name))
         for name, parameter in node.get_parameters_by_prefix("").items()
     }
     timers = tuple((one.timer_period_ns, TimerOf(one, True).due_ns()) for one in node.timers)

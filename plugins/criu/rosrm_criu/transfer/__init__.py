@@ -16,7 +16,7 @@ If the stream breaks, the fetch fails, both sides remove what they have, and the
 docs/decisions/0041-one-tls-stream.md gives the reasons for this design.
 """
 
-from rosrm_criu.transfer.form import Fetched, Offer, Sent
+from rosrm_criu.transfer.form import Fetched, Offer, OfferResult
 from rosrm_criu.transfer.starting import DEFAULT_RATE, DEFAULT_RESERVE, Fetcher, Sender, missing
 
 __all__ = [
@@ -25,7 +25,7 @@ __all__ = [
     "Fetched",
     "Fetcher",
     "Offer",
+    "OfferResult",
     "Sender",
-    "Sent",
     "missing",
 ]

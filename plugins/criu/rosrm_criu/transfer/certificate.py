@@ -21,7 +21,7 @@ _TO: Final = dt.datetime(9999, 12, 31, tzinfo=dt.timezone.utc)
 
 
 @dataclass(frozen=True)
-class Identity:
+class TlsIdentity:
     """A certificate and its key, in memory only.
 
     Attributes:
@@ -43,7 +43,7 @@ class Identity:
             context.load_cert_chain(f"/proc/self/fd/{memory}")
 
 
-def new_identity() -> Identity:
+def new_identity() -> TlsIdentity:
     """Create a new identity."""
     key = ec.generate_private_key(ec.SECP256R1())
     # The name is unique; otherwise a peer would take one certificate for the signer of another.
@@ -65,7 +65,7 @@ def new_identity() -> Identity:
         serialization.NoEncryption(),
     )
     shown = certificate.public_bytes(serialization.Encoding.PEM).decode()
-    return Identity(certificate=shown, fingerprint=fingerprint_of(shown), key=private)
+    return TlsIdentity(certificate=shown, fingerprint=fingerprint_of(shown), key=private)
 
 
 def fingerprint_of(certificate: str) -> str:

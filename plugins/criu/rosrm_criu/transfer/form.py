@@ -112,7 +112,7 @@ def _is_address(text: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Sent:
+class OfferResult:
     """Result of an offer.
 
     Attributes:

@@ -21,7 +21,7 @@ from rosrm.runtime.disk_space import room_for
 _PREFIX: Final = ".rosrm-fetch-"
 
 
-class Landing:
+class StagingDirectory:
     """A new directory beside the target; it is removed at the end, unless it became the target.
 
     Args:

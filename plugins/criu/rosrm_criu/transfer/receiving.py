@@ -17,10 +17,10 @@ from rosrm.runtime.disk_space import room_for
 from rosrm_criu.transfer.addresses import nearest_first
 from rosrm_criu.transfer.archive import Unpacker
 from rosrm_criu.transfer.form import PART_HEAD, TAKEN, Fetched, Offer
-from rosrm_criu.transfer.landing import Landing
+from rosrm_criu.transfer.landing import StagingDirectory
 
 if TYPE_CHECKING:
-    from rosrm_criu.transfer.certificate import Identity
+    from rosrm_criu.transfer.certificate import TlsIdentity
 
 #: Seconds for one address to answer.
 _CONNECT: Final = 2.0
@@ -52,7 +52,7 @@ class _Stream:
         TransferError: the source cannot be reached.
     """
 
-    def __init__(self, offer: Offer, *, timeout: float, identity: Identity) -> None:
+    def __init__(self, offer: Offer, *, timeout: float, identity: TlsIdentity) -> None:
         self._offer = offer
         self._timeout = timeout
         self._deadline = time.monotonic() + timeout
@@ -154,7 +154,7 @@ class _AnotherServer(Exception):
 
 
 def receive(
-    offer: Offer, target: Path, *, timeout: float, reserve: int, identity: Identity,
+    offer: Offer, target: Path, *, timeout: float, reserve: int, identity: TlsIdentity,
     before_placing: Callable[[], None],
 ) -> Fetched:  # fmt: skip
     """Fetch a directory.
@@ -173,7 +173,7 @@ def receive(
     began = time.monotonic()
     if identity.fingerprint != offer.to:
         raise TransferError("what is offered is for another destination than this one")
-    with contextlib.closing(Landing(target)) as landing:
+    with contextlib.closing(StagingDirectory(target)) as landing:
         landing.require(offer.length + offer.files * _ROUNDING, reserve)
         with contextlib.closing(_Stream(offer, timeout=timeout, identity=identity)) as stream:
             checksum = _unpack(stream, offer, landing.path, target)
@@ -211,7 +211,7 @@ def _unpack(stream: _Stream, offer: Offer, directory: Path, target: Path) -> str
     return checksum
 
 
-def _context(identity: Identity) -> ssl.SSLContext:
+def _context(identity: TlsIdentity) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.check_hostname = False  # the fingerprint is compared before anything is sent

@@ -21,8 +21,8 @@ from typing import Final, Literal
 from rosrm.errors import TransferError
 from rosrm_criu.transfer.addresses import own_addresses
 from rosrm_criu.transfer.archive import Archive
-from rosrm_criu.transfer.certificate import Identity, fingerprint_of, new_identity
-from rosrm_criu.transfer.form import PART_HEAD, TAKEN, Offer, Sent
+from rosrm_criu.transfer.certificate import TlsIdentity, fingerprint_of, new_identity
+from rosrm_criu.transfer.form import PART_HEAD, TAKEN, Offer, OfferResult
 
 _LOOPBACK: Final = "127.0.0.1"
 #: Seconds for a reader to complete the TLS handshake and to send the token.
@@ -33,7 +33,7 @@ _SLACK: Final = 0.05
 _LONGEST: Final = 256
 
 
-class Pace:
+class RateLimiter:
     """Rate limiter that spreads bytes evenly over time, so that others can use the network too.
 
     Args:
@@ -78,7 +78,7 @@ class _Server:
     ) -> None:
         self._archive = archive
         self._context = context
-        self._pace = Pace(max_rate)
+        self._pace = RateLimiter(max_rate)
         self._over = over
         self._listener = socket.create_server(("", 0))
         self._admitting = threading.Lock()
@@ -157,7 +157,7 @@ def _say_fault(connection: ssl.SSLSocket, why: str) -> None:
     connection.sendall(bytes(PART_HEAD) + why.encode(errors="replace"))
 
 
-def _context(identity: Identity, to: str) -> ssl.SSLContext:
+def _context(identity: TlsIdentity, to: str) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     identity.load_into(context)
@@ -169,7 +169,7 @@ def _context(identity: Identity, to: str) -> ssl.SSLContext:
 def serve(
     directory: Path, *, seconds: float, max_rate: float, to: str,
     announce: Callable[[Offer], None], over: threading.Event,
-) -> Sent:  # fmt: skip
+) -> OfferResult:  # fmt: skip
     """Offer a directory, and wait for the end of the offer.
 
     Args:
@@ -209,4 +209,4 @@ def serve(
         outcome = server.outcome or ("withdrawn" if was_set else "expired")
     finally:
         server.close()
-    return Sent(outcome, server.sent)
+    return OfferResult(outcome, server.sent)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.errors import TransferError
-from rosrm_criu.transfer.form import Fetched, Offer, Sent
+from rosrm_criu.transfer.form import Fetched, Offer, OfferResult
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -137,7 +137,7 @@ class Sender(_End):
 
     def __init__(self) -> None:
         super().__init__("send")
-        self._sent: Sent | None = None
+        self._sent: OfferResult | None = None
 
     def offer(
         self, directory: Path, *, seconds: float, to: str, max_rate: float = DEFAULT_RATE
@@ -160,7 +160,7 @@ class Sender(_End):
         }  # fmt: skip
         return Offer.from_json(self._ask(asked, _START))
 
-    def wait(self, timeout: float) -> Sent | None:
+    def wait(self, timeout: float) -> OfferResult | None:
         """Return the result of the offer; None: it still stands after `timeout` seconds."""
         try:
             self._process.wait(timeout)
@@ -168,7 +168,7 @@ class Sender(_End):
             return None
         return self.close()
 
-    def close(self) -> Sent:
+    def close(self) -> OfferResult:
         """End the offer, if it still stands, and return its result."""
         self._end()
         with self._closing:
@@ -176,12 +176,12 @@ class Sender(_End):
                 self._sent = self._read_sent()
         return self._sent
 
-    def _read_sent(self) -> Sent:
+    def _read_sent(self) -> OfferResult:
         assert self._process.stdout is not None
         with self._process.stdout as output, contextlib.suppress(ValueError, TypeError, KeyError):
             told = json.loads(output.readline())
-            return Sent(told["outcome"], told["bytes"])
-        return Sent("failed", 0)
+            return OfferResult(told["outcome"], told["bytes"])
+        return OfferResult("failed", 0)
 
 
 class Fetcher(_End):

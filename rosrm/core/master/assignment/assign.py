@@ -40,7 +40,7 @@ def demand_of(state: MasterState, process: Process) -> Demand:
     Changes that count: the learned needs, and the hosts with a replica of the snapshot.
     """
     version = state.learned.version
-    near = state.keeping.holdings.hosts_of(process.name, process.born)
+    near = state.replication.replicas.hosts_of(process.name, process.born)
     known = process.demand
     if known is None or known[0] != version or known[1].near != near:
         estimate = state.learned.estimate(process.spec, state.settings.default_needs)
@@ -66,17 +66,17 @@ def demand_to_move(
         source: "it is the source of the move",
     }  # fmt: skip
     return Demand(
-        process.spec, *amounts_of(state, process, seen), excluded, headroom,
+        process.spec, *demand_amounts(state, process, seen), excluded, headroom,
         reads=state.declared.reads,
     )  # fmt: skip
 
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
     """Return the demand of a process on the host of its image, where it is to be restored."""
-    return Demand(process.spec, *amounts_of(state, process, seen), reads=state.declared.reads)
+    return Demand(process.spec, *demand_amounts(state, process, seen), reads=state.declared.reads)
 
 
-def amounts_of(
+def demand_amounts(
     state: MasterState, process: Process, seen: Mapping[str, float]
 ) -> tuple[Mapping[str, float], frozenset[str]]:
     """Return the amount that a process needs of each resource, and the resources that are guessed.
@@ -165,7 +165,7 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     names = (name for name in state.queue if awaits_states(state, state.processes[name], now))
     passed_over = frozenset(names)
     for name in passed_over:
-        _tell_waits(state, state.processes[name], _STATE_MAY_COME, now)
+        _record_wait_reason(state, state.processes[name], _STATE_MAY_COME, now)
     return passed_over
 
 
@@ -213,7 +213,7 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     if never:
         _set_aside(state, process, never, now)
         return True
-    _tell_waiting(state, process, demand, now)
+    _record_waiting(state, process, demand, now)
     return False
 
 
@@ -224,7 +224,7 @@ def _assign(
     host = state.hosts.hosts[column]
     instance = state.new_instance_id(process)
     state.queue.remove(process.name)
-    state.charge_ranked(instance, host, now, ranking)
+    state.reserve_ranked(instance, host, now, ranking)
     ranking.took()
     process.owner, process.left_behind, process.exit_code = instance.number, None, None
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
@@ -296,18 +296,18 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
         state.save(process)
 
 
-def _tell_waiting(state: MasterState, process: Process, demand: Demand, now: float) -> None:
+def _record_waiting(state: MasterState, process: Process, demand: Demand, now: float) -> None:
     """Record once that the head of the queue waits, and the reason."""
     if not state.hosts.listed():
-        _tell_waits(state, process, "no host has registered yet", now)
+        _record_wait_reason(state, process, "no host has registered yet", now)
         return
     reason = why_all_away(state.hosts, demand) or "no host can take it now"
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
-        _tell_waits(state, process, reason, now, {"decision": process.decision})
+        _record_wait_reason(state, process, reason, now, {"decision": process.decision})
 
 
-def _tell_waits(
+def _record_wait_reason(
     state: MasterState, process: Process, reason: str, now: float,
     facts: Mapping[str, Any] = EMPTY,
 ) -> None:  # fmt: skip

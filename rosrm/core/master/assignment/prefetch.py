@@ -38,7 +38,7 @@ def review_slots(state: MasterState, host: Host, now: float) -> None:
     running = [
         instance
         for instance in (state.instances[number] for number in host.instances)
-        if instance.runs
+        if instance.is_running
     ]
     ahead = len(running) >= most and all(_ends_soon(state, one, now) for one in running)
     state.hosts.set_bound(host, most + ahead)

@@ -14,22 +14,22 @@ from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
 _TELLING_RUN: Final = 1.0
 
 
-def settle_charge(state: MasterState, instance: Instance, now: float) -> None:
+def settle_reservation(state: MasterState, instance: Instance, now: float) -> None:
     """Lower the reservation of an instance to the part that the readings do not show yet."""
     table = state.hosts
     instance.settled = now - instance.since >= state.settings.settle
     left = {}
-    for resource, amount in instance.amounts.items():
+    for resource, amount in instance.demand.items():
         hidden = amount - instance.seen.get(resource, 0.0)
         if hidden > 0.0 and not (instance.settled and resource in instance.estimated):
             left[resource] = hidden
     need = table.fractions_of(instance.host, left, instance.estimated)
     need = np.where(need < np.inf, need, 0.0)
     change = need.copy()
-    change[: len(instance.charged)] -= instance.charged
+    change[: len(instance.reserved)] -= instance.reserved
     if np.any(change):
-        instance.charged = need
-        table.charge(instance.host, change)
+        instance.reserved = need
+        table.add_reservation(instance.host, change)
 
 
 def learn_from(

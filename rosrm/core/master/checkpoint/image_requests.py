@@ -14,13 +14,13 @@ from rosrm.core.master.checkpoint import images
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.start import destination_node, proposed, why_busy, why_no_executor
-from rosrm.core.master.migration.steps import nobody_there, title
+from rosrm.core.master.migration.steps import instances_are_gone, title
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.scheduling.decision import verdict_of
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.migration import Run
-from rosrm.core.master.state.process import Image, Instance, Process, ProcessPhase, Wanted
+from rosrm.core.master.state.migration import Migration
+from rosrm.core.master.state.process import DesiredState, Image, Instance, Process, ProcessPhase
 from rosrm.extensions.contracts import Imaging
 from rosrm.extensions.plugin_calls import implements
 from rosrm.model.event_kinds import EventKind
@@ -60,8 +60,8 @@ def begin_checkpoint(
 
 
 def _why_no_checkpoint(state: MasterState, process: Process) -> str:
-    if process.name in state.runs:
-        return why_busy(state.runs[process.name])
+    if process.name in state.migrations:
+        return why_busy(state.migrations[process.name])
     if process.phase is ProcessPhase.CHECKPOINTED:
         return f"{process.name} is checkpointed already: {images.reason_of(state, process)}"
     if process.phase is not ProcessPhase.RUNNING:
@@ -130,8 +130,8 @@ def begin_restore(state: MasterState, process: Process, cause: str, now: float) 
 
 
 def _why_no_restore(state: MasterState, process: Process) -> str:
-    if process.name in state.runs:
-        return why_busy(state.runs[process.name])
+    if process.name in state.migrations:
+        return why_busy(state.migrations[process.name])
     image = process.image
     if image is None or process.phase is not ProcessPhase.CHECKPOINTED:
         stands = standing(process.phase.value)
@@ -177,19 +177,20 @@ def _begin(
     if isinstance(plan, Rejected):
         return plan
     host = state.hosts.by_name[move.source_host]
-    run = Run(
+    migration = Migration(
         process.name, plan, strategy, move.source, host, move.destination, host, cause, now,
         move.source_node, destination_node(plan, move), state.wall, aim=aim,
     )  # fmt: skip
-    lacking = why_no_executor(state, run)
+    lacking = why_no_executor(state, migration)
     if lacking:
         return Rejected(lacking)
-    state.runs[process.name] = run
+    state.migrations[process.name] = migration
     if ranking is not None:
-        state.charge_ranked(run.destination, host, now, ranking)
-    state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
+        state.reserve_ranked(migration.destination, host, now, ranking)
+    state.set_phase(process, ProcessPhase.MIGRATING, now, migration.progress_text)
     state.record(
-        now, _BEGUN[aim], f"{process.name}: {run.course}; {cause}", process=process.name,
+        now, _BEGUN[aim], f"{process.name}: {migration.progress_text}; {cause}",
+        process=process.name,
         host=host.name,
         facts={
             "strategy": strategy, "cause": cause, "steps": [title(step) for step in plan.steps],
@@ -197,80 +198,85 @@ def _begin(
         },
     )  # fmt: skip
     state.save(process)
-    state.save_run(run)
+    state.save_migration(migration)
     return None
 
 
-def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit) -> None:
+def commit_to_image(
+    state: MasterState, process: Process, migration: Migration, step: Commit
+) -> None:
     """Make the image the owner of the name; its source stays frozen."""
-    source: Instance | None = state.instances.get(run.source.number)
+    source: Instance | None = state.instances.get(migration.source.number)
     needs = {} if source is None else source.measured
     image = Image(
-        run.source.number, run.source_host.name, run.strategy, step.image, state.wall,
-        "" if run.source_node == process.name else run.source_node, needs,
+        migration.source.number, migration.source_host.name, migration.strategy, step.image,
+        state.wall,
+        "" if migration.source_node == process.name else migration.source_node, needs,
     )  # fmt: skip
     process.owner = 0
     images.set_image(state, process, image)
 
 
-def leave_behind(state: MasterState, run: Run, step: Execute) -> bool:
+def leave_behind(state: MasterState, migration: Migration, step: Execute) -> bool:
     """Return True if a plan that may not stop can skip an executor, because nothing needs the step.
 
     Anything frozen on that host is still frozen. When the host returns, it is
     killed, not re-adopted.
     """
-    if run.aim is Aim.CHECKPOINT:
-        if run.undo is None or run.source.number not in run.ended:
+    if migration.aim is Aim.CHECKPOINT:
+        if migration.undo is None or migration.source.number not in migration.ended:
             return False
-        _remove_unmade(state, run)
-    elif not nobody_there(state, run, step):
+        _remove_unmade(state, migration)
+    elif not instances_are_gone(state, migration, step):
         return False
-    process = state.processes[run.process]
+    process = state.processes[migration.process]
     if process.left_behind is not None and process.left_behind.host == step.host:
         process.left_behind = None
         state.save(process)
     return True
 
 
-def _remove_unmade(state: MasterState, run: Run) -> None:
+def _remove_unmade(state: MasterState, migration: Migration) -> None:
     """Remove the partial image that an undone checkpoint may have left on its host."""
-    commit = run.plan.steps[run.commit_index]
+    commit = migration.plan.steps[migration.commit_index]
     if isinstance(commit, Commit):
-        number = run.source.number
-        images.remove(state, run.process, run.source_host.name, commit.image, number)
+        number = migration.source.number
+        images.remove(state, migration.process, migration.source_host.name, commit.image, number)
 
 
-def settle(state: MasterState, process: Process, run: Run, now: float) -> None:
+def settle(state: MasterState, process: Process, migration: Migration, now: float) -> None:
     """Set the phase after a plan that ends with an image; drop the image of a cancelled process."""
-    if process.wanted is Wanted.CANCEL:
-        images.drop(state, process, run.destination.number)
+    if process.wanted is DesiredState.CANCEL:
+        images.drop(state, process, migration.destination.number)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(
             now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
             process=process.name,
         )  # fmt: skip
     else:
-        process.wanted = Wanted.RUN
-        trouble = f"it was not restored: {run.failure}" if run.aim is Aim.RESTORE else ""
+        process.wanted = DesiredState.RUN
+        trouble = (
+            f"it was not restored: {migration.failure}" if migration.aim is Aim.RESTORE else ""
+        )
         images.note_checkpointed(state, process, now, trouble)
     state.save(process)
 
 
-def ending_of(run: Run) -> tuple[EventKind, str]:
+def ending_of(migration: Migration) -> tuple[EventKind, str]:
     """Return the kind and the message of the record that marks the end of a plan."""
-    name, done = run.process, run.undo is None
-    here, there = run.source_host.name, run.destination_host.name
-    if run.aim is Aim.CHECKPOINT:
+    name, done = migration.process, migration.undo is None
+    here, there = migration.source_host.name, migration.destination_host.name
+    if migration.aim is Aim.CHECKPOINT:
         if done:
             return EventKind.CHECKPOINTED, f"{name} is checkpointed: its image is on {here}"
         return (
             EventKind.CHECKPOINT_FAILED,
-            f"{name} was not checkpointed and still runs on {here}: {run.failure}",
+            f"{name} was not checkpointed and still runs on {here}: {migration.failure}",
         )
-    if run.aim is Aim.RESTORE:
+    if migration.aim is Aim.RESTORE:
         if done:
             return EventKind.RESTORED, f"{name} was restored from its image on {here}"
-        return EventKind.RESTORE_FAILED, f"{name} stays checkpointed on {here}: {run.failure}"
+        return EventKind.RESTORE_FAILED, f"{name} stays checkpointed on {here}: {migration.failure}"
     if done:
         return EventKind.MIGRATED, f"{name} moved from {here} to {there}"
-    return EventKind.STAYED, f"{name} stayed on {here}: {run.failure}"
+    return EventKind.STAYED, f"{name} stayed on {here}: {migration.failure}"

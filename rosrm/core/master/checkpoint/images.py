@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.state.hosts import HostCondition
-from rosrm.core.master.state.images import Unwanted
+from rosrm.core.master.state.images import UnwantedImage
 from rosrm.core.master.state.pending_orders import ImageRemoval
 from rosrm.core.master.state.process import Image, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
@@ -90,8 +90,8 @@ def drop(state: MasterState, process: Process, *numbers: int) -> None:
 def remove(
     state: MasterState, process: str, host: str, drop: str, number: int, *numbers: int
 ) -> None:
-    """Have an image removed once its host is up; the arguments are those of `Unwanted`."""
-    state.images.unwanted[number] = Unwanted(process, host, drop, (number, *numbers))
+    """Have an image removed once its host is up; the arguments are those of `UnwantedImage`."""
+    state.images.unwanted[number] = UnwantedImage(process, host, drop, (number, *numbers))
     _save(state)
 
 
@@ -147,5 +147,5 @@ def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> Non
         cluster: the journal's table of that name.
     """
     for number, one in cluster.get(_KEY, {}).items():
-        known = fields_from_plain(Unwanted, one, _JOURNALED)
-        state.images.unwanted[int(number)] = Unwanted(**known)
+        known = fields_from_plain(UnwantedImage, one, _JOURNALED)
+        state.images.unwanted[int(number)] = UnwantedImage(**known)

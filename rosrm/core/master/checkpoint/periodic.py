@@ -46,9 +46,9 @@ _PATIENCE: Final = 30.0
 def review(state: MasterState, now: float) -> None:
     """Order due dumps and remove the images of ended instances, once a second."""
     known = state.periodic
-    if now - known.looked < _LOOK_EVERY:
+    if now - known.reviewed_at < _LOOK_EVERY:
         return
-    known.looked = now
+    known.reviewed_at = now
     for number in [number for number in known.of if number not in state.instances]:
         if _remove(state, number, known.of[number]):
             del known.of[number]
@@ -96,11 +96,11 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         return
     pace = _pace(state, process, strategy, host, dumped)
     if isinstance(pace, Rejected):
-        _say_trouble(state, dumped, pace.reason, now)
+        _record_trouble(state, dumped, pace.reason, now)
     elif pace is not None and now >= dumped.since + pace:
         trouble = capabilities.fault(state, process.spec.migration.strategy or "", host, host)
         if trouble:
-            _say_trouble(state, dumped, trouble, now)
+            _record_trouble(state, dumped, trouble, now)
         else:
             _order(state, process, strategy, owner, dumped, now)
 
@@ -121,9 +121,9 @@ def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> boo
     """Return True if a process runs, its host is up, and no plan or stop is under way."""
     return (
         process.phase is ProcessPhase.RUNNING
-        and owner.runs
+        and owner.is_running
         and not owner.stopping
-        and process.name not in state.runs
+        and process.name not in state.migrations
         and state.hosts.condition_of(owner.host) is HostCondition.UP
     )
 
@@ -132,7 +132,7 @@ def _pace(
     state: MasterState, process: Process, strategy: PeriodicImaging, host: Host, dumped: Dumped
 ) -> float | Rejected | None:
     """Return the seconds between two dumps; None: no dump is wanted."""
-    policy, name = state.keeping.policy, state.keeping.policy_name
+    policy, name = state.replication.policy, state.replication.policy_name
     if policy is None:
         return Rejected("no checkpoint policy is selected: name one in the cluster's file")
     if not implements(policy, MemoryPacing):
@@ -173,7 +173,7 @@ def _order(
     try:
         step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask)
     except PluginError as error:
-        _say_trouble(state, dumped, str(error), now)
+        _record_trouble(state, dumped, str(error), now)
         return
     dump = RunExecutor(step.executor, step.arguments, step.timeout)
     dumped.order = state.send(owner.host, dump, PeriodicCheckpoint(owner.id.number))
@@ -186,15 +186,15 @@ def _order(
 def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
     dumped.order, dumped.since = None, now
     if not event.accepted:
-        _say_trouble(state, dumped, event.message or event.code, now)
+        _record_trouble(state, dumped, event.message or event.code, now)
         return
     result = event.result or {}
     dumped.size = int(_number(result.get("size")))
     parts = result.get("seconds")
     dumped.pause = sum(map(_number, parts.values())) if isinstance(parts, Mapping) else 0.0
-    told = dumped.made and not dumped.trouble
+    recorded = dumped.made and not dumped.trouble
     dumped.made, dumped.trouble = True, ""
-    if not told:
+    if not recorded:
         state.record(
             now, EventKind.PERIODIC_CHECKPOINT,
             f"the first periodic checkpoint of {dumped.process} is made ({size(dumped.size)}, "
@@ -208,7 +208,7 @@ def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) else 0.0
 
 
-def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
+def _record_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
     """Record a failure of periodic checkpoints, once until the reason changes."""
     if trouble == dumped.trouble:
         return

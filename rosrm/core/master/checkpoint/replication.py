@@ -33,13 +33,13 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.pending_orders import Replication
-from rosrm.core.master.state.replicas import Holding, Told
+from rosrm.core.master.state.replicas import Replica, ReplicationOrder
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.extensions.plugin_calls import required
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import DropReplica, ReplicateSnapshot
-from rosrm.model.values import InstanceId, KeptState
+from rosrm.model.values import InstanceId, SnapshotReport
 
 #: Seconds between two reviews of the same process.
 _LOOK_EVERY: Final = 1.0
@@ -61,11 +61,13 @@ def kept_states_received(
         note_states(state, host, event.states, now)
 
 
-def note_states(state: MasterState, host: Host, states: tuple[KeptState, ...], now: float) -> None:
+def note_states(
+    state: MasterState, host: Host, states: tuple[SnapshotReport, ...], now: float
+) -> None:
     """Replace the known replicas of a host by its complete report."""
     # The journal may be lost: no instance may get a number that a snapshot has already.
     state.skip_numbers(max((one.instance.number for one in states), default=0))
-    state.keeping.holdings.replace(host.name, states, now)
+    state.replication.replicas.replace(host.name, states, now)
 
 
 def awaits_states(state: MasterState, process: Process, now: float) -> bool:
@@ -79,9 +81,9 @@ def awaits_states(state: MasterState, process: Process, now: float) -> bool:
         return False
     if (state.hosts.condition == HostCondition.EXPECTED).any():
         return True
-    return not state.keeping.in_reach(process.name, process.born, state.hosts) and any(
+    return not state.replication.in_reach(process.name, process.born, state.hosts) and any(
         _may_come_back(state, state.hosts.by_name[name], now)
-        for name in state.keeping.holdings.hosts_of(process.name, process.born)
+        for name in state.replication.replicas.hosts_of(process.name, process.born)
         if name in state.hosts.by_name and not _was_left_on(process, name)
     )
 
@@ -101,9 +103,9 @@ def _was_left_on(process: Process, host: str) -> bool:
 
 def note_answer(state: MasterState, process: str, event: happened.OrderAnswered) -> None:
     """Note that a slave has accepted or refused the newest choice for a process."""
-    told = state.keeping.told.get(process)
+    told = state.replication.last_orders.get(process)
     if told is not None and told.order == event.order:
-        told.taken = event.accepted
+        told.accepted = event.accepted
 
 
 # --- requests -------------------------------------------------------------------------------
@@ -120,21 +122,21 @@ def begin_anew(state: MasterState, process: Process) -> None:
 
 def review(state: MasterState, now: float) -> None:
     """Review a share of the processes with replicas, so that each is reviewed once a second."""
-    keeping = state.keeping
-    names = keeping.holdings.processes()
-    if len(keeping.dropped_at) > _REMEMBERED:
-        keeping.dropped_at.clear()
-    share = min(1.0, (now - keeping.looked) / _LOOK_EVERY)
-    keeping.looked = now
-    if not keeping.waiting:
-        keeping.waiting = names[::-1]
+    replication_state = state.replication
+    names = replication_state.replicas.processes()
+    if len(replication_state.dropped_at) > _REMEMBERED:
+        replication_state.dropped_at.clear()
+    share = min(1.0, (now - replication_state.reviewed_at) / _LOOK_EVERY)
+    replication_state.reviewed_at = now
+    if not replication_state.waiting:
+        replication_state.waiting = names[::-1]
     for _ in range(math.ceil(share * len(names))):
-        if not keeping.waiting:
+        if not replication_state.waiting:
             return
-        name = keeping.waiting.pop()
+        name = replication_state.waiting.pop()
         process = state.processes.get(name)
         if process is None:
-            keeping.told.pop(name, None)
+            replication_state.last_orders.pop(name, None)
             _drop_removed(state, name, now)
         else:
             _review(state, process, now)
@@ -142,31 +144,33 @@ def review(state: MasterState, now: float) -> None:
 
 def _drop_removed(state: MasterState, name: str, now: float) -> None:
     """Drop every replica of a process that was removed and is not known again."""
-    end = state.keeping.removed.get(name, 0)
-    for host, holding in state.keeping.holdings.of(name).items():
-        if holding.number < end:
-            _drop(state, name, host, holding, now)
+    end = state.replication.removed.get(name, 0)
+    for host, replica in state.replication.replicas.of(name).items():
+        if replica.number < end:
+            _drop(state, name, host, replica, now)
 
 
 def _review(state: MasterState, process: Process, now: float) -> None:
-    holdings = state.keeping.holdings.of(process.name)
+    replicas = state.replication.replicas.of(process.name)
     owner = state.instances.get(process.owner)
-    if owner is not None and owner.runs and process.phase is ProcessPhase.RUNNING:
-        _choose(state, process, owner.host, holdings, now)
-    for name, holding in holdings.items():
-        if _is_stale(state, process, name, holding, holdings):
-            _drop(state, process.name, name, holding, now)
+    if owner is not None and owner.is_running and process.phase is ProcessPhase.RUNNING:
+        _choose(state, process, owner.host, replicas, now)
+    for name, replica in replicas.items():
+        if _is_stale(state, process, name, replica, replicas):
+            _drop(state, process.name, name, replica, now)
 
 
 def _choose(
-    state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
+    state: MasterState, process: Process, host: Host, replicas: Mapping[str, Replica], now: float
 ) -> None:
     """Ask the policy, and send its choice to the slave if it is new there."""
-    choice = _choice(state, process, host, holdings, now)
-    told = state.keeping.told.get(process.name)
-    chosen = choice is not None or (told is not None and told.chosen)
+    choice = _choice(state, process, host, replicas, now)
+    told = state.replication.last_orders.get(process.name)
+    chosen = choice is not None or (told is not None and told.by_policy)
     if choice is None:
-        choice = told.choice if told is not None and chosen else _as_kept(process, host, holdings)
+        choice = (
+            told.choice if told is not None and chosen else _current_choice(process, host, replicas)
+        )
     if not chosen and not choice.hosts:
         return  # no other host has a replica, and the policy has chosen none
     incarnation = host.description.incarnation
@@ -176,13 +180,15 @@ def _choose(
         and _is_same(told.choice, choice)
     )  # fmt: skip
     if told is not None:
-        told.chosen = chosen
-    if told is not None and known and (told.taken or now - told.at < state.settings.order_retry):
+        told.by_policy = chosen
+    if told is not None and known and (told.accepted or now - told.at < state.settings.order_retry):
         return
     instance = InstanceId(process.name, process.owner)
     replicate = ReplicateSnapshot(instance, choice.hosts, choice.every)
     order = state.send(host, replicate, Replication(process.name))
-    state.keeping.told[process.name] = Told(process.owner, incarnation, choice, order, now, chosen)
+    state.replication.last_orders[process.name] = ReplicationOrder(
+        process.owner, incarnation, choice, order, now, chosen
+    )
     if not known and (told is None or set(told.choice.hosts) != set(choice.hosts)):
         where = ", ".join(choice.hosts) or "no other host"
         state.record(
@@ -192,11 +198,11 @@ def _choose(
         )  # fmt: skip
 
 
-def _as_kept(
-    process: Process, host: Host, holdings: Mapping[str, Holding]
+def _current_choice(
+    process: Process, host: Host, replicas: Mapping[str, Replica]
 ) -> CheckpointChoice:  # fmt: skip
     """Choose the other hosts with a replica that is not from before the last submission."""
-    kept = (name for name, one in holdings.items() if one.number >= process.born)
+    kept = (name for name, one in replicas.items() if one.number >= process.born)
     return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
 
 
@@ -206,32 +212,32 @@ def _is_same(one: CheckpointChoice, other: CheckpointChoice) -> bool:
 
 
 def _choice(
-    state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
+    state: MasterState, process: Process, host: Host, replicas: Mapping[str, Replica], now: float
 ) -> CheckpointChoice | None:
     """Return the choice of the policy; None: keep the last one.
 
     A policy that raises or breaks its contract is recorded by name.
     """
-    keeping = state.keeping
-    if keeping.policy is None:
+    replication_state = state.replication
+    if replication_state.policy is None:
         return CheckpointChoice(())
-    kept = keeping.holdings.hosts_of(process.name, process.born)
+    kept = replication_state.replicas.hosts_of(process.name, process.born)
     others = tuple(name for name in kept if name != host.name)
     hosts = {
         one.name: one.description.labels
         for one in state.hosts.hosts
-        if _may_keep(state, one, others)
+        if _may_hold_replica(state, one, others)
     }
-    since = max((holdings[name].since for name in others), default=None)
+    since = max((replicas[name].since for name in others), default=None)
     view = CheckpointView(
         process.spec, host.name, None if since is None else now - since,
-        _newest_size(holdings), others, hosts,
+        _newest_size(replicas), others, hosts,
     )  # fmt: skip
-    policy = keeping.policy
+    policy = replication_state.policy
     try:
         return state.plugins.ask(
             "checkpoint",
-            keeping.policy_name,
+            replication_state.policy_name,
             "choose",
             lambda: sound_choice(policy.choose(view), view),
         )
@@ -239,7 +245,7 @@ def _choice(
         return None
 
 
-def _may_keep(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
+def _may_hold_replica(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
     """Return True if a host may keep a replica.
 
     A suspect host stays a keeper, because it may only be silent for a moment.
@@ -250,8 +256,8 @@ def _may_keep(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
     )
 
 
-def _newest_size(holdings: Mapping[str, Holding]) -> int:
-    return max(((one.age, one.size) for one in holdings.values()), default=((0, 0), 0))[1]
+def _newest_size(replicas: Mapping[str, Replica]) -> int:
+    return max(((one.age, one.size) for one in replicas.values()), default=((0, 0), 0))[1]
 
 
 def sound_choice(choice: CheckpointChoice | None, view: CheckpointView) -> CheckpointChoice | None:
@@ -271,30 +277,33 @@ def sound_choice(choice: CheckpointChoice | None, view: CheckpointView) -> Check
 
 
 def _is_stale(
-    state: MasterState, process: Process, host: str, holding: Holding,
-    holdings: Mapping[str, Holding],
+    state: MasterState, process: Process, host: str, replica: Replica,
+    replicas: Mapping[str, Replica],
 ) -> bool:  # fmt: skip
     """Return True if, as far as the master knows, no instance will start from a replica."""
-    if holding.number < process.born or process.phase in _DONE:
+    if replica.number < process.born or process.phase in _DONE:
         return True
-    owner, told = state.instances.get(process.owner), state.keeping.told.get(process.name)
+    owner, last_order = (
+        state.instances.get(process.owner),
+        state.replication.last_orders.get(process.name),
+    )
     if owner is None or process.phase is not ProcessPhase.RUNNING or host == owner.host.name:
         return False
-    if told is None or not told.chosen or told.number != process.owner:
+    if last_order is None or not last_order.by_policy or last_order.number != process.owner:
         return False
-    if host in told.choice.hosts:
+    if host in last_order.choice.hosts:
         return False
     # Keep an undesired replica until a newer one exists elsewhere.
-    better = told.choice.hosts or (owner.host.name,)
-    return any(name in holdings and holdings[name].age > holding.age for name in better)
+    better = last_order.choice.hosts or (owner.host.name,)
+    return any(name in replicas and replicas[name].age > replica.age for name in better)
 
 
-def _drop(state: MasterState, process: str, name: str, holding: Holding, now: float) -> None:
+def _drop(state: MasterState, process: str, name: str, replica: Replica, now: float) -> None:
     host = state.hosts.by_name.get(name)
     if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
         return  # it reports its replicas again when it rejoins
-    at = state.keeping.dropped_at.get((process, name), -math.inf)
+    at = state.replication.dropped_at.get((process, name), -math.inf)
     if now - at < state.settings.order_retry:
         return
-    state.keeping.dropped_at[process, name] = now
-    state.send(host, DropReplica(InstanceId(process, holding.number)), Replication(process))
+    state.replication.dropped_at[process, name] = now
+    state.send(host, DropReplica(InstanceId(process, replica.number)), Replication(process))

@@ -53,7 +53,7 @@ def _checking(state: MasterState) -> Iterator[tuple[str, HostChecking]]:
 
 
 def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now: float) -> None:
-    known = state.abilities.answers.get((name, host.name))
+    known = state.host_capabilities.answers.get((name, host.name))
     incarnation = host.description.incarnation
     if known is not None and known.incarnation == incarnation and now < known.ask_at:
         return
@@ -65,18 +65,18 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
         answer = Answer(
             incarnation, reason=f"its ability is not known: {error}", ask_at=now + _ASK_AGAIN
         )
-        state.abilities.answers[name, host.name] = answer
+        state.host_capabilities.answers[name, host.name] = answer
         return
     if ability not in host.description.executors:
         reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
         # Asked again, because the slave reports broken plugins only after its registration.
-        state.abilities.answers[name, host.name] = Answer(
+        state.host_capabilities.answers[name, host.name] = Answer(
             incarnation, reason=reason, ask_at=now + _ASK_AGAIN
         )
         return
     query = CapabilityQuery(name, host.name)
     order = state.send(host, RunExecutor(ability, timeout=_PATIENCE), query)
-    state.abilities.answers[name, host.name] = Answer(
+    state.host_capabilities.answers[name, host.name] = Answer(
         incarnation, order, ask_at=now + _PATIENCE + _ASK_AGAIN
     )
 
@@ -86,7 +86,7 @@ def note_answer(
 ) -> None:
     """Note the answer of a host about a strategy, unless the host was asked again since."""
     strategy, host = query.strategy, query.host
-    answer = state.abilities.answers[strategy, host]
+    answer = state.host_capabilities.answers[strategy, host]
     if answer.order != event.order:
         return
     if event.accepted:
@@ -113,7 +113,7 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
         return ""
     facts = []
     for host in (source, destination):
-        answer = state.abilities.answers.get((strategy, host.name))
+        answer = state.host_capabilities.answers.get((strategy, host.name))
         if answer is None or answer.facts is None:
             return _absent(strategy, answer, [host.name])
         facts.append(answer.facts)
@@ -130,7 +130,7 @@ def faults(state: MasterState, strategy: str, source: Host) -> list[str]:
     """Return why a strategy cannot move anything from a host to others, an equal reason once."""
     absent: dict[str, tuple[Answer | None, list[str]]] = {}
     others: dict[str, None] = {}
-    answers = state.abilities.answers
+    answers = state.host_capabilities.answers
     here = answers.get((strategy, source.name))
     for host in state.hosts.listed():
         found = "" if host is source else fault(state, strategy, source, host)

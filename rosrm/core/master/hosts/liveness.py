@@ -31,7 +31,7 @@ def review_liveness(state: MasterState, now: float) -> None:
     table = state.hosts
     if not len(table):
         return
-    age = now - table.heard
+    age = now - table.last_contact
     condition = table.condition
     grace = _grace(state)
     fresh = age < state.settings.suspect + grace
@@ -45,11 +45,11 @@ def review_liveness(state: MasterState, now: float) -> None:
     past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
     for column in np.flatnonzero(up & ~fresh & ~past_lease):
         _suspect(state, table.hosts[column], float(age[column]), now)
-    _note_company(state, bool((up & ~past_lease).any()), now)
+    _note_contact(state, bool((up & ~past_lease).any()), now)
     for column in np.flatnonzero(past_lease):
         _lose(state, table.hosts[column], float(age[column]), float(lease[column]), now)
     for column in np.flatnonzero((suspect | lost) & fresh):
-        welcome_back(state, table.hosts[column], now)
+        mark_up(state, table.hosts[column], now)
 
 
 def lease_of(state: MasterState, host: Host) -> float:
@@ -59,7 +59,7 @@ def lease_of(state: MasterState, host: Host) -> float:
 
 def lease_end(state: MasterState, host: Host) -> float:
     """Return the time at which the lease of a host ends if it sends nothing before."""
-    return float(state.hosts.heard[host.column]) + lease_of(state, host)
+    return float(state.hosts.last_contact[host.column]) + lease_of(state, host)
 
 
 def _grace(state: MasterState) -> FloatArray:
@@ -67,12 +67,12 @@ def _grace(state: MasterState) -> FloatArray:
     return np.maximum(0.0, _REPORTS_MISSED * state.hosts.period - state.settings.suspect)
 
 
-def _note_company(state: MasterState, heard: bool, now: float) -> None:
+def _note_contact(state: MasterState, in_contact: bool, now: float) -> None:
     """Note the time since when at least one host is up.
 
     A master that receives nothing from any host may itself be cut off.
     """
-    state.in_company_since = min(state.in_company_since, now) if heard else inf
+    state.contact_since = min(state.contact_since, now) if in_contact else inf
 
 
 def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
@@ -91,16 +91,16 @@ def _lose(state: MasterState, host: Host, age: float, lease: float, now: float) 
         f"{host.name} is lost: it has not reported for {age:.1f} s, its lease is {lease:g} s",
         host=host.name,
     )  # fmt: skip
-    loss.lose_sight(state, host, now)
+    loss.mark_lost(state, host, now)
 
 
-def welcome_back(state: MasterState, host: Host, now: float) -> None:
+def mark_up(state: MasterState, host: Host, now: float) -> None:
     """Return a suspect or lost host that reports again to the condition up."""
     was_lost = state.hosts.condition_of(host) is HostCondition.LOST
     state.hosts.set_condition(host, HostCondition.UP)
     state.record(now, EventKind.HOST_BACK, f"{host.name} reports again", host=host.name)
     if was_lost:
-        loss.regain_sight(state, host, now)
-        state.hosts.set_untold(host, untold=True)
+        loss.mark_rejoined(state, host, now)
+        state.hosts.set_report_due(host, report_due=True)
         state.send(host, ReportInstances())
     reconsider_set_aside(state, now)

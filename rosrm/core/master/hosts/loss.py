@@ -31,11 +31,11 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.hosts import readoption
 from rosrm.core.master.hosts.fencing import ended_after_loss
 from rosrm.core.master.master_state import (
+    DesiredState,
     Instance,
     MasterState,
     Process,
     ProcessPhase,
-    Wanted,
 )
 from rosrm.core.master.migration import failover, handoff
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -46,7 +46,7 @@ from rosrm.model.plan import Aim
 _OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
 
 
-def lose_sight(state: MasterState, host: Host, now: float) -> None:
+def mark_lost(state: MasterState, host: Host, now: float) -> None:
     """Mark a host as lost: its processes are out of reach, not ended."""
     host.lost_since = now
     _note_phases(state, host, now)
@@ -62,20 +62,20 @@ def detach(state: MasterState, host: Host, lease_end: float, now: float) -> None
 def _note_phases(state: MasterState, host: Host, now: float) -> None:
     for number in host.instances:
         process = state.owned_by(state.instances[number])
-        if process is not None and process.name not in state.runs:
+        if process is not None and process.name not in state.migrations:
             lifecycle.note_phase(state, process, state.instances[number], now)
 
 
-def regain_sight(state: MasterState, host: Host, now: float) -> None:
+def mark_rejoined(state: MasterState, host: Host, now: float) -> None:
     """Restore the phases of a lost host's processes from their last status when it rejoins."""
     for number in host.instances:
         instance = state.instances[number]
         process = state.owned_by(instance)
-        if process is None or process.name in state.runs:
+        if process is None or process.name in state.migrations:
             continue
-        if process.phase is ProcessPhase.UNREACHABLE or process.wanted is Wanted.CANCEL:
+        if process.phase is ProcessPhase.UNREACHABLE or process.wanted is DesiredState.CANCEL:
             lifecycle.note_phase(state, process, instance, now)
-    readoption.take_back_all(state, host, now)
+    readoption.readopt_all(state, host, now)
 
 
 def review_lost_hosts(state: MasterState, now: float) -> None:
@@ -97,10 +97,10 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     process = state.processes.get(instance.id.process)
     if process is None:
         return True
-    if now < state.in_company_since + state.settings.lease:
+    if now < state.contact_since + state.settings.lease:
         return False
-    run = state.runs.get(process.name)
-    if run is not None and run.aim is Aim.RESTORE and not run.committed:
+    migration = state.migrations.get(process.name)
+    if migration is not None and migration.aim is Aim.RESTORE and not migration.committed:
         return False
     if process.owner not in (0, instance.id.number) and not _may_be_active(state, instance):
         return True
@@ -108,7 +108,7 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
         return True
     policy = process.spec.host_loss
     lost_for = now - instance.host.lost_since
-    if process.wanted is Wanted.CANCEL:
+    if process.wanted is DesiredState.CANCEL:
         # Giving it up frees its name, so it must have ended: only an expired fence ensures that.
         ends_at = max(policy.delay, ended_after_loss(process.spec, state.settings))
         return policy.then == "elsewhere" and lost_for >= ends_at
@@ -117,12 +117,16 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
 
 def _may_be_active(state: MasterState, instance: Instance) -> bool:
     """Return True if the destination of a migration may be active, unknown to the master."""
-    run = state.runs.get(instance.id.process)
-    if run is None or run.committed or run.destination != instance.id:
+    migration = state.migrations.get(instance.id.process)
+    if migration is None or migration.committed or migration.destination != instance.id:
         return False
     number = instance.id.number
-    alone = run.plan.overlap == 0.0 and number in run.launched and number not in run.suspended
-    return alone or handoff.was_switched(run)
+    alone = (
+        migration.plan.overlap == 0.0
+        and number in migration.launched
+        and number not in migration.suspended
+    )
+    return alone or handoff.was_switched(migration)
 
 
 def _give_up(state: MasterState, instance: Instance, now: float) -> None:
@@ -132,15 +136,15 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
         now, EventKind.GIVEN_UP, f"{instance.id} is given up: {why}",
         process=instance.id.process, host=host.name, facts={"number": instance.id.number},
     )  # fmt: skip
-    if process is not None and _may_be_taken_back(process, instance):
+    if process is not None and _may_be_readopted(process, instance):
         process.left_behind = LeftBehind(instance.id.number, host.name, instance.node_name)
     stays = process is not None and process.spec.host_loss.then == "stop"
     lifecycle.gone(state, instance, now, why, comes_again=not stays)
 
 
-def _may_be_taken_back(process: Process, instance: Instance) -> bool:
+def _may_be_readopted(process: Process, instance: Instance) -> bool:
     """Return True if the instance owns the name and was not ordered to stop."""
-    runs_on = process.wanted is Wanted.RUN and not instance.stopping
+    runs_on = process.wanted is DesiredState.RUN and not instance.stopping
     return (
         runs_on
         and process.owner == instance.id.number

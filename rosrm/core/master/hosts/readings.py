@@ -35,7 +35,7 @@ def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> B
     ).all(axis=1)  # fmt: skip
     if known.any():
         fresh = known & (readings.sequence >= table.sequence[at])
-        table.heard[at[fresh]] = now
+        table.last_contact[at[fresh]] = now
         table.stale[at[fresh & ~sane]] = _SLOT_BITS.sum()
         _store(table, readings, at, fresh & sane)
         table.changed()

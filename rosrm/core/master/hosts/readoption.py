@@ -14,16 +14,16 @@ from rosrm.model.orders import SetRestartPolicy
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
 
-def take_back_all(state: MasterState, host: Host, now: float) -> None:
+def readopt_all(state: MasterState, host: Host, now: float) -> None:
     """Re-adopt every instance of a host without a successor, until the host reports otherwise."""
     for name in [*state.queue, *sorted(state.set_aside)]:
         process = state.processes[name]
         if process.left_behind is not None and process.left_behind.host == host.name:
-            _take_back(state, process, process.left_behind, host, now)
+            _readopt(state, process, process.left_behind, host, now)
 
 
-def take_back(state: MasterState, host: Host, status: InstanceStatus, now: float) -> bool:
-    """Re-adopt one reported instance that was given up, as `take_back_all` does.
+def readopt(state: MasterState, host: Host, status: InstanceStatus, now: float) -> bool:
+    """Re-adopt one reported instance that was given up, as `readopt_all` does.
 
     Returns:
         False: the instance is not one that can be re-adopted.
@@ -34,11 +34,11 @@ def take_back(state: MasterState, host: Host, status: InstanceStatus, now: float
         return False
     if (left.number, left.host) != (status.instance.number, host.name):
         return False
-    _take_back(state, process, left, host, now)
+    _readopt(state, process, left, host, now)
     return True
 
 
-def _take_back(
+def _readopt(
     state: MasterState, process: Process, left: LeftBehind, host: Host, now: float
 ) -> None:
     state.unqueue(process)
@@ -62,8 +62,8 @@ def has_successor(state: MasterState, status: InstanceStatus) -> bool:
     True also where a plan treats this instance as ended, or its image owns the name.
     """
     process = state.processes.get(status.instance.process)
-    number, run = status.instance.number, state.runs.get(status.instance.process)
-    if run is not None and number in run.ended:
+    number, migration = status.instance.number, state.migrations.get(status.instance.process)
+    if migration is not None and number in migration.ended:
         return True
     if process is None:
         return False

@@ -9,13 +9,13 @@ import numpy as np
 from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
-from rosrm.core.master.assignment.reservations import settle_charge
+from rosrm.core.master.assignment.reservations import settle_reservation
 from rosrm.core.master.checkpoint import replication
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.hosts import loss
-from rosrm.core.master.hosts.liveness import lease_end, welcome_back
+from rosrm.core.master.hosts.liveness import lease_end, mark_up
 from rosrm.core.master.hosts.readings import take_readings
-from rosrm.core.master.master_state import MasterState, ProcessPhase, Wanted
+from rosrm.core.master.master_state import DesiredState, MasterState, ProcessPhase
 from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.extensions.contracts import Intent
@@ -27,7 +27,7 @@ from rosrm.model.values import InstanceStatus
 from rosrm.wording import counted
 
 #: Seconds between two records of the same fault of the same host.
-_TOLD_EVERY = 10.0
+_RECORD_PERIOD = 10.0
 
 
 def host_registered(state: MasterState, event: happened.HostRegistered, now: float) -> None:
@@ -61,11 +61,11 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     )  # fmt: skip
     note_seen(state, host.name, event.journal_seen, now)
     replication.note_states(state, host, event.kept, now)  # replicas decide on placement
-    loss.regain_sight(state, host, now)
+    loss.mark_rejoined(state, host, now)
     stopping = [number for number in sorted(host.instances) if state.instances[number].stopping]
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
     _stop_again(state, stopping, now)
-    _forgive(state, host)
+    _clear_exclusions(state, host)
     _execute_again(state, host)
     reconsider_set_aside(state, now)
     state.emit(Reply(event.request, host_id=host.host_id))
@@ -85,10 +85,10 @@ def _live(held: Iterable[InstanceStatus]) -> str:
 
 def _execute_again(state: MasterState, host: Host) -> None:
     """Repeat the steps whose executor ended with the slave's former run."""
-    for run in state.runs.values():
-        step = run.step_in_hand
+    for migration in state.migrations.values():
+        step = migration.current_step
         if isinstance(step, Execute) and step.host == host.name:
-            run.begun = False
+            migration.begun = False
 
 
 def _refuse_host(
@@ -98,7 +98,7 @@ def _refuse_host(
     if known is None:
         state.record(now, EventKind.HOST_REFUSED, why, host=event.description.name)
     else:  # a slave whose name is taken retries for a moment
-        _tell(state, known, EventKind.HOST_REFUSED, now, why)
+        _record_seldom(state, known, EventKind.HOST_REFUSED, now, why)
     state.emit(Reply(event.request, False, code, why))
 
 
@@ -110,28 +110,28 @@ def _registered_again(
     Keep all later reports of the slave. The instances in this request may be outdated, so order a
     full report in sequence.
     """
-    state.hosts.heard[host.column] = now
+    state.hosts.last_contact[host.column] = now
     replication.note_states(state, host, event.kept, now)
     condition = state.hosts.condition_of(host)
     if condition in (HostCondition.LOST, HostCondition.SUSPECT):
-        welcome_back(state, host, now)
+        mark_up(state, host, now)
     if condition is not HostCondition.LOST:
         state.send(host, ReportInstances())
     state.emit(Reply(event.request, host_id=host.host_id))
 
 
-def _forgive(state: MasterState, host: Host) -> None:
+def _clear_exclusions(state: MasterState, host: Host) -> None:
     """Clear the exclusions and reasons that stem from the former run of a host's slave.
 
     The slave may have now what it lacked. The master also stops instances there that may have run
     on while the slave was away.
     """
-    for name in state.over:
+    for name in state.terminal:
         process = state.processes[name]
         if process.phase is ProcessPhase.CANCELLED and process.ended_on == host.name:
             process.reason = ""
     for process in state.processes.values():
-        if host.name in process.excluded and not process.phase.over:
+        if host.name in process.excluded and not process.phase.is_terminal:
             del process.excluded[host.name]
             process.demand = None
 
@@ -179,8 +179,8 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
     state.record(now, EventKind.HOST_LEFT, f"{host.name} leaves: its slave stops", host=host.name)
     for number in sorted(host.instances):
         process = state.owned_by(state.instances[number])
-        if process is not None and process.wanted is Wanted.RUN:
-            process.wanted = Wanted.REQUEUE
+        if process is not None and process.wanted is DesiredState.RUN:
+            process.wanted = DesiredState.REQUEUE
             state.save(process)
     state.emit(Reply(event.request))
 
@@ -215,7 +215,7 @@ def readings_received(state: MasterState, event: happened.ReadingsReceived, now:
     for row in np.flatnonzero(refused):
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
         if host is not None:
-            _tell(
+            _record_seldom(
                 state, host, EventKind.READING_REFUSED, now,
                 f"a reading of {host.name} was refused (NaN, negative, absurd, or a limit outside "
                 f"0..1): usage {_shown(event.usage[row])}, limit {_shown(event.limit[row])}",
@@ -226,9 +226,11 @@ def _shown(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
     return "[" + ", ".join(f"{value:.3g}" for value in values[:8]) + ", …]"
 
 
-def _tell(state: MasterState, host: Host, kind: EventKind, now: float, message: str) -> None:
-    if now - host.told.get(kind, float("-inf")) >= _TOLD_EVERY:
-        host.told[kind] = now
+def _record_seldom(
+    state: MasterState, host: Host, kind: EventKind, now: float, message: str
+) -> None:
+    if now - host.recorded_at.get(kind, float("-inf")) >= _RECORD_PERIOD:
+        host.recorded_at[kind] = now
         state.record(now, kind, message, host=host.name)
 
 
@@ -242,7 +244,7 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
         if instance is None or instance.host is not host:
             continue
         if not (np.isfinite(cpu) and np.isfinite(memory) and cpu >= 0.0 and memory >= 0.0):
-            _tell(
+            _record_seldom(
                 state,
                 host,
                 EventKind.READING_REFUSED,
@@ -253,7 +255,7 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
         instance.seen = {"cpu": float(cpu), "memory": float(memory)}
         for resource, amount in instance.seen.items():
             instance.peak[resource] = max(amount, instance.peak.get(resource, 0.0))
-        settle_charge(state, instance, now)
+        settle_reservation(state, instance, now)
 
 
 def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:

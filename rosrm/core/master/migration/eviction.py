@@ -11,9 +11,9 @@ from collections import defaultdict
 from collections.abc import Iterable
 from typing import Final
 
-from rosrm.core.master.assignment.assign import amounts_of, demand_to_move, ranking_of
+from rosrm.core.master.assignment.assign import demand_amounts, demand_to_move, ranking_of
 from rosrm.core.master.hosts import capabilities
-from rosrm.core.master.master_state import Instance, MasterState, Process, Wanted
+from rosrm.core.master.master_state import DesiredState, Instance, MasterState, Process
 from rosrm.core.master.migration.start import (
     begin_move,
     moves_under_way,
@@ -34,13 +34,13 @@ from rosrm.model.values import InstanceState
 from rosrm.wording import counted, few, listed
 
 #: Least seconds between two records, with different reasons, that nothing can leave a host.
-_TOLD_EVERY = 10.0
+_RECORD_PERIOD = 10.0
 #: Most reasons against hosts in one answer.
 _MOST_SAID: Final = 3
 _ALONE: Final = "there is no other host"
 
 
-def relieve_hosts(state: MasterState, now: float) -> None:
+def evict_from_hosts(state: MasterState, now: float) -> None:
     """Move processes off draining hosts and off hosts over a limit for long enough."""
     _note_limits(state, now)
     for host in state.hosts.listed():
@@ -53,7 +53,7 @@ def relieve_hosts(state: MasterState, now: float) -> None:
             if not host.drained:
                 _drain(state, host, now)
         elif state.settings.automatic and host.over_since:
-            _relieve(state, host, now)
+            _evict(state, host, now)
 
 
 def _note_limits(state: MasterState, now: float) -> None:
@@ -93,16 +93,16 @@ def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
         state.record(now, EventKind.UNDER_LIMIT, f"{host.name} is under its limits", host=host.name)
 
 
-def _relieve(state: MasterState, host: Host, now: float) -> None:
-    if any(run.source_host is host for run in state.runs.values()):
+def _evict(state: MasterState, host: Host, now: float) -> None:
+    if any(migration.source_host is host for migration in state.migrations.values()):
         return  # first await the effect of the current migration
     for resource, since in list(host.over_since.items()):
         if now - since >= state.settings.hysteresis:
-            _relieve_resource(state, host, resource, now)
+            _evict_for_resource(state, host, resource, now)
             return
 
 
-def _relieve_resource(state: MasterState, host: Host, resource: str, now: float) -> None:
+def _evict_for_resource(state: MasterState, host: Host, resource: str, now: float) -> None:
     reasons = []
     for instance in _largest_first(state, host, resource):
         process = state.processes[instance.id.process]
@@ -116,18 +116,18 @@ def _relieve_resource(state: MasterState, host: Host, resource: str, now: float)
                 return
             reason = rejected.reason
         reasons.append((process.name, reason))
-    _tell_nothing_moves(state, host, resource, reasons, now)
+    _record_nothing_moves(state, host, resource, reasons, now)
 
 
 def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
     held = [state.instances[number] for number in host.instances]
     owned = [instance for instance in held if state.owned_by(instance) is not None]
-    return sorted(owned, key=lambda one: (-relief_of(one, resource), one.id.number))
+    return sorted(owned, key=lambda one: (-usage_to_free(one, resource), one.id.number))
 
 
-def relief_of(instance: Instance, resource: str) -> float:
+def usage_to_free(instance: Instance, resource: str) -> float:
     """Return the usage that leaves the host with an instance, in base units of the resource."""
-    return instance.seen.get(resource, instance.amounts.get(resource, 0.0))
+    return instance.seen.get(resource, instance.demand.get(resource, 0.0))
 
 
 def _why_not_now(
@@ -136,7 +136,7 @@ def _why_not_now(
     refusal = why_immovable(state, process)
     if refusal:
         return refusal
-    if relief_of(instance, resource) <= 0.0:
+    if usage_to_free(instance, resource) <= 0.0:
         return f"{process.name} uses no {resource}"
     since_move, cooldown = now - process.moved_at, state.settings.cooldown
     if since_move < cooldown:
@@ -168,18 +168,18 @@ def try_move(
         destination = _destination(state, process, ranking, source.host, host)
         if isinstance(destination, Rejected):
             return Rejected("; ".join(dict.fromkeys(lacking.values()))) if lacking else destination
-        run = plan_move(state, process, destination, cause, now)
-        if isinstance(run, Rejected):
-            return run
-        refusal = why_no_executor(state, run)
+        migration = plan_move(state, process, destination, cause, now)
+        if isinstance(migration, Rejected):
+            return migration
+        refusal = why_no_executor(state, migration)
         if not refusal:
             break
-        hosts, shared = without_executor(state, run)
+        hosts, shared = without_executor(state, migration)
         if host is not None or not hosts:
             return Rejected(refusal)
         lacking.update(dict.fromkeys(hosts, shared))
     decision = decide(ranking, chosen=destination.column)
-    begin_move(state, process, run, ranking, now)
+    begin_move(state, process, migration, ranking, now)
     state.note_decision(process, decision, "migrated", now)
     return None
 
@@ -223,8 +223,8 @@ def departures(state: MasterState, host: Host) -> str:
     if not leaving:
         return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
     count = counted(len(leaving), "process leaves", "processes leave")
-    said = f"{count} ({listed(leaving)})"
-    return f"{said}; cannot leave: {'; '.join(few(staying))}" if staying else said
+    summary = f"{count} ({listed(leaving)})"
+    return f"{summary}; cannot leave: {'; '.join(few(staying))}" if staying else summary
 
 
 def _leaving(state: MasterState, host: Host) -> list[str]:
@@ -251,22 +251,28 @@ def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
         predicate = reason.removeprefix(f"{name} ")
         names[predicate, predicate != reason].append(name)
     return [
-        f"{alike[0] if len(alike) == 1 else f'each of {listed(alike)}'} {said}" if of_it else said
-        for (said, of_it), alike in names.items()
+        f"{alike[0] if len(alike) == 1 else f'each of {listed(alike)}'} {predicate_text}"
+        if of_it
+        else predicate_text
+        for (predicate_text, of_it), alike in names.items()
     ]
 
 
 def _why_it_stays(state: MasterState, instance: Instance) -> str:
     """Return why an instance can neither leave its host nor is about to end; "" if it can."""
     process, source = state.owned_by(instance), instance.host
-    if process is None or process.wanted is not Wanted.RUN or process.name in state.runs:
+    if (
+        process is None
+        or process.wanted is not DesiredState.RUN
+        or process.name in state.migrations
+    ):
         return ""
     reason = why_never_movable(state, process)
     if reason:
         return reason
     # What a strategy or a lost host lacks may change later; labels and resources do not.
     lasting = {**process.excluded, source.name: "it is there"}
-    amounts, estimated = amounts_of(state, process, instance.measured)
+    amounts, estimated = demand_amounts(state, process, instance.measured)
     possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
     if any(possible[host.column] for host in state.hosts.listed() if host is not source):
         return ""
@@ -294,14 +300,14 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
         process = state.processes[instance.id.process]
         if moves_under_way(state) >= state.settings.max_migrations:
             return
-        if process.name in state.runs:
+        if process.name in state.migrations:
             continue
         rejected = try_move(state, process, f"{host.name} is being drained", now)
         if rejected is not None:
             reasons.append((process.name, rejected.reason))
     reasons += _images_on(state, host)
     if reasons:
-        _tell_nothing_moves(state, host, "drain", reasons, now)
+        _record_nothing_moves(state, host, "drain", reasons, now)
 
 
 def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
@@ -315,15 +321,15 @@ def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
     ]
 
 
-def _tell_nothing_moves(
+def _record_nothing_moves(
     state: MasterState, host: Host, what: str, reasons: list[tuple[str, str]], now: float
 ) -> None:
     why = "; ".join(_grouped(reasons)[:8]) or "it runs no process of this cluster"
     key = f"nothing_moves {what}"
-    soon = now - host.told.get(key, float("-inf")) < _TOLD_EVERY
+    soon = now - host.recorded_at.get(key, float("-inf")) < _RECORD_PERIOD
     if soon or host.blocked.get(what) == why:
         return
-    host.told[key], host.blocked[what] = now, why
+    host.recorded_at[key], host.blocked[what] = now, why
     state.record(
         now, EventKind.NOTHING_MOVES, f"nothing can leave {host.name}: {why}", host=host.name,
         facts={"cause": what},

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.state.migration import End, Run
-from rosrm.core.master.state.process import Process, ProcessPhase, Wanted
+from rosrm.core.master.state.migration import End, Migration
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Step
 
@@ -32,11 +32,11 @@ def is_ready(state: MasterState, process: Process) -> bool:
     standby = state.standbys.get(process.name)
     if standby is None or standby.source.number != process.owner:
         return False
-    if process.wanted is Wanted.CANCEL:
+    if process.wanted is DesiredState.CANCEL:
         return False
-    said: Mapping[ReportPhase, str] = standby.phases_of(standby.destination)
+    reported: Mapping[ReportPhase, str] = standby.phases_of(standby.destination)
     instance = state.instances.get(standby.destination.number)
-    follows = ReportPhase.READY in said and not said.keys() & _OVER
+    follows = ReportPhase.READY in reported and not reported.keys() & _OVER
     return follows and instance is not None and not instance.stopping
 
 
@@ -48,24 +48,27 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     """
     if _succeeded(end) or not is_ready(state, process):
         return False
-    run: Run = state.standbys.pop(process.name)
-    run.ended[run.source.number] = end
-    run.index, run.begun = index_of(HandoffPhase.SWITCH, run.plan.steps), False
-    run.started, run.wall = now, state.wall
-    run.cause = f"{run.source} has ended"
-    process.wanted = Wanted.RUN
+    migration: Migration = state.standbys.pop(process.name)
+    migration.ended[migration.source.number] = end
+    migration.index, migration.begun = index_of(HandoffPhase.SWITCH, migration.plan.steps), False
+    migration.started, migration.wall = now, state.wall
+    migration.cause = f"{migration.source} has ended"
+    process.wanted = DesiredState.RUN
     process.left_behind, process.standby_reason = None, ""
-    state.runs[process.name] = run
-    state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {run.cause}")
+    state.migrations[process.name] = migration
+    state.set_phase(
+        process, ProcessPhase.MIGRATING, now, f"its standby takes over: {migration.cause}"
+    )
     state.record(
         now, EventKind.FAILED_OVER,
-        f"the standby of {process.name} on {run.destination_host.name} takes over: {run.cause}"
+        f"the standby of {process.name} on {migration.destination_host.name} takes over: "
+        f"{migration.cause}"
         + (f" ({end.status.message})" if end.status.message else ""),
-        process=process.name, host=run.destination_host.name,
-        facts={"source": run.source.number, "destination": run.destination.number},
+        process=process.name, host=migration.destination_host.name,
+        facts={"source": migration.source.number, "destination": migration.destination.number},
     )  # fmt: skip
     state.save(process)
-    state.save_run(run)
+    state.save_migration(migration)
     return True
 
 

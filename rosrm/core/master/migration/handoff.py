@@ -15,7 +15,7 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress, done_if
-from rosrm.core.master.state.migration import Heard, Run
+from rosrm.core.master.state.migration import HandoffReports, Migration
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
 from rosrm.model.values import InstanceId, ProcessSpec
@@ -50,13 +50,13 @@ _REPORTS: Final[Mapping[ReportPhase, str]] = {
 # --- phases sent ------------------------------------------------------------------------------
 
 
-def publish(state: MasterState, run: Run, phase: HandoffPhase) -> None:
+def publish(state: MasterState, migration: Migration, phase: HandoffPhase) -> None:
     """Publish the phase of a handoff to its source and destination."""
-    spec = state.processes[run.process].spec
+    spec = state.processes[migration.process].spec
     state.emit(
         PublishStateConfig(
-            run.process, phase, run.source.number, run.destination.number,
-            qualified(spec, run.source_node), qualified(spec, run.destination_node),
+            migration.process, phase, migration.source.number, migration.destination.number,
+            qualified(spec, migration.source_node), qualified(spec, migration.destination_node),
         )
     )  # fmt: skip
 
@@ -67,47 +67,50 @@ def qualified(spec: ProcessSpec, node_name: str) -> str:
     return f"/{namespace}/{node_name}" if namespace else f"/{node_name}"
 
 
-def close(state: MasterState, run: Run) -> None:
+def close(state: MasterState, migration: Migration) -> None:
     """Publish the end of a handoff, if anything was published of it before."""
-    said = [step.phase for step in run.so_far if isinstance(step, Configure)]
-    if said and HandoffPhase.DONE not in said:
-        publish(state, run, HandoffPhase.DONE)
+    reported = [step.phase for step in migration.begun_steps if isinstance(step, Configure)]
+    if reported and HandoffPhase.DONE not in reported:
+        publish(state, migration, HandoffPhase.DONE)
 
 
-def say_again(state: MasterState, run: Run, step: Configure, now: float) -> None:
+def republish(state: MasterState, migration: Migration, step: Configure, now: float) -> None:
     """Repeat a phase without an answer, because the message may be lost.
 
     If the source has ended, publish the order to take over in its place.
     """
-    if _needs_take_over(state, run, step):
-        _take_over(state, run, step, now)
-    elif step.awaited and now - run.order_at >= state.settings.order_retry:
-        run.order_at = now
-        publish(state, run, step.phase)
+    if _needs_take_over(state, migration, step):
+        _take_over(state, migration, step, now)
+    elif step.awaited and now - migration.order_at >= state.settings.order_retry:
+        migration.order_at = now
+        publish(state, migration, step.phase)
 
 
-def _needs_take_over(state: MasterState, run: Run, step: Configure) -> bool:
+def _needs_take_over(state: MasterState, migration: Migration, step: Configure) -> bool:
     """Return True if the source ended while the master awaited its silence.
 
     The destination takes over from the state that it has.
     """
-    alone = run.source.number not in state.instances and run.destination.number in state.instances
-    return step.phase is HandoffPhase.SWITCH and alone and not is_active(state, run)
+    alone = (
+        migration.source.number not in state.instances
+        and migration.destination.number in state.instances
+    )
+    return step.phase is HandoffPhase.SWITCH and alone and not is_active(state, migration)
 
 
-def _take_over(state: MasterState, run: Run, step: Configure, now: float) -> None:
-    if run.taking_over and now - run.order_at < state.settings.order_retry:
+def _take_over(state: MasterState, migration: Migration, step: Configure, now: float) -> None:
+    if migration.taking_over and now - migration.order_at < state.settings.order_retry:
         return
-    if not run.taking_over:
-        run.taking_over = True
-        run.deadline = now + step.timeout
+    if not migration.taking_over:
+        migration.taking_over = True
+        migration.deadline = now + step.timeout
         state.record(
             now, EventKind.TAKE_OVER,
-            f"{run.source} has ended: {run.destination} takes over from it",
-            process=run.process, host=run.destination_host.name,
+            f"{migration.source} has ended: {migration.destination} takes over from it",
+            process=migration.process, host=migration.destination_host.name,
         )  # fmt: skip
-    run.order_at = now
-    publish(state, run, HandoffPhase.TAKE_OVER)
+    migration.order_at = now
+    publish(state, migration, HandoffPhase.TAKE_OVER)
 
 
 # --- reports received -------------------------------------------------------------------------
@@ -115,50 +118,52 @@ def _take_over(state: MasterState, run: Run, step: Configure, now: float) -> Non
 
 def handoff_reported(state: MasterState, event: happened.HandoffReported, now: float) -> None:
     """Note the reported phase of the source or the destination."""
-    for run in (state.runs.get(event.process), state.standbys.get(event.process)):
-        if run is not None and run.destination.number == event.destination:
-            _note(state, run, event, now)
+    for migration in (state.migrations.get(event.process), state.standbys.get(event.process)):
+        if migration is not None and migration.destination.number == event.destination:
+            _note(state, migration, event, now)
 
 
-def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: float) -> None:
-    if event.instance not in (run.source.number, run.destination.number):
+def _note(
+    state: MasterState, migration: Migration, event: happened.HandoffReported, now: float
+) -> None:
+    if event.instance not in (migration.source.number, migration.destination.number):
         return
-    heard = run.heard.setdefault(event.instance, Heard())
-    if event.phase not in heard.phases:
+    reports = migration.handoff_reports.setdefault(event.instance, HandoffReports())
+    if event.phase not in reports.phases:
         # A destination that receives the state waits no more; a time-out shows the older message.
         is_news = event.message and event.phase is not ReportPhase.SHADOWING
-        said = f": {event.message}" if is_news else ""
-        message = f"{run.process}#{event.instance} {_REPORTS[event.phase]}{said}"
+        details = f": {event.message}" if is_news else ""
+        message = f"{migration.process}#{event.instance} {_REPORTS[event.phase]}{details}"
         state.record(
             now, EventKind.HANDOFF_REPORTED, message,
-            process=run.process,
+            process=migration.process,
             facts={"phase": event.phase.name, "sequence": event.sequence},
         )  # fmt: skip
-    heard.phases[event.phase] = heard.message = event.message
+    reports.phases[event.phase] = reports.message = event.message
 
 
-def is_active(state: MasterState, run: Run) -> bool:
+def is_active(state: MasterState, migration: Migration) -> bool:
     """Return True if the destination has reported that it is active, with no order to stop since.
 
     After an order to stop, only its end decides.
     """
-    instance = state.instances.get(run.destination.number)
+    instance = state.instances.get(migration.destination.number)
     if instance is None or instance.stopping:
         return False
-    said = run.phases_of(run.destination)
-    return ReportPhase.ACTIVE in said and ReportPhase.ABORTED not in said
+    reported = migration.phases_of(migration.destination)
+    return ReportPhase.ACTIVE in reported and ReportPhase.ABORTED not in reported
 
 
-def is_released(state: MasterState, run: Run, instance: InstanceId) -> bool:
+def is_released(state: MasterState, migration: Migration, instance: InstanceId) -> bool:
     """Return True if a silent source has handed everything over, or has ended."""
     ended = instance.number not in state.instances
-    return ended or ReportPhase.RELEASED in run.phases_of(instance)
+    return ended or ReportPhase.RELEASED in migration.phases_of(instance)
 
 
-def is_switching(run: Run) -> bool:
+def is_switching(migration: Migration) -> bool:
     """Return True if the current step is the one in which the destination becomes active."""
-    step = run.step_in_hand
-    if run.undo is not None or not isinstance(step, Configure):
+    step = migration.current_step
+    if migration.undo is not None or not isinstance(step, Configure):
         return False
     return step.phase is HandoffPhase.SWITCH
 
@@ -166,56 +171,58 @@ def is_switching(run: Run) -> bool:
 # --- outcome of a phase -----------------------------------------------------------------------
 
 
-def outcome(step: Configure, state: MasterState, run: Run) -> StepOutcome:
+def outcome(step: Configure, state: MasterState, migration: Migration) -> StepOutcome:
     """Return the outcome of the current phase."""
-    return _OUTCOMES[step.phase](state, run) if step.awaited else StepProgress.DONE
+    return _OUTCOMES[step.phase](state, migration) if step.awaited else StepProgress.DONE
 
 
-def _shadowing(state: MasterState, run: Run) -> StepOutcome:
-    is_ready = bool(_READY & run.phases_of(run.destination).keys())
-    return _fault(state, run) or done_if(is_ready)
+def _shadowing(state: MasterState, migration: Migration) -> StepOutcome:
+    is_ready = bool(_READY & migration.phases_of(migration.destination).keys())
+    return _fault(state, migration) or done_if(is_ready)
 
 
-def _switching(state: MasterState, run: Run) -> StepOutcome:
-    if is_active(state, run):
+def _switching(state: MasterState, migration: Migration) -> StepOutcome:
+    if is_active(state, migration):
         return StepProgress.DONE
-    return _fault(state, run) or StepProgress.PENDING
+    return _fault(state, migration) or StepProgress.PENDING
 
 
-def _fault(state: MasterState, run: Run) -> StepFailed | None:
+def _fault(state: MasterState, migration: Migration) -> StepFailed | None:
     """Return why the destination can no longer become active; None: it can."""
-    if run.destination.number not in state.instances:
-        how = run.how_ended(run.destination)
-        return StepFailed(f"{run.destination} ended on {run.destination_host.name}: {how}")
-    for instance in (run.destination, run.source):
-        said = run.phases_of(instance)
-        if ReportPhase.FAILED in said:
-            how = f"{_REPORTS[ReportPhase.FAILED]}: {said[ReportPhase.FAILED]}"
+    if migration.destination.number not in state.instances:
+        how = migration.how_ended(migration.destination)
+        return StepFailed(
+            f"{migration.destination} ended on {migration.destination_host.name}: {how}"
+        )
+    for instance in (migration.destination, migration.source):
+        reported = migration.phases_of(instance)
+        if ReportPhase.FAILED in reported:
+            how = f"{_REPORTS[ReportPhase.FAILED]}: {reported[ReportPhase.FAILED]}"
             return StepFailed(f"{instance} {how}")
-    if ReportPhase.ABORTED in run.phases_of(run.destination):
-        return StepFailed(f"{run.destination} {_REPORTS[ReportPhase.ABORTED]}")
+    if ReportPhase.ABORTED in migration.phases_of(migration.destination):
+        return StepFailed(f"{migration.destination} {_REPORTS[ReportPhase.ABORTED]}")
     return None
 
 
-def _aborting(state: MasterState, run: Run) -> StepOutcome:
-    said = run.phases_of(run.destination)
-    aborted = ReportPhase.ABORTED in said or ReportPhase.FAILED in said
-    return done_if(aborted or run.destination.number not in state.instances)
+def _aborting(state: MasterState, migration: Migration) -> StepOutcome:
+    reported = migration.phases_of(migration.destination)
+    aborted = ReportPhase.ABORTED in reported or ReportPhase.FAILED in reported
+    return done_if(aborted or migration.destination.number not in state.instances)
 
 
-def _resuming(state: MasterState, run: Run) -> StepOutcome:
-    resumed = ReportPhase.RESUMED in run.phases_of(run.source)
-    ended = run.source.number not in state.instances
+def _resuming(state: MasterState, migration: Migration) -> StepOutcome:
+    resumed = ReportPhase.RESUMED in migration.phases_of(migration.source)
+    ended = migration.source.number not in state.instances
     # A source without the protocol reports nothing, and never stopped publishing.
-    deaf = not was_switched(run) and not run.phases_of(run.source)
+    deaf = not was_switched(migration) and not migration.phases_of(migration.source)
     return done_if(resumed or ended or deaf)
 
 
-def _at_once(state: MasterState, run: Run) -> StepOutcome:
+def _at_once(state: MasterState, migration: Migration) -> StepOutcome:
     return StepProgress.DONE
 
 
-_OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Run], StepOutcome]]] = {
+_OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Migration], StepOutcome]]] = {
     HandoffPhase.SHADOW: _shadowing,
     HandoffPhase.SWITCH: _switching,
     HandoffPhase.ABORT: _aborting,
@@ -224,55 +231,60 @@ _OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Run], StepOutcome]
 }
 
 
-def was_switched(run: Run) -> bool:
+def was_switched(migration: Migration) -> bool:
     """Return True if SWITCH may have been published, so that the source may be silent."""
     return any(
-        isinstance(step, Configure) and step.phase is HandoffPhase.SWITCH for step in run.so_far
+        isinstance(step, Configure) and step.phase is HandoffPhase.SWITCH
+        for step in migration.begun_steps
     )
 
 
 # --- time-outs --------------------------------------------------------------------------------
 
 
-def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> StepOutcome:
+def timed_out(state: MasterState, migration: Migration, step: Configure, now: float) -> StepOutcome:
     """Return the outcome of a phase after its time-out, as `outcome` does."""
-    if step.phase is HandoffPhase.RESUME and not was_switched(run):
+    if step.phase is HandoffPhase.RESUME and not was_switched(migration):
         return StepProgress.DONE  # it was never ordered to be silent
     if step.phase is HandoffPhase.ABORT:
-        instance = state.instances[run.destination.number]
+        instance = state.instances[migration.destination.number]
         if not instance.stopping:
-            _stop_unheard(state, run, now)
+            _stop_silent_destination(state, migration, now)
             return StepProgress.PENDING
     what = f"{TITLES[step.phase]} took longer than {step.timeout:g} s"
-    return StepFailed(f"{what}: {_waited(run)}")
+    return StepFailed(f"{what}: {_waited(migration)}")
 
 
-def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
+def _stop_silent_destination(state: MasterState, migration: Migration, now: float) -> None:
     """Stop a destination that does not answer: only its end ensures that it is never active."""
-    stop = state.processes[run.process].spec.stop
-    lifecycle.stop_instance(state, state.instances[run.destination.number], now)
-    run.deadline = now + stop.timeout
+    stop = state.processes[migration.process].spec.stop
+    lifecycle.stop_instance(state, state.instances[migration.destination.number], now)
+    migration.deadline = now + stop.timeout
     state.record(
         now, EventKind.DESTINATION_UNHEARD,
-        f"{run.destination} does not confirm that the handoff is called off: the master stops it",
-        process=run.process, host=run.destination_host.name,
+        f"{migration.destination} does not confirm that the handoff is called off: the master "
+        "stops it",
+        process=migration.process, host=migration.destination_host.name,
     )  # fmt: skip
-    state.save_run(run)
+    state.save_migration(migration)
 
 
-def _waited(run: Run) -> str:
+def _waited(migration: Migration) -> str:
     """Return the newest report of source and destination, for a time-out."""
-    source, destination = run.heard.get(run.source.number), run.heard.get(run.destination.number)
+    source, destination = (
+        migration.handoff_reports.get(migration.source.number),
+        migration.handoff_reports.get(migration.destination.number),
+    )
     if source is None and destination is None:
         return (
             "neither node has reported. Do they use rosrm.node? One that keeps only the "
             "paper's constraints needs `protocol: paper` in the options of its migration"
         )
-    said = [
+    reported = [
         f"{instance} has not reported"
-        if heard is None
-        else f"{instance} {_REPORTS[list(heard.phases)[-1]]}"
-        + (f": {heard.message}" if heard.message else "")
-        for instance, heard in ((run.destination, destination), (run.source, source))
+        if reports is None
+        else f"{instance} {_REPORTS[list(reports.phases)[-1]]}"
+        + (f": {reports.message}" if reports.message else "")
+        for instance, reports in ((migration.destination, destination), (migration.source, source))
     ]
-    return "; ".join(said)
+    return "; ".join(reported)

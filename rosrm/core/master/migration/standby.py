@@ -27,8 +27,8 @@ from rosrm.core.master.migration.start import plan_move, why_no_executor
 from rosrm.core.master.outcomes import Rejected, StepFailed, StepProgress
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.migration import Run
-from rosrm.core.master.state.process import Process, ProcessPhase, Wanted
+from rosrm.core.master.state.migration import Migration
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import HandoffPhase, ReportPhase, Start
 
@@ -41,8 +41,8 @@ _AT_A_TIME: Final = 2
 
 def review_standbys(state: MasterState, now: float) -> None:
     """Review every standby, and begin those that are missing."""
-    for run in list(state.standbys.values()):
-        _review(state, run, now)
+    for migration in list(state.standbys.values()):
+        _review(state, migration, now)
     begun = 0
     for name in state.wants_standby:
         process = state.processes[name]
@@ -51,8 +51,8 @@ def review_standbys(state: MasterState, now: float) -> None:
 
 
 def _lacks_one(state: MasterState, process: Process, now: float) -> bool:
-    alone = process.name not in state.standbys and process.name not in state.runs
-    calm = process.phase is ProcessPhase.RUNNING and process.wanted is Wanted.RUN
+    alone = process.name not in state.standbys and process.name not in state.migrations
+    calm = process.phase is ProcessPhase.RUNNING and process.wanted is DesiredState.RUN
     return alone and calm and len(process.instances) == 1 and now >= process.standby_at
 
 
@@ -67,32 +67,32 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         _wait(state, process, "no host has room for its standby", now)
         return False
     host = state.hosts.hosts[column]
-    run = plan_move(state, process, host, "standby", now)
-    why = run.reason if isinstance(run, Rejected) else why_no_executor(state, run)
-    if isinstance(run, Rejected) or why or not _can_wait(run):
+    migration = plan_move(state, process, host, "standby", now)
+    why = migration.reason if isinstance(migration, Rejected) else why_no_executor(state, migration)
+    if isinstance(migration, Rejected) or why or not _can_wait(migration):
         why = why or "its migration strategy keeps no standby ready"
         _wait(state, process, f"it can have no standby: {why}", now)
         return False
-    state.standbys[process.name] = run
-    state.charge_ranked(run.destination, host, now, ranking)
+    state.standbys[process.name] = migration
+    state.reserve_ranked(migration.destination, host, now, ranking)
     state.record(
         now, EventKind.STANDBY_BEGUN, f"the standby of {process.name} starts on {host.name}",
-        process=process.name, host=host.name, facts={"number": run.destination.number},
+        process=process.name, host=host.name, facts={"number": migration.destination.number},
     )  # fmt: skip
     process.standby_reason = f"its standby starts on {host.name}"
-    executor.advance_standby(state, run, now)
+    executor.advance_standby(state, migration, now)
     state.save(process)
     return True
 
 
-def _can_wait(run: Run) -> bool:
+def _can_wait(migration: Migration) -> bool:
     """Return True if the plan is a handoff, with a shadow that is ready before it is active."""
     shadow, switch = (
-        failover.index_of(phase, run.plan.steps)
+        failover.index_of(phase, migration.plan.steps)
         for phase in (HandoffPhase.SHADOW, HandoffPhase.SWITCH)
     )
     return 0 <= shadow < switch and any(
-        isinstance(step, Start) and step.shadow for step in run.plan.steps[:shadow]
+        isinstance(step, Start) and step.shadow for step in migration.plan.steps[:shadow]
     )
 
 
@@ -126,47 +126,54 @@ def _wait(state: MasterState, process: Process, why: str, now: float) -> None:
 # --- review of a standby ----------------------------------------------------------------------
 
 
-def _review(state: MasterState, run: Run, now: float) -> None:
-    process, instance = state.processes[run.process], state.instances.get(run.destination.number)
-    move = state.runs.get(run.process)
-    if process.wanted is Wanted.CANCEL or process.phase.over or (move and move.committed):
+def _review(state: MasterState, migration: Migration, now: float) -> None:
+    process, instance = (
+        state.processes[migration.process],
+        state.instances.get(migration.destination.number),
+    )
+    move = state.migrations.get(migration.process)
+    if (
+        process.wanted is DesiredState.CANCEL
+        or process.phase.is_terminal
+        or (move and move.committed)
+    ):
         end_standby(state, process, now)
     elif move is not None:
         return
     elif instance is None:
-        how = run.how_ended(run.destination)
-        _lost(state, process, run, f"{run.destination} ended: {how}", now)
-    elif process.owner != run.source.number:
+        how = migration.how_ended(migration.destination)
+        _lost(state, process, migration, f"{migration.destination} ended: {how}", now)
+    elif process.owner != migration.source.number:
         end_standby(state, process, now)
     elif instance.host.draining:
-        _lost(state, process, run, f"{instance.host.name} is being drained", now)
-    elif (gave_up := _why_given_up(run)) is not None:
-        _lost(state, process, run, gave_up, now)
+        _lost(state, process, migration, f"{instance.host.name} is being drained", now)
+    elif (gave_up := _why_given_up(migration)) is not None:
+        _lost(state, process, migration, gave_up, now)
     else:
-        _advance(state, process, run, now)
+        _advance(state, process, migration, now)
 
 
-def _why_given_up(run: Run) -> str | None:
+def _why_given_up(migration: Migration) -> str | None:
     """Return why the standby has called the handoff off; None: it has not."""
-    said = run.phases_of(run.destination)
-    if said.keys().isdisjoint({ReportPhase.FAILED, ReportPhase.ABORTED}):
+    reported = migration.phases_of(migration.destination)
+    if reported.keys().isdisjoint({ReportPhase.FAILED, ReportPhase.ABORTED}):
         return None
-    why = said.get(ReportPhase.FAILED) or said.get(ReportPhase.ABORTED)
-    return why or f"{run.destination} has called the handoff off"
+    why = reported.get(ReportPhase.FAILED) or reported.get(ReportPhase.ABORTED)
+    return why or f"{migration.destination} has called the handoff off"
 
 
-def _advance(state: MasterState, process: Process, run: Run, now: float) -> None:
-    outcome = executor.advance_standby(state, run, now)
+def _advance(state: MasterState, process: Process, migration: Migration, now: float) -> None:
+    outcome = executor.advance_standby(state, migration, now)
     if isinstance(outcome, StepFailed):
-        late = now >= run.deadline
-        why = f"{run.destination} did not start in time" if late else outcome.reason
-        _lost(state, process, run, why, now)
+        late = now >= migration.deadline
+        why = f"{migration.destination} did not start in time" if late else outcome.reason
+        _lost(state, process, migration, why, now)
     elif outcome is StepProgress.DONE:
-        _note_ready(state, process, run, now)
+        _note_ready(state, process, migration, now)
 
 
-def _note_ready(state: MasterState, process: Process, run: Run, now: float) -> None:
-    host = run.destination_host.name
+def _note_ready(state: MasterState, process: Process, migration: Migration, now: float) -> None:
+    host = migration.destination_host.name
     ready = f"its standby is ready on {host}"
     if process.standby_reason != ready:
         process.standby_reason, process.standby_tries = ready, 0
@@ -176,14 +183,14 @@ def _note_ready(state: MasterState, process: Process, run: Run, now: float) -> N
         )  # fmt: skip
 
 
-def _lost(state: MasterState, process: Process, run: Run, why: str, now: float) -> None:
+def _lost(state: MasterState, process: Process, migration: Migration, why: str, now: float) -> None:
     wait = min(_FIRST_WAIT * 2.0**process.standby_tries, _LONGEST_WAIT)
     process.standby_tries = min(process.standby_tries + 1, 16)
     process.standby_at = now + wait
     state.record(
         now, EventKind.STANDBY_LOST,
         f"{process.name} has no standby: {why}; the master starts another one in {wait:g} s",
-        process=process.name, host=run.destination_host.name,
+        process=process.name, host=migration.destination_host.name,
     )  # fmt: skip
     end_standby(state, process, now)
     process.standby_reason = f"it has no standby: {why}"
@@ -191,12 +198,12 @@ def _lost(state: MasterState, process: Process, run: Run, why: str, now: float) 
 
 def end_standby(state: MasterState, process: Process, now: float) -> None:
     """Stop the standby of a process, if it has one."""
-    run = state.standbys.pop(process.name, None)
-    if run is None:
+    migration = state.standbys.pop(process.name, None)
+    if migration is None:
         return
     process.standby_reason = ""
-    handoff.close(state, run)
-    instance = state.instances.get(run.destination.number)
+    handoff.close(state, migration)
+    instance = state.instances.get(migration.destination.number)
     if instance is not None and process.owner != instance.id.number and not instance.stopping:
         lifecycle.stop_instance(state, instance, now)
     state.save(process)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from rosrm.core.master.checkpoint.images import reason_of
-from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run
+from rosrm.core.master.master_state import MasterState, Migration, Process, ProcessPhase
 from rosrm.core.master.migration.steps import title
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.plugin_failures import why_broken
@@ -24,32 +24,33 @@ _HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE:
 
 
 def begin_move(
-    state: MasterState, process: Process, run: Run, ranking: Ranking, now: float
+    state: MasterState, process: Process, migration: Migration, ranking: Ranking, now: float
 ) -> None:
     """Begin a planned migration to a host that has room for the process by a ranking."""
-    destination, cause = run.destination_host, run.cause
-    state.runs[process.name] = run
-    state.charge_ranked(run.destination, destination, now, ranking)
+    destination, cause = migration.destination_host, migration.cause
+    state.migrations[process.name] = migration
+    state.reserve_ranked(migration.destination, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
     state.record(
         now, EventKind.MIGRATION_BEGUN,
-        f"{process.name} moves from {run.source_host.name} to {destination.name} by "
-        f"{run.strategy}: {cause}",
+        f"{process.name} moves from {migration.source_host.name} to {destination.name} by "
+        f"{migration.strategy}: {cause}",
         process=process.name, host=destination.name,
         facts={
-            "from": run.source_host.name, "to": destination.name, "strategy": run.strategy,
-            "cause": cause, "steps": [title(step) for step in run.plan.steps],
-            "overlap": run.plan.overlap, "source": run.source.number,
-            "destination": run.destination.number,
+            "from": migration.source_host.name, "to": destination.name,
+            "strategy": migration.strategy,
+            "cause": cause, "steps": [title(step) for step in migration.plan.steps],
+            "overlap": migration.plan.overlap, "source": migration.source.number,
+            "destination": migration.destination.number,
         },
     )  # fmt: skip
     state.save(process)
-    state.save_run(run)
+    state.save_migration(migration)
 
 
 def plan_move(
     state: MasterState, process: Process, destination: Host, cause: str, now: float
-) -> Run | Rejected:
+) -> Migration | Rejected:
     """Return the planned migration of a running process, or why there is no plan."""
     source = state.instances[process.owner]
     name = process.spec.migration.strategy or ""
@@ -61,7 +62,7 @@ def plan_move(
     plan = proposed(state, name, move)
     if isinstance(plan, Rejected):
         return plan
-    return Run(
+    return Migration(
         process.name, plan, name, source.id, source.host, move.destination, destination, cause,
         now, move.source_node, destination_node(plan, move), state.wall,
     )  # fmt: skip
@@ -69,20 +70,20 @@ def plan_move(
 
 def moves_under_way(state: MasterState) -> int:
     """Return the number of migrations in flight; a stuck one does not block others."""
-    return sum(not run.stuck for run in state.runs.values())
+    return sum(not migration.stuck for migration in state.migrations.values())
 
 
-def why_busy(run: Run) -> str:
+def why_busy(migration: Migration) -> str:
     """Return a sentence that names the plan under way for a process."""
-    if run.aim is Aim.MOVE:
-        return f"{run.process} is moving already, to {run.destination_host.name}"
-    return f"{run.process} is busy: {run.course}"
+    if migration.aim is Aim.MOVE:
+        return f"{migration.process} is moving already, to {migration.destination_host.name}"
+    return f"{migration.process} is busy: {migration.progress_text}"
 
 
 def why_immovable(state: MasterState, process: Process) -> str:
     """Return why a process cannot be moved now; "" if it can."""
-    if process.name in state.runs:
-        return why_busy(state.runs[process.name])
+    if process.name in state.migrations:
+        return why_busy(state.migrations[process.name])
     if process.phase is ProcessPhase.CHECKPOINTED:
         return f"{process.name} is checkpointed: {reason_of(state, process)}; restore it first"
     if process.phase is not ProcessPhase.RUNNING:
@@ -109,37 +110,37 @@ def why_never_movable(state: MasterState, process: Process) -> str:
     return ""
 
 
-def why_no_executor(state: MasterState, run: Run) -> str:
+def why_no_executor(state: MasterState, migration: Migration) -> str:
     """Return a sentence on the host that lacks an executor of a plan; "": none does."""
-    lacking = _lacking(state, run)
-    return "" if lacking is None else _lacks(state, run, lacking[0], [lacking[1].name])
+    lacking = _lacking(state, migration)
+    return "" if lacking is None else _lacks(state, migration, lacking[0], [lacking[1].name])
 
 
-def without_executor(state: MasterState, run: Run) -> tuple[list[str], str]:
+def without_executor(state: MasterState, migration: Migration) -> tuple[list[str], str]:
     """Return all hosts that lack the executor missing at a plan's destination, with a sentence.
 
     Return no host if the plan can be carried out on its destination.
     """
-    lacking = _lacking(state, run)
-    if lacking is None or lacking[1] is not run.destination_host:
+    lacking = _lacking(state, migration)
+    if lacking is None or lacking[1] is not migration.destination_host:
         return [], ""
     executor, _ = lacking
     hosts = [
         host.name
         for host in state.hosts.listed()
-        if host is not run.source_host and _has_not(host, executor)
+        if host is not migration.source_host and _has_not(host, executor)
     ]
-    return hosts, _lacks(state, run, executor, hosts)
+    return hosts, _lacks(state, migration, executor, hosts)
 
 
-def _lacking(state: MasterState, run: Run) -> tuple[str, Host] | None:
+def _lacking(state: MasterState, migration: Migration) -> tuple[str, Host] | None:
     """Return an executor that a plan names and the host that lacks it."""
-    if run.strategy not in state.declared.executors:
+    if migration.strategy not in state.declared.executors:
         return None  # its offer is unknown
-    commit = run.plan.steps[run.commit_index]
-    named = [*executors_of(run.plan)]
+    commit = migration.plan.steps[migration.commit_index]
+    named = [*executors_of(migration.plan)]
     if isinstance(commit, Commit) and commit.image:
-        named.append((commit.image, run.source_host.name))
+        named.append((commit.image, migration.source_host.name))
     for executor, name in named:
         host = state.hosts.by_name[name]
         if _has_not(host, executor):
@@ -151,12 +152,12 @@ def _has_not(host: Host, executor: str) -> bool:
     return bool(host.description.incarnation) and executor not in host.description.executors
 
 
-def _lacks(state: MasterState, run: Run, executor: str, hosts: list[str]) -> str:
-    brought_by = state.declared.brought_by.get(run.strategy) or "the plugin"
+def _lacks(state: MasterState, migration: Migration, executor: str, hosts: list[str]) -> str:
+    brought_by = state.declared.brought_by.get(migration.strategy) or "the plugin"
     one = len(hosts) == 1
     lacking = f"{listed(hosts, most=3)} {'has' if one else 'have'} no executor {executor!r}"
-    lacking += f", which {run.strategy} needs there to move {run.process}"
-    broken = ((name, why_broken(state.hosts.by_name[name], run.strategy)) for name in hosts)
+    lacking += f", which {migration.strategy} needs there to move {migration.process}"
+    broken = ((name, why_broken(state.hosts.by_name[name], migration.strategy)) for name in hosts)
     faults = [f"on {name} {reason}" for name, reason in broken if reason]
     if faults:
         return f"{lacking}: {faults[0]}; then restart its slave"

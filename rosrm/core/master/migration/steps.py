@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from rosrm.core.master import lifecycle
 from rosrm.core.master.events import BAD_RESULT, OrderAnswered
-from rosrm.core.master.master_state import MasterState, Run
+from rosrm.core.master.master_state import MasterState, Migration
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress, done_if
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -44,19 +44,19 @@ _AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
 # --- execution --------------------------------------------------------------------------------
 
 
-def begin(state: MasterState, run: Run, step: Step, now: float) -> bool:
+def begin(state: MasterState, migration: Migration, step: Step, now: float) -> bool:
     """Begin the current step, unless it has begun; return False if it must wait."""
-    if run.begun:
+    if migration.begun:
         return True
-    if now < run.retry_at or _is_expected(state, run, step):
+    if now < migration.retry_at or _is_expected(state, migration, step):
         return False
-    run.begun, run.answer, run.bad_result = True, None, False
-    run.deadline = now + max(step.timeout, 0.0)
-    _give_order(state, run, step, now)
+    migration.begun, migration.answer, migration.bad_result = True, None, False
+    migration.deadline = now + max(step.timeout, 0.0)
+    _give_order(state, migration, step, now)
     return True
 
 
-def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
+def _is_expected(state: MasterState, migration: Migration, step: Step) -> bool:
     """Return True if a host that the step needs has not returned since the master started.
 
     The step waits for it until its lease ends; then the step begins, and its own time-out decides.
@@ -66,18 +66,18 @@ def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
     if not isinstance(step, Configure):
         concerned = [state.hosts.by_name[step.host]]
     else:
-        both = (run.source.number, run.destination.number) if step.awaited else ()
+        both = (migration.source.number, migration.destination.number) if step.awaited else ()
         concerned = [state.instances[one].host for one in both if one in state.instances]
     return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
 
 
-def outcome_of(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
+def outcome_of(state: MasterState, migration: Migration, step: Step, now: float) -> StepOutcome:
     """Return the outcome of the current step; repeat its order or end it at its time-out."""
-    outcome = _outcome(step, state, run, now)
+    outcome = _outcome(step, state, migration, now)
     if outcome is StepProgress.PENDING:
-        _give_order_again(state, run, step, now)
-        if now >= run.deadline:
-            outcome = _timed_out(state, run, step, now)
+        _give_order_again(state, migration, step, now)
+        if now >= migration.deadline:
+            outcome = _timed_out(state, migration, step, now)
     return outcome
 
 
@@ -87,63 +87,72 @@ def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
     The result of an executor is kept for those of later steps. The start of a standby is repeated
     whatever the answer.
     """
-    run = state.runs.get(process)
-    if run is None or run.order != event.order or event.code == "timeout":
+    migration = state.migrations.get(process)
+    if migration is None or migration.order != event.order or event.code == "timeout":
         return
-    run.answer = (event.accepted, event.message or event.code)
-    run.bad_result = event.code == BAD_RESULT
-    step = run.step_in_hand
+    migration.answer = (event.accepted, event.message or event.code)
+    migration.bad_result = event.code == BAD_RESULT
+    step = migration.current_step
     if event.accepted and event.result and isinstance(step, Execute):
-        run.results[step.executor] = event.result
+        migration.results[step.executor] = event.result
 
 
 # --- orders -----------------------------------------------------------------------------------
 
 
-def _give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
+def _give_order(state: MasterState, migration: Migration, step: Step, now: float) -> None:
     """Send the order of a step to its slave, or in a handoff to the nodes themselves."""
-    run.order = None
+    migration.order = None
     if isinstance(step, Commit | AwaitReady | AwaitReleased):
         return
     if isinstance(step, Configure):
-        run.order_at = now
-        handoff.publish(state, run, step.phase)
+        migration.order_at = now
+        handoff.publish(state, migration, step.phase)
         return
-    if isinstance(step, Start) and _in_the_way(state, run, step, now):
+    if isinstance(step, Start) and _in_the_way(state, migration, step, now):
         return
     host = state.hosts.by_name[step.host]
-    order = _order_of(state, run, step, host, now)
-    run.order, run.order_at = state.send(host, order, MigrationStep(run.process)), now
+    order = _order_of(state, migration, step, host, now)
+    migration.order, migration.order_at = (
+        state.send(host, order, MigrationStep(migration.process)),
+        now,
+    )
 
 
 def _order_of(
-    state: MasterState, run: Run, step: Start | Stop | Execute | SetRestart, host: Host, now: float
+    state: MasterState,
+    migration: Migration,
+    step: Start | Stop | Execute | SetRestart,
+    host: Host,
+    now: float,
 ) -> Order:
     """Return the order of a step; note in its migration what the order changes."""
     if isinstance(step, Stop):
         return StopInstance(step.instance)
     if isinstance(step, Execute):
-        return RunExecutor(step.executor, _arguments(run, step), step.timeout)
+        return RunExecutor(step.executor, _arguments(migration, step), step.timeout)
     if isinstance(step, SetRestart):
-        if step.restart != state.processes[run.process].spec.restart:
-            run.suspended.add(step.instance.number)
-            state.save_run(run)
+        if step.restart != state.processes[migration.process].spec.restart:
+            migration.suspended.add(step.instance.number)
+            state.save_migration(migration)
         return SetRestartPolicy(step.instance, step.restart)
-    return _start(state, run, step, host, now)
+    return _start(state, migration, step, host, now)
 
 
-def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
-    return {**step.arguments, "results": run.results} if run.results else step.arguments
+def _arguments(migration: Migration, step: Execute) -> Mapping[str, Any]:
+    return {**step.arguments, "results": migration.results} if migration.results else step.arguments
 
 
-def _start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> StartInstance:
-    process = state.processes[run.process]
+def _start(
+    state: MasterState, migration: Migration, step: Start, host: Host, now: float
+) -> StartInstance:
+    process = state.processes[migration.process]
     spec, number = process.spec, step.instance.number
-    run.launched.add(number)
+    migration.launched.add(number)
     if step.shadow or step.restored:
-        run.suspended.add(number)
-    state.save_run(run)
-    if number not in state.instances and number not in run.ended:
+        migration.suspended.add(number)
+    state.save_migration(migration)
+    if number not in state.instances and number not in migration.ended:
         state.add_instance(step.instance, spec, host, now)
         state.save(process)
     instance = state.instances.get(number)
@@ -158,16 +167,16 @@ def _start(state: MasterState, run: Run, step: Start, host: Host, now: float) ->
     )
 
 
-def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
+def _in_the_way(state: MasterState, migration: Migration, step: Start, now: float) -> bool:
     """Return True if another instance of the name may run, and the plan does not allow two.
 
     A source with an image is frozen, so it does not count. On the way back, stop any other instance
     whatever the plan allows: the step that should have stopped it failed.
     """
-    process = state.processes[run.process]
-    back = run.undo is not None
+    process = state.processes[migration.process]
+    back = migration.undo is not None
     aliased = step.node_name not in ("", process.name)
-    if not back and (run.plan.overlap > 0.0 or aliased or step.restored):
+    if not back and (migration.plan.overlap > 0.0 or aliased or step.restored):
         return False
     others = [one for one in state.instances_of(process) if one.id != step.instance]
     for other in others:
@@ -176,86 +185,90 @@ def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
     return bool(others)
 
 
-def _give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
+def _give_order_again(state: MasterState, migration: Migration, step: Step, now: float) -> None:
     """Repeat the order for a start, a stop or a restart policy, because orders may be lost.
 
     A second order does no harm. A start that another instance delayed is ordered as soon as that
     one has ended.
     """
     if isinstance(step, Configure):
-        handoff.say_again(state, run, step, now)
+        handoff.republish(state, migration, step, now)
     elif isinstance(step, Execute | AwaitReady | AwaitReleased | Commit):
         return
-    elif _has_waited(run, step) or now - run.order_at >= state.settings.order_retry:
-        _give_order(state, run, step, now)
+    elif _has_waited(migration, step) or now - migration.order_at >= state.settings.order_retry:
+        _give_order(state, migration, step, now)
 
 
-def _has_waited(run: Run, step: Step) -> bool:
+def _has_waited(migration: Migration, step: Step) -> bool:
     """Return True if the start was not ordered yet, because another instance was in its way."""
-    return isinstance(step, Start) and step.instance.number not in run.launched
+    return isinstance(step, Start) and step.instance.number not in migration.launched
 
 
 # --- outcomes ---------------------------------------------------------------------------------
 
 
-def _timed_out(state: MasterState, run: Run, step: Step, now: float) -> StepOutcome:
+def _timed_out(state: MasterState, migration: Migration, step: Step, now: float) -> StepOutcome:
     """Return the outcome of a step after its time-out, as `_outcome` does."""
     if isinstance(step, Configure):
-        return handoff.timed_out(state, run, step, now)
+        return handoff.timed_out(state, migration, step, now)
     if isinstance(step, AwaitReleased):
         return StepProgress.DONE
     return StepFailed(f"{title(step)} took longer than {step.timeout:g} s")
 
 
 @singledispatch
-def _outcome(step: Any, state: MasterState, run: Run, now: float) -> StepOutcome:
+def _outcome(step: Any, state: MasterState, migration: Migration, now: float) -> StepOutcome:
     """Return the outcome of the current step."""
     raise TypeError(step)
 
 
 @_outcome.register
-def _(step: Start, state: MasterState, run: Run, now: float) -> StepOutcome:
-    if step.instance.number in run.ended:
-        return StepFailed(f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}")
+def _(step: Start, state: MasterState, migration: Migration, now: float) -> StepOutcome:
+    if step.instance.number in migration.ended:
+        return StepFailed(
+            f"{step.instance} ended on {step.host}: {migration.how_ended(step.instance)}"
+        )
     instance = state.instances.get(step.instance.number)
     if instance is None:
         return StepProgress.PENDING  # another instance has to end first
-    if run.answer is not None and not run.answer[0]:
-        return StepFailed(f"{step.host} refused to start {step.instance}: {run.answer[1]}")
-    return done_if(instance.runs)
+    if migration.answer is not None and not migration.answer[0]:
+        return StepFailed(f"{step.host} refused to start {step.instance}: {migration.answer[1]}")
+    return done_if(instance.is_running)
 
 
 @_outcome.register
-def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> StepOutcome:
+def _(step: AwaitReady, state: MasterState, migration: Migration, now: float) -> StepOutcome:
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return StepFailed(f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}")
+        return StepFailed(
+            f"{step.instance} ended on {step.host}: {migration.how_ended(step.instance)}"
+        )
     settled = instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
     return done_if(settled)
 
 
 @_outcome.register
-def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> StepOutcome:
-    return done_if(handoff.is_released(state, run, step.instance))
+def _(step: AwaitReleased, state: MasterState, migration: Migration, now: float) -> StepOutcome:
+    return done_if(handoff.is_released(state, migration, step.instance))
 
 
 @_outcome.register
-def _(step: Stop, state: MasterState, run: Run, now: float) -> StepOutcome:
+def _(step: Stop, state: MasterState, migration: Migration, now: float) -> StepOutcome:
     return done_if(step.instance.number not in state.instances)
 
 
 @_outcome.register
-def _(step: Configure, state: MasterState, run: Run, now: float) -> StepOutcome:
-    return handoff.outcome(step, state, run)
+def _(step: Configure, state: MasterState, migration: Migration, now: float) -> StepOutcome:
+    return handoff.outcome(step, state, migration)
 
 
 @_outcome.register
-def _(step: SetRestart, state: MasterState, run: Run, now: float) -> StepOutcome:
+def _(step: SetRestart, state: MasterState, migration: Migration, now: float) -> StepOutcome:
     if step.instance.number not in state.instances:
         return StepProgress.DONE  # it has ended: there is nothing to restart
-    if run.answer is None:
+    if migration.answer is None:
         return StepProgress.PENDING
-    accepted, message = run.answer
+    accepted, message = migration.answer
     if accepted:
         return StepProgress.DONE
     what = f"the restart policy of {step.instance}"
@@ -263,35 +276,37 @@ def _(step: SetRestart, state: MasterState, run: Run, now: float) -> StepOutcome
 
 
 @_outcome.register
-def _(step: Commit, state: MasterState, run: Run, now: float) -> StepOutcome:
+def _(step: Commit, state: MasterState, migration: Migration, now: float) -> StepOutcome:
     return StepProgress.DONE
 
 
 @_outcome.register
-def _(step: Execute, state: MasterState, run: Run, now: float) -> StepOutcome:
-    if run.answer is None:
+def _(step: Execute, state: MasterState, migration: Migration, now: float) -> StepOutcome:
+    if migration.answer is None:
         away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
         # A frozen instance must not wait for a long time-out. A plan that may not stop waits for
         # the host as long as an instance of it may be there.
-        turns = run.undo is None and not run.committed
-        if away and (turns or nobody_there(state, run, step)):
+        turns = migration.undo is None and not migration.committed
+        if away and (turns or instances_are_gone(state, migration, step)):
             return StepFailed(f"{step.host} {away}")
         return StepProgress.PENDING
-    accepted, message = run.answer
+    accepted, message = migration.answer
     if accepted:
         return StepProgress.DONE
     return StepFailed(f"{step.executor} failed on {step.host}: {message}")
 
 
-def nobody_there(state: MasterState, run: Run, step: Execute) -> bool:
+def instances_are_gone(state: MasterState, migration: Migration, step: Execute) -> bool:
     """Return True if a host is away, and its instances of a migration have ended or count as lost.
 
     An executor could do nothing for them there, and the host may never return.
     """
     host = state.hosts.by_name[step.host]
-    if run.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:
+    if migration.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:
         return False
-    return all(one.host is not host for one in state.instances_of(state.processes[run.process]))
+    return all(
+        one.host is not host for one in state.instances_of(state.processes[migration.process])
+    )
 
 
 def title(step: Step) -> str:

@@ -29,57 +29,62 @@ from rosrm.wording import counted
 _KEY: Final = "unheard"
 
 
-def begin(state: MasterState, newest: int, now: float, *, fell: bool) -> None:
+def begin(state: MasterState, newest: int, now: float, *, machine_rebooted: bool) -> None:
     """Begin the wait of a master that starts.
 
     Args:
         state: as it was restored.
         newest: sequence of the newest record that the journal holds.
-        fell: the machine was rebooted, and the last master had not stopped before.
+        machine_rebooted: the machine was rebooted, and the last master had not stopped before.
 
     Afterwards `intent` is to become durable, together with the mark that distinguishes the next
     start from this one.
     """
-    state.tail.newest, state.tail.started = newest, now
-    state.tail.fell = state.tail.fell or fell
+    state.journal_gap.newest, state.journal_gap.started = newest, now
+    state.journal_gap.machine_rebooted = state.journal_gap.machine_rebooted or machine_rebooted
 
 
 def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
     """Take over the wait of a former master from the intents `cluster`."""
-    kept = cluster.get(_KEY, {})
-    state.tail.fell, state.tail.short = bool(kept.get("fell")), bool(kept.get("short"))
+    stored = cluster.get(_KEY, {})
+    state.journal_gap.machine_rebooted, state.journal_gap.records_missing = (
+        bool(stored.get("fell")),
+        bool(stored.get("short")),
+    )
 
 
 def intent(state: MasterState) -> Intent:
     """Return the intent with the conditions that a master started now would wait for."""
-    tail = state.tail
-    waits = {"fell": tail.fell, "short": tail.short}
+    gap = state.journal_gap
+    waits = {"fell": gap.machine_rebooted, "short": gap.records_missing}
     return Intent("cluster", _KEY, waits if any(waits.values()) else None)
 
 
 def review(state: MasterState, now: float) -> None:
     """End the waits that are over, in the journal too."""
-    tail = state.tail
-    before = (tail.fell, tail.short)
+    gap = state.journal_gap
+    before = (gap.machine_rebooted, gap.records_missing)
     if not any(before):
         return
-    tail.short = tail.short and now < tail.started + state.settings.lease
-    tail.fell = tail.fell and bool((state.hosts.condition == HostCondition.EXPECTED).any())
-    if (tail.fell, tail.short) != before:
+    gap.records_missing = gap.records_missing and now < gap.started + state.settings.lease
+    gap.machine_rebooted = gap.machine_rebooted and bool(
+        (state.hosts.condition == HostCondition.EXPECTED).any()
+    )
+    if (gap.machine_rebooted, gap.records_missing) != before:
         state.emit(intent(state))
 
 
 def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     """Compare the journal with the newest record that a host has seen, and begin a wait."""
-    tail = state.tail
-    lost = seen - tail.newest
-    if lost <= tail.lost:
+    gap = state.journal_gap
+    lost = seen - gap.newest
+    if lost <= gap.lost:
         return
-    tail.lost = lost
+    gap.lost = lost
     state.skip_numbers(state.next_instance + lost)  # each may have held a new instance
-    left = tail.started + state.settings.lease - now
-    if left > 0 and not tail.short:
-        tail.short = True
+    left = gap.started + state.settings.lease - now
+    if left > 0 and not gap.records_missing:
+        gap.records_missing = True
         state.emit(intent(state))
     wait = (
         f"; the master assigns no work for {left:.1f} s, until all hosts have reported"
@@ -90,17 +95,17 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     state.record(
         now, EventKind.JOURNAL_BEHIND,
         f"the journal has lost its newest records: {host} has seen record {seen}, and the journal "
-        f"ended at {tail.newest} when this master started: {records} missing. Repeat the "
+        f"ended at {gap.newest} when this master started: {records} missing. Repeat the "
         f"requests in them; processes that these started are stopped{wait}",
-        host=host, facts={"seen": seen, "newest": tail.newest, "lost": lost},
+        host=host, facts={"seen": seen, "newest": gap.newest, "lost": lost},
     )  # fmt: skip
 
 
 def why_no_work(state: MasterState, now: float) -> str:
     """Return why the master assigns no work now; "" if it does."""
     review(state, now)
-    if state.tail.short:
+    if state.journal_gap.records_missing:
         return "the journal has lost its newest records: the master waits for all hosts to report"
-    if state.tail.fell:
+    if state.journal_gap.machine_rebooted:
         return "the master's machine was rebooted: the master waits for all hosts to report"
     return ""

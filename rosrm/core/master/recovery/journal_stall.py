@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.hosts.liveness import welcome_back
+from rosrm.core.master.hosts.liveness import mark_up
 from rosrm.core.master.hosts.readings import take_readings
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
@@ -23,6 +23,6 @@ def note_readings(state: MasterState, event: happened.ReadingsReceived, now: flo
     """
     take_readings(state.hosts, event, now)
     table = state.hosts
-    heard = (table.condition == HostCondition.SUSPECT) & (table.heard >= now)
-    for column in np.flatnonzero(heard):
-        welcome_back(state, table.hosts[column], now)
+    in_contact = (table.condition == HostCondition.SUSPECT) & (table.last_contact >= now)
+    for column in np.flatnonzero(in_contact):
+        mark_up(state, table.hosts[column], now)

@@ -7,11 +7,17 @@ from typing import Any
 
 from rosrm.core.master.checkpoint import images
 from rosrm.core.master.lifecycle import adopt_to_stop, note_awaited_ends, note_phase
-from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
+from rosrm.core.master.master_state import (
+    DesiredState,
+    MasterState,
+    Migration,
+    Process,
+    ProcessPhase,
+)
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state import migration
 from rosrm.core.master.state import process as processes
-from rosrm.core.master.state.migration import end_from_dict, way_back
+from rosrm.core.master.state.migration import end_from_dict, undo_steps
 from rosrm.core.master.state.process import Image, LeftBehind
 from rosrm.extensions.contracts import Intent
 from rosrm.model.codec import fields_from_plain, from_plain
@@ -39,7 +45,7 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     for program, amounts in intents("learned").items():
         state.learned.restore(program, amounts)
     removed = ((int(one["next"]), name) for name, one in intents("removed").items())
-    state.keeping.removed.update((name, end) for end, name in sorted(removed))
+    state.replication.removed.update((name, end) for end, name in sorted(removed))
     stored = sorted(intents("process").values(), key=lambda item: int(item["order"]))
     moves = intents("migration")
     for item in stored:
@@ -64,11 +70,11 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     process = Process(
         spec=from_plain(ProcessSpec, item["spec"]), phase=phase,
         since=now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
-        ended_on=item["host"] if phase.over else "",
+        ended_on=item["host"] if phase.is_terminal else "",
         left_behind=from_plain(LeftBehind, left) if left else None,
         **fields_from_plain(Process, item, processes.JOURNALED),
     )  # fmt: skip
-    if not phase.over:
+    if not phase.is_terminal:
         process.exit_code = None
     state.add_process(process)
     images.set_image(state, process, None if image is None else from_plain(Image, image))
@@ -83,7 +89,7 @@ def _restore_place(state: MasterState, process: Process, now: float) -> None:
     elif process.image is not None:
         trouble = process.reason if process.phase is ProcessPhase.CHECKPOINTED else ""
         images.note_checkpointed(state, process, now, trouble)
-    elif not process.phase.over:
+    elif not process.phase.is_terminal:
         _expect_to_run(state, process, now)
 
 
@@ -113,10 +119,10 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
     if owner is not None:
         note_phase(state, process, owner, now)
     elif process.instances:
-        if process.wanted is not Wanted.CANCEL:
-            process.wanted = Wanted.REQUEUE
+        if process.wanted is not DesiredState.CANCEL:
+            process.wanted = DesiredState.REQUEUE
         note_awaited_ends(state, process, now)
-    elif process.wanted is Wanted.CANCEL:
+    elif process.wanted is DesiredState.CANCEL:
         state.set_phase(process, ProcessPhase.CANCELLED, now)
     else:
         state.enqueue(process, now, "no instance of it was left when the master started")
@@ -130,12 +136,12 @@ def _restore_standby(
     if standby is None or int(standby["destination"]) not in process.instances:
         return
     try:
-        run = _run_of(state, process, standby, now)
+        restored = _restored_migration(state, process, standby, now)
     except (KeyError, TypeError, ValueError):
         state.instances[int(standby["destination"])].stopping = True  # it is replaced
         return
-    run.index = 0
-    state.standbys[process.name] = run
+    restored.index = 0
+    state.standbys[process.name] = restored
 
 
 # --- moves ------------------------------------------------------------------------------------
@@ -154,48 +160,50 @@ def _restore_move(
 ) -> bool:  # fmt: skip
     """Continue a migration; return False if that is impossible, and drop it."""
     try:
-        run = _run_of(state, process, move, now)
+        restored = _restored_migration(state, process, move, now)
     except (KeyError, TypeError, ValueError) as fault:
-        _forget_move(state, process, move, str(fault), now)
+        _discard_migration(state, process, move, str(fault), now)
         return False
     process.owner = int(item["owner"])
-    state.runs[process.name] = run
+    state.migrations[process.name] = restored
     for number in process.instances.intersection(move["stopping"]):
         state.instances[number].stopping = True
-    state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
+    state.set_phase(process, ProcessPhase.MIGRATING, now, restored.progress_text)
     goes_on = (
-        f"continues its move to {run.destination_host.name}"
-        if run.aim is Aim.MOVE
-        else f"continues: {run.course}"
+        f"continues its move to {restored.destination_host.name}"
+        if restored.aim is Aim.MOVE
+        else f"continues: {restored.progress_text}"
     )
     state.record(
         now, EventKind.MIGRATION_TAKEN_UP, f"{process.name} {goes_on}",
-        process=process.name, host=run.destination_host.name,
+        process=process.name, host=restored.destination_host.name,
     )  # fmt: skip
     return True
 
 
-def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: float) -> Run:
+def _restored_migration(
+    state: MasterState, process: Process, move: Mapping[str, Any], now: float
+) -> Migration:
     hosts = state.hosts.by_name
     plan = from_plain(Plan, move["plan"])
     wall = float(move.get("wall", state.wall))  # older journals lack it
     started = now - max(0.0, state.wall - wall)  # the clock may have been set back
-    run = Run(
+    restored = Migration(
         process.name, plan, started=started,
         source=InstanceId(process.name, int(move["source"])),
         source_host=hosts[move["source_host"]],
         destination=InstanceId(process.name, int(move["destination"])),
         destination_host=hosts[move["destination_host"]],
-        **fields_from_plain(Run, {"wall": wall, **move}, migration.JOURNALED),
+        **fields_from_plain(Migration, {"wall": wall, **move}, migration.JOURNALED),
     )  # fmt: skip
     if move["back"]:
-        run.undo = way_back(plan, run.turned_at)
+        restored.undo = undo_steps(plan, restored.turned_at)
     for number, end in move["ended"].items():
-        run.ended[int(number)] = end_from_dict(InstanceId(process.name, int(number)), end)
-    return run
+        restored.ended[int(number)] = end_from_dict(InstanceId(process.name, int(number)), end)
+    return restored
 
 
-def _forget_move(
+def _discard_migration(
     state: MasterState, process: Process, move: Mapping[str, Any], fault: str, now: float
 ) -> None:
     """Drop a migration: the owner of the name runs on, any other instance is stopped.

@@ -195,14 +195,14 @@ def _verdict(
     name, value = moment.hosts.host(at).name, float(moment.value[at])
     if value < np.inf:
         score = value - TIE * float(moment.hosts.processes[at])
-        reason = _said(moment, scores, at, veto=False)
+        reason = _policy_reason(moment, scores, at, veto=False)
         return Verdict(name, "chosen" if chosen else "fits", score, reason)
     if refused is not None:
         return Verdict(name, refused.filter.verdict, None, one_line(refused.reason))
-    return Verdict(name, "vetoed", None, _said(moment, scores, at, veto=True))
+    return Verdict(name, "vetoed", None, _policy_reason(moment, scores, at, veto=True))
 
 
-def _said(moment: Moment, scores: Scores | None, at: int, *, veto: bool) -> str:
+def _policy_reason(moment: Moment, scores: Scores | None, at: int, *, veto: bool) -> str:
     """Return the policy's own reason, or a note that the policy failed."""
     if scores is None or moment.policy is None:
         return ""

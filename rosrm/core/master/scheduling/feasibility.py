@@ -98,13 +98,13 @@ def _host_by_host(filters: Sequence[Filter], table: HostTable, demand: Demand) -
     named = listed[:_NAMED_HOSTS]
     columns = np.array([host.column for host in named], np.int64)
     found = refusals(filters, as_if_empty(table, demand, columns))
-    said = by_reason(
+    summary = by_reason(
         (host.name, first_line(refusal.reason))  # `rosrm explain` has the details
         for host, refusal in zip(named, found, strict=True)
         if refusal is not None
     )
     more = len(listed) - len(named)
-    return f"{said}; and {counted(more, 'more host')}" if more else said
+    return f"{summary}; and {counted(more, 'more host')}" if more else summary
 
 
 def _unmeasured(table: HostTable, demand: Demand) -> str:

@@ -194,7 +194,7 @@ def _why_not_accepting(hosts: Candidates, row: int) -> str:
 
 
 def _has_reported(hosts: Candidates) -> BoolArray:
-    return ~hosts.table.untold[hosts.columns]
+    return ~hosts.table.report_due[hosts.columns]
 
 
 def _why_not_reported(_hosts: Candidates, _row: int) -> str:

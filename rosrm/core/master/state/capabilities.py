@@ -29,7 +29,7 @@ class Answer:
 
 
 @dataclass(slots=True)
-class Abilities:
+class HostCapabilities:
     """The answers by strategy and host, for all strategies that do not work on every host."""
 
     answers: dict[tuple[str, str], Answer] = field(default_factory=dict)

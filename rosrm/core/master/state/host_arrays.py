@@ -41,7 +41,7 @@ class HostColumns:
         closed: (H,) cordoned or draining.
         untold: (H,) it was lost, and has not reported its instances since.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
-        heard, registered: (H,) time of the last contact; of the registration.
+        last_contact, registered: (H,) time of the last contact; of the registration.
         period: (H,) seconds between its readings.
         processes, bound: (H,) held or reserved; most of them.
         incarnation, sequence: (H,) of the slave's run; of its newest reading.
@@ -67,9 +67,9 @@ class HostColumns:
             "asking": np.zeros(columns, np.bool_),
             "accepting": np.zeros(columns, np.bool_),
             "closed": np.zeros(columns, np.bool_),
-            "untold": np.zeros(columns, np.bool_),
+            "report_due": np.zeros(columns, np.bool_),
             "stale": np.zeros(columns, np.uint32),
-            "heard": np.zeros(columns),
+            "last_contact": np.zeros(columns),
             "registered": np.full(columns, -np.inf),
             "period": np.zeros(columns),
             "processes": np.zeros(columns, np.int64),
@@ -114,9 +114,9 @@ class HostColumns:
         self.asking: BoolArray = used["asking"]
         self.accepting: BoolArray = used["accepting"]
         self.closed: BoolArray = used["closed"]
-        self.untold: BoolArray = used["untold"]
+        self.report_due: BoolArray = used["report_due"]
         self.stale: npt.NDArray[np.uint32] = used["stale"]
-        self.heard: FloatArray = used["heard"]
+        self.last_contact: FloatArray = used["last_contact"]
         self.registered: FloatArray = used["registered"]
         self.period: FloatArray = used["period"]
         self.processes: IntArray = used["processes"]

@@ -67,7 +67,7 @@ class Host:
             whose excess is on record without its end.
         drained: it is draining, and no process is left on it that can leave.
         pruned: it is in no listing, until it registers.
-        told: kind of a record that is not repeated at once, to the time of the record.
+        recorded_at: kind of a record that is not repeated at once, to the time of the record.
         blocked: cause of an eviction to the last recorded reason why nothing could leave.
         detached_since: time at which its slave was stopped, while it is detached.
         lost_since: time at which it was lost, while it is; of a detached host the time at which its
@@ -85,7 +85,7 @@ class Host:
     instances: set[int] = field(default_factory=set)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
-    told: dict[str, float] = field(default_factory=dict)
+    recorded_at: dict[str, float] = field(default_factory=dict)
     blocked: dict[str, str] = field(default_factory=dict)
     detached_since: float = 0.0
     lost_since: float = 0.0
@@ -129,7 +129,7 @@ class HostTable(HostColumns):
         self.hosts.append(host)
         self.by_name[name] = host
         self._listed = None
-        self.heard[host.column] = now
+        self.last_contact[host.column] = now
         self.condition[host.column] = HostCondition.EXPECTED
         self.set_closed(host, cordoned=cordoned, draining=draining)
         return host
@@ -152,9 +152,9 @@ class HostTable(HostColumns):
         self.usage[rows, column] = 0.0
         self.busy[rows, column] = self.load[rows, column]
         self.condition[column] = HostCondition.UP
-        self.asking[column] = self.accepting[column] = self.untold[column] = False
+        self.asking[column] = self.accepting[column] = self.report_due[column] = False
         self.stale[column] = 0
-        self.heard[column] = self.registered[column] = now
+        self.last_contact[column] = self.registered[column] = now
         self.bound[column] = description.max_processes or NO_BOUND
         self.period[column] = description.period
         self.incarnation[column] = description.incarnation
@@ -167,7 +167,7 @@ class HostTable(HostColumns):
         """Leave a host out of every listing until its slave registers, then as a new host."""
         host.pruned, host.description = True, HostDescription(host.name, 0)
         self._listed = None
-        for known in (host.over_since, host.over_at, host.told, host.blocked, host.failing):
+        for known in (host.over_since, host.over_at, host.recorded_at, host.blocked, host.failing):
             known.clear()
         self.incarnation[host.column] = 0
         self._labelled.clear()
@@ -231,7 +231,7 @@ class HostTable(HostColumns):
             self.bound[host.column] = bound
             self.touched.append(host.column)
 
-    def charge(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
+    def add_reservation(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
         """Add to (or, negative, take from) the reservations and process count of one host.
 
         `amount` is (R',) fractions, R' at most the resources known now.
@@ -295,7 +295,7 @@ class HostTable(HostColumns):
         silent = self.without_reading() | (self.accepting & ~self.asking)
         return np.flatnonzero(young & silent)
 
-    def unheard(self) -> list[int]:
+    def silent_hosts(self) -> list[int]:
         """Return the numbers of hosts that have reported and are silent now."""
         silent = np.isin(self.condition, _SILENT)
         return [int(column) + 1 for column in np.flatnonzero(silent)]
@@ -322,13 +322,13 @@ class HostTable(HostColumns):
 
     def statuses_missing(self) -> IntArray:
         """Return the columns of hosts with missing statuses, by their report or since a loss."""
-        behind = (self.reported > self.status_sequence) | self.untold
+        behind = (self.reported > self.status_sequence) | self.report_due
         return np.flatnonzero(behind & (self.condition == HostCondition.UP))
 
-    def set_untold(self, host: Host, *, untold: bool) -> None:
+    def set_report_due(self, host: Host, *, report_due: bool) -> None:
         """Set whether a lost host has rejoined without a report of its instances yet."""
-        if bool(self.untold[host.column]) is not untold:
-            self.untold[host.column] = untold
+        if bool(self.report_due[host.column]) is not report_due:
+            self.report_due[host.column] = report_due
             self.changed()
 
     def note_statuses(self, host: Host, sequence: int, now: float) -> bool | None:
@@ -341,7 +341,7 @@ class HostTable(HostColumns):
         if sequence <= newest:
             return None
         self.status_sequence[host.column] = sequence
-        self.heard[host.column] = now
+        self.last_contact[host.column] = now
         return sequence == newest + 1
 
     def is_accepting(self, host: Host) -> bool:

@@ -8,7 +8,7 @@ from rosrm.core.master.commands import OrderId
 
 
 @dataclass(slots=True)
-class Unwanted:
+class UnwantedImage:
     """An image that is to be removed.
 
     Attributes:
@@ -38,4 +38,4 @@ class Images:
     """
 
     of: set[str] = field(default_factory=set)
-    unwanted: dict[int, Unwanted] = field(default_factory=dict)
+    unwanted: dict[int, UnwantedImage] = field(default_factory=dict)

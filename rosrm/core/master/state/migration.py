@@ -32,7 +32,7 @@ class End:
 
 
 @dataclass(slots=True)
-class Heard:
+class HandoffReports:
     """Reports of the source or the destination of a handoff.
 
     Attributes:
@@ -60,7 +60,7 @@ class PlainPlan(Lazy):
 
 
 @dataclass(slots=True)
-class Run:
+class Migration:
     """A migration: the execution of a plan.
 
     Attributes:
@@ -82,7 +82,7 @@ class Run:
         suspended: numbers of the instances whose slave was ordered not to restart them. A later
             order may have allowed it again: its answer may arrive before the report of an end.
         ended: instance number to the end of that instance.
-        heard: instance number to its reports on a handoff.
+        handoff_reports: instance number to its reports on a handoff.
         taking_over: the destination was ordered to take over without its source.
         results: executor name to its result.
         aim: purpose of the plan. Source and destination of a checkpoint or a restore have the same
@@ -117,7 +117,7 @@ class Run:
     launched: set[int] = field(default_factory=set)
     suspended: set[int] = field(default_factory=set)
     ended: dict[int, End] = field(default_factory=dict)
-    heard: dict[int, Heard] = field(default_factory=dict)
+    handoff_reports: dict[int, HandoffReports] = field(default_factory=dict)
     taking_over: bool = False
     results: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     aim: Aim = Aim.MOVE
@@ -127,13 +127,13 @@ class Run:
         self.plain_plan = PlainPlan(self.plan)
 
     @property
-    def step_in_hand(self) -> Step | None:
+    def current_step(self) -> Step | None:
         """Return the current or next step; None: all are done."""
         steps = self._steps
         return steps[self.index] if self.index < len(steps) else None
 
     @property
-    def ahead(self) -> Sequence[Step]:
+    def remaining_steps(self) -> Sequence[Step]:
         """Return the steps not begun yet, in the current direction."""
         return self._steps[self.index + self.begun :]
 
@@ -142,18 +142,18 @@ class Run:
         return self.plan.steps if self.undo is None else self.undo
 
     @property
-    def so_far(self) -> Sequence[Step]:
+    def begun_steps(self) -> Sequence[Step]:
         """Return the steps of the plan that were or may have been begun on the way forward."""
         reached = self.index if self.undo is None else self.turned_at
         return self.plan.steps[: reached + 1]
 
     @property
-    def went_on(self) -> bool:
+    def destination_is_active(self) -> bool:
         """Return True if an executor has found the destination running: there is no way back."""
         return any(result.get("active") is True for result in self.results.values())
 
     @property
-    def course(self) -> str:
+    def progress_text(self) -> str:
         """Return the reason shown for the process during the migration."""
         host = self.destination_host.name
         return {
@@ -167,10 +167,10 @@ class Run:
         """Return the index of the plan's commit."""
         return next(at for at, step in enumerate(self.plan.steps) if isinstance(step, Commit))
 
-    def turn_back(self) -> None:
+    def begin_undo(self) -> None:
         """Undo from now on every step so far, the current one included, newest first."""
         self.turned_at = self.index
-        self.undo = way_back(self.plan, self.turned_at)
+        self.undo = undo_steps(self.plan, self.turned_at)
         self.index, self.begun = 0, False
 
     def how_ended(self, instance: InstanceId) -> str:
@@ -185,14 +185,14 @@ class Run:
 
     def phases_of(self, instance: InstanceId) -> Mapping[ReportPhase, str]:
         """Return all phases that the source or the destination has reported."""
-        heard = self.heard.get(instance.number)
-        return heard.phases if heard is not None else {}
+        reports = self.handoff_reports.get(instance.number)
+        return reports.phases if reports is not None else {}
 
 
-def way_back(plan: Plan, turned_at: int) -> Sequence[Step]:
+def undo_steps(plan: Plan, turned_at: int) -> Sequence[Step]:
     """Return the undo of the steps of a plan up to one of them, newest first."""
-    so_far = plan.steps[: turned_at + 1]
-    return [step.undo for step in reversed(so_far) if step.undo is not None]
+    begun_steps = plan.steps[: turned_at + 1]
+    return [step.undo for step in reversed(begun_steps) if step.undo is not None]
 
 
 #: Fields that the journal has unchanged: of a migration, of an end, and of the status of an end.
@@ -204,21 +204,23 @@ _END: Final = ("ordered", "completed", "gone")
 _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")
 
 
-def run_to_dict(run: Run, stopping: Sequence[int]) -> dict[str, Any]:
+def migration_to_dict(migration: Migration, stopping: Sequence[int]) -> dict[str, Any]:
     """Return all facts about a migration that a restarted master needs.
 
     Reports of a handoff are left out, because the nodes send them again.
 
     Args:
-        run: the migration.
+        migration: the migration.
         stopping: numbers of its instances that were ordered to stop.
     """
     return {
-        "plan": run.plain_plan, "back": run.undo is not None, "stopping": list(stopping),
-        "source": run.source.number, "source_host": run.source_host.name,
-        "destination": run.destination.number, "destination_host": run.destination_host.name,
-        "ended": {str(number): _end_to_dict(end) for number, end in run.ended.items()},
-        **fields_to_plain(run, JOURNALED),
+        "plan": migration.plain_plan, "back": migration.undo is not None,
+        "stopping": list(stopping),
+        "source": migration.source.number, "source_host": migration.source_host.name,
+        "destination": migration.destination.number,
+        "destination_host": migration.destination_host.name,
+        "ended": {str(number): _end_to_dict(end) for number, end in migration.ended.items()},
+        **fields_to_plain(migration, JOURNALED),
     }  # fmt: skip
 
 
@@ -227,6 +229,6 @@ def _end_to_dict(end: End) -> dict[str, Any]:
 
 
 def end_from_dict(instance: InstanceId, plain: Mapping[str, Any]) -> End:
-    """Return the end of an instance from `run_to_dict`, which has only the fields used later."""
+    """Return the end of an instance from `migration_to_dict`, with the fields used later."""
     status = InstanceStatus(instance, **fields_from_plain(InstanceStatus, plain, _STATUS))
     return End(status, **fields_from_plain(End, plain, _END))

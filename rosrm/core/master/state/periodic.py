@@ -45,8 +45,8 @@ class Periodic:
     """All periodic checkpoints, by the number of the instance.
 
     Attributes:
-        looked: time of the last review.
+        reviewed_at: time of the last review.
     """
 
     of: dict[int, Dumped] = field(default_factory=dict)
-    looked: float = -inf
+    reviewed_at: float = -inf

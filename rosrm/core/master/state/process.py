@@ -36,15 +36,15 @@ class ProcessPhase(str, Enum):
     CHECKPOINTED = "checkpointed"
 
     @property
-    def over(self) -> bool:
+    def is_terminal(self) -> bool:
         """Return True for a terminal phase, which only a client's request leaves."""
-        return self in _OVER
+        return self in _TERMINAL
 
 
-_OVER: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
+_TERMINAL: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
 
 
-class Wanted(str, Enum):
+class DesiredState(str, Enum):
     """Desired state of a process once its instance has ended."""
 
     RUN = "run"
@@ -59,7 +59,7 @@ class Instance:
     Attributes:
         state: as last reported by the slave; None: assigned, nothing reported yet.
         charged: (R',) reservation on its host, fractions.
-        amounts: base units that the assignment reserved.
+        demand: base units that the assignment reserved.
         estimated: resources whose amount is an estimate and stops counting after `settle`.
         since: time of the assignment.
         seen: newest usage in base units.
@@ -77,9 +77,9 @@ class Instance:
     id: InstanceId
     host: Host
     since: float
-    amounts: Mapping[str, float]
+    demand: Mapping[str, float]
     estimated: frozenset[str]
-    charged: FloatArray
+    reserved: FloatArray
     state: InstanceState | None = None
     pid: int = 0
     restarts: int = 0
@@ -88,7 +88,7 @@ class Instance:
     stopping: bool = False
     restarting: bool = False
     settled: bool = False
-    given_again: bool = False
+    redelivered: bool = False
     recalled: bool = False
     at_once: bool = False
     order_at: float = -inf
@@ -96,7 +96,7 @@ class Instance:
     ready_at: float = inf
 
     @property
-    def runs(self) -> bool:
+    def is_running(self) -> bool:
         """Return True if its slave reports that it runs, ready or not."""
         return self.state in _RUNS
 
@@ -200,7 +200,7 @@ class Process:
     order: int
     phase: ProcessPhase
     since: float
-    wanted: Wanted = Wanted.RUN
+    wanted: DesiredState = DesiredState.RUN
     owner: int = 0
     instances: set[int] = field(default_factory=set)
     reason: str = ""
@@ -211,7 +211,7 @@ class Process:
     exit_code: int | None = None
     ended_on: str = ""
     wall: float = 0.0
-    out_of_sight: tuple[ProcessPhase, float, float] | None = None
+    phase_before_loss: tuple[ProcessPhase, float, float] | None = None
     restarts: int = 0
     decision: Mapping[str, Any] | None = None
     decided_at: float = 0.0

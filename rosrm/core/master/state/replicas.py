@@ -13,13 +13,13 @@ from typing import Final
 from rosrm.core.master.commands import OrderId
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointPolicy
-from rosrm.model.values import EMPTY, KeptState
+from rosrm.model.values import EMPTY, SnapshotReport
 
 _IN_REACH: Final = frozenset({HostCondition.UP, HostCondition.SUSPECT})
 
 
 @dataclass(frozen=True, slots=True)
-class Holding:
+class Replica:
     """The newest snapshot of a process on one host.
 
     Attributes:
@@ -40,32 +40,32 @@ class Holding:
         return self.number, self.sequence
 
 
-class Holdings:
+class ReplicaIndex:
     """Index of snapshots: process to host to the newest snapshot there."""
 
     def __init__(self) -> None:
-        self._of: dict[str, dict[str, Holding]] = {}
+        self._of: dict[str, dict[str, Replica]] = {}
         self._on: dict[str, set[str]] = {}
 
-    def replace(self, host: str, states: Iterable[KeptState], now: float) -> None:
+    def replace(self, host: str, states: Iterable[SnapshotReport], now: float) -> None:
         """Replace the snapshots of a host by its report."""
-        told = {state.instance.process: state for state in states}
-        for process in self._on.get(host, set()) - told.keys():
-            self._forget(process, host)
-        for process, state in told.items():
+        reported = {state.instance.process: state for state in states}
+        for process in self._on.get(host, set()) - reported.keys():
+            self._remove(process, host)
+        for process, state in reported.items():
             known = self._of.setdefault(process, {})
             before = known.get(host)
             if before is None or before.age != (state.instance.number, state.sequence):
-                known[host] = Holding(state.instance.number, state.sequence, state.size, now)
-        self._on[host] = set(told)
+                known[host] = Replica(state.instance.number, state.sequence, state.size, now)
+        self._on[host] = set(reported)
 
-    def _forget(self, process: str, host: str) -> None:
+    def _remove(self, process: str, host: str) -> None:
         known = self._of[process]
         del known[host]
         if not known:
             del self._of[process]
 
-    def of(self, process: str) -> Mapping[str, Holding]:
+    def of(self, process: str) -> Mapping[str, Replica]:
         """Return the snapshots of a process by host; empty where none is known."""
         return self._of.get(process, EMPTY)
 
@@ -83,15 +83,15 @@ class Holdings:
 
 
 @dataclass(slots=True)
-class Told:
+class ReplicationOrder:
     """The last order to a slave about replicas of an instance's snapshot.
 
     Attributes:
         number: of the instance.
         incarnation: of the slave.
-        chosen: the policy has made this choice since the master started. False: the policy gives no
-            answer, and the hosts are those with a replica already.
-        taken: the slave has accepted.
+        by_policy: the policy has made this choice since the master started. False: the policy gives
+            no answer, and the hosts are those with a replica already.
+        accepted: the slave has accepted.
     """
 
     number: int
@@ -99,34 +99,34 @@ class Told:
     choice: CheckpointChoice
     order: OrderId
     at: float
-    chosen: bool = True
-    taken: bool = False
+    by_policy: bool = True
+    accepted: bool = False
 
 
 @dataclass(slots=True)
-class Keeping:
+class ReplicationState:
     """State of snapshot replication.
 
     Attributes:
         policy: chooses the hosts of replicas; None: snapshots stay on their own hosts alone.
         policy_name: in the configuration.
         holdings: index of snapshots by process and host.
-        told: process name to the last order to its slave.
+        last_orders: process name to the last order to its slave.
         dropped_at: time of the last order to a host to drop its replica of a process.
         removed: stateful processes that were removed, each with a number above those of all its
             instances.
         waiting: processes still to be reviewed in this round.
-        looked: time of the last review.
+        reviewed_at: time of the last review.
     """
 
     policy: CheckpointPolicy | None = None
     policy_name: str = ""
-    holdings: Holdings = field(default_factory=Holdings)
-    told: dict[str, Told] = field(default_factory=dict)
+    replicas: ReplicaIndex = field(default_factory=ReplicaIndex)
+    last_orders: dict[str, ReplicationOrder] = field(default_factory=dict)
     dropped_at: dict[tuple[str, str], float] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=dict)
     waiting: list[str] = field(default_factory=list)
-    looked: float = -inf
+    reviewed_at: float = -inf
 
     def in_reach(self, process: str, since: int, hosts: HostTable) -> tuple[str, ...]:
         """Return the hosts in reach with a snapshot of an instance from a number on, newest first.
@@ -134,9 +134,11 @@ class Keeping:
         Before them come the hosts that were to get a replica and have not reported one yet: it may
         have arrived since their report, and would then be newer than all others.
         """
-        known = self.holdings.hosts_of(process, since)
-        told = self.told.get(process)
-        asked = told.choice.hosts if told is not None and told.number >= since else ()
+        known = self.replicas.hosts_of(process, since)
+        last_order = self.last_orders.get(process)
+        asked = (
+            last_order.choice.hosts if last_order is not None and last_order.number >= since else ()
+        )
         return tuple(
             name
             for name in (*(name for name in asked if name not in known), *known)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 from std_msgs.msg import Int64, String
 
-from rosrm.node.handoff.state_parts import Part, StateError
+from rosrm.node.handoff.state_parts import StateError, StateTopic
 
 
 def part(*answers):
     """Return a part whose author's function gives these answers in turn."""
     left = iter(answers)
-    return Part("/state", Int64, lambda: next(left), lambda message: None)
+    return StateTopic("/state", Int64, lambda: next(left), lambda message: None)
 
 
 def test_what_was_wrong_is_said_again_while_nothing_has_changed():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rosrm.ros.master.reading_stats import Ledger
+from rosrm.ros.master.reading_stats import ReadingStats
 from rosrm.ros.reading_codec import Runs
 
 RUN = 500
@@ -21,14 +21,14 @@ def runs(*rows: tuple[int, int, int], incarnation: int = RUN, beat: int = 9) -> 
 
 
 @pytest.fixture
-def ledger() -> Ledger:
-    made = Ledger()
+def ledger() -> ReadingStats:
+    made = ReadingStats()
     for host in (1, 2):
         made.begin(host, RUN)
     return made
 
 
-def test_what_came_is_accounted_for(ledger: Ledger) -> None:
+def test_what_came_is_accounted_for(ledger: ReadingStats) -> None:
     """Cycles count, not messages; nothing is missed before the first message of a run."""
     ledger.take(runs((1, 40, 1), (2, 3, 3)), 0.0)
     ledger.take(runs((1, 42, 2)), 0.1)
@@ -36,7 +36,7 @@ def test_what_came_is_accounted_for(ledger: Ledger) -> None:
     assert (ledger.cycles, ledger.missed) == (6, 0)
 
 
-def test_a_gap_in_the_sequence_is_missed(ledger: Ledger) -> None:
+def test_a_gap_in_the_sequence_is_missed(ledger: ReadingStats) -> None:
     """Each cycle without a message counts."""
     ledger.take(runs((1, 1, 1)), 0.0)
     ledger.take(runs((1, 9, 2)), 0.1)
@@ -44,7 +44,7 @@ def test_a_gap_in_the_sequence_is_missed(ledger: Ledger) -> None:
     assert (ledger.cycles, ledger.missed) == (3, 6)
 
 
-def test_what_comes_late_is_missed_no_more(ledger: Ledger) -> None:
+def test_what_comes_late_is_missed_no_more(ledger: ReadingStats) -> None:
     """DDS may deliver in another order."""
     ledger.take(runs((1, 1, 1)), 0.0)
     ledger.take(runs((1, 4, 1)), 0.1)
@@ -57,7 +57,7 @@ def test_what_comes_late_is_missed_no_more(ledger: Ledger) -> None:
 
 
 @pytest.mark.parametrize("host", [0, 3, 10_000_000])
-def test_who_is_not_registered_is_not_entered(ledger: Ledger, host: int) -> None:
+def test_who_is_not_registered_is_not_entered(ledger: ReadingStats, host: int) -> None:
     """A former run of a registered host is ignored, too."""
     assert ledger.take(runs((host, 5, 5)), 0.0).tolist() == []
     assert ledger.take(runs((1, 5, 5), incarnation=RUN + 1), 0.0).tolist() == []
@@ -65,7 +65,7 @@ def test_who_is_not_registered_is_not_entered(ledger: Ledger, host: int) -> None
     assert ledger.ages(0.0) == (0, 0.0)
 
 
-def test_a_new_run_begins_anew(ledger: Ledger) -> None:
+def test_a_new_run_begins_anew(ledger: ReadingStats) -> None:
     """Its sequence starts again and its beat uses another clock; the old counts stay."""
     ledger.take(runs((1, 100, 1), beat=10**15), 0.0)
     ledger.begin(1, RUN + 1)
@@ -76,7 +76,7 @@ def test_a_new_run_begins_anew(ledger: Ledger) -> None:
     assert (ledger.cycles, ledger.missed) == (3, 0)
 
 
-def test_the_oldest_reading_is_that_of_the_most_silent_host(ledger: Ledger) -> None:
+def test_the_oldest_reading_is_that_of_the_most_silent_host(ledger: ReadingStats) -> None:
     """A host that left, or has been silent for long, is no longer awaited."""
     ledger.take(runs((1, 1, 1)), 0.0)
     ledger.take(runs((2, 1, 1)), 2.0)
@@ -87,7 +87,7 @@ def test_the_oldest_reading_is_that_of_the_most_silent_host(ledger: Ledger) -> N
     assert ledger.ages(3.0) == (1, 3.0)
 
 
-def test_the_books_grow(ledger: Ledger) -> None:
+def test_the_books_grow(ledger: ReadingStats) -> None:
     """Existing counts stay."""
     ledger.take(runs((1, 7, 1), beat=3), 1.0)
     ledger.begin(5000, RUN)

@@ -37,11 +37,11 @@ class FakeClient:
 def heard(links: HostLinks, beat: int, sequence: int) -> None:
     column = np.array([HOST], np.int64)
     one = np.ones(1, np.int64)
-    links.ledger.take(
+    links.reading_stats.take(
         Runs(column, np.array([RUN], np.uint64), one, one * sequence, np.array([beat], np.uint64),
              one), 0.0,
     )  # fmt: skip
-    links.heard([HOST])
+    links.reading_received([HOST])
 
 
 class Control:

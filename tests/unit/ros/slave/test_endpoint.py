@@ -11,8 +11,8 @@ from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import HostDescription
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.slave import endpoint
-from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
-from rosrm.ros.slave.journal_watermark import JournalSeen, Seen
+from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
+from rosrm.ros.slave.journal_watermark import JournalWatermark, Watermark
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
 
@@ -104,7 +104,7 @@ class Host:
         self.heard: list[float] = []
 
     def take(self, event) -> None:
-        if isinstance(event, events.MasterHears):
+        if isinstance(event, events.ContactConfirmed):
             self.heard.append(event.at)
         else:
             self.events.append(event)
@@ -147,7 +147,7 @@ class Master:
 class Slave:
     """Endpoint of a slave with its fake surroundings."""
 
-    def __init__(self, clock: Clock, seen: JournalSeen | None = None) -> None:
+    def __init__(self, clock: Clock, seen: JournalWatermark | None = None) -> None:
         self.clock, self.wire, self.host = clock, Wire(), Host()
         description = HostDescription("h0", 5)
         self.endpoint = SlaveEndpoint(
@@ -155,7 +155,7 @@ class Slave:
         )
 
     @property
-    def link(self) -> Link:
+    def link(self) -> MasterLink:
         return self.endpoint.link
 
     def sent(self, kind) -> list[Call]:
@@ -183,7 +183,7 @@ class Slave:
         """Greet the slave, send beats and accept its registration."""
         self.find(master)
         master.take_in()
-        assert self.link is Link.REGISTERED
+        assert self.link is MasterLink.REGISTERED
 
 
 @pytest.fixture
@@ -200,13 +200,13 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     old, new = Master(slave, 11, epoch=2), Master(slave, 12, epoch=epoch, pid=8)
     slave.join(old)
     slave.pass_time(2.0, old)
-    assert slave.link is Link.REGISTERED
+    assert slave.link is MasterLink.REGISTERED
     slave.pass_time(1.0, new)
     assert events.MasterLost() in slave.host.events
-    assert slave.link is Link.GREETING
+    assert slave.link is MasterLink.GREETING
 
     new.greet()
-    assert slave.link is Link.REGISTERING
+    assert slave.link is MasterLink.REGISTERING
     new.take_in()
     asked = len(slave.sent(srv.RequestProcess))
     slave.pass_time(PERIOD, new)
@@ -221,13 +221,13 @@ def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
     old, new = Master(slave, 11), Master(slave, 12, pid=8)
     slave.pass_time(PERIOD)
     old.greet()
-    assert slave.link is Link.LISTENING
+    assert slave.link is MasterLink.LISTENING
     slave.pass_time(1.0, new)
     assert slave.sent(srv.RegisterHost) == []
     slave.pass_time(3.0, new)  # the greeting has expired
     new.greet()
     new.take_in()
-    assert slave.link is Link.REGISTERED
+    assert slave.link is MasterLink.REGISTERED
 
 
 def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
@@ -235,12 +235,12 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     old, new = Master(slave, 11, pid=1), Master(slave, 12, pid=1)
     slave.join(old)
     slave.pass_time(1.0, new)
-    assert slave.link is Link.GREETING
+    assert slave.link is MasterLink.GREETING
     new.greet()
     new.take_in()
     assert slave.host.events[-1] == events.Registered(1, renumbers=True)
     slave.pass_time(5.0, new)
-    assert slave.link is Link.REGISTERED
+    assert slave.link is MasterLink.REGISTERED
     assert len(slave.sent(srv.RegisterHost)) == 2
     slave.pass_time(3.0)  # the new run is silent for a while
     slave.pass_time(PERIOD, new)
@@ -255,9 +255,9 @@ def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
     slave.join(ours)
     for epoch in (1, 2):
         slave.pass_time(3.0, ours, Master(slave, 12, epoch=epoch, pid=8))
-        assert slave.link is Link.REGISTERED
+        assert slave.link is MasterLink.REGISTERED
     Master(slave, 13, epoch=3, pid=9).beat()
-    assert slave.link is Link.SEARCHING
+    assert slave.link is MasterLink.SEARCHING
 
 
 def test_beats_say_that_the_master_hears_this_host(slave) -> None:
@@ -295,15 +295,15 @@ def test_an_answer_that_was_taken_in_late_greets_nobody(slave) -> None:
     slave.pass_time(PERIOD)
     slave.clock.now += 10.0
     ours.greet()
-    assert slave.link is Link.SEARCHING
+    assert slave.link is MasterLink.SEARCHING
 
 
 def test_a_silent_master_is_lost(slave) -> None:
     slave.join(Master(slave, 11))
     slave.pass_time(1.8)
-    assert slave.link is Link.REGISTERED
+    assert slave.link is MasterLink.REGISTERED
     slave.pass_time(0.6)
-    assert slave.link is not Link.REGISTERED
+    assert slave.link is not MasterLink.REGISTERED
     assert events.MasterLost() in slave.host.events
 
 
@@ -314,7 +314,7 @@ def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave, 
     told = []
     slave.endpoint.leave(lambda: told.append(slave.clock.now))
     slave.pass_time(0.6)
-    assert slave.link is not Link.REGISTERED
+    assert slave.link is not MasterLink.REGISTERED
     assert len(told) == 1
     assert not [line for line in caplog.messages if "keep running" in line]
 
@@ -381,14 +381,14 @@ def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_pa
     clock = Clock()
     monkeypatch.setattr(endpoint, "time", clock)
     path = tmp_path / "journal_seen"
-    slave = Slave(clock, JournalSeen(path))
+    slave = Slave(clock, JournalWatermark(path))
     old = Master(slave, 11, epoch=2)
     slave.join(old)
     assert slave.newest(srv.RegisterHost).request.journal_seen == 0
     old.beat(journal=40)
     old.beat(journal=41)
     slave.pass_time(PERIOD)
-    again = Slave(clock, JournalSeen(path))
+    again = Slave(clock, JournalWatermark(path))
     for one in (slave, again):
         told = Master(one, 12, epoch=3, pid=8)
         one.pass_time(3.0, told)
@@ -396,20 +396,20 @@ def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_pa
         assert one.newest(srv.RegisterHost).request.journal_seen == 41
         told.take_in()
         told.beat(journal=7)
-    assert JournalSeen(path).of_former_run("m", 12) == 0
-    assert JournalSeen(path).of_former_run("m", 13) == 7
-    assert JournalSeen(path).of_former_run("another", 13) == 0
+    assert JournalWatermark(path).of_former_run("m", 12) == 0
+    assert JournalWatermark(path).of_former_run("m", 13) == 7
+    assert JournalWatermark(path).of_former_run("another", 13) == 0
 
 
 def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -> None:
     """The slave's disk is full, or its file is invalid."""
     path = tmp_path / "journal_seen"
     path.write_bytes(b"\xff nonsense")
-    seen = JournalSeen(path)
+    seen = JournalWatermark(path)
     assert seen.of_former_run("m", 2) == 0
     path.unlink()
     path.mkdir()
-    seen.note(Seen(5, 1, "m"))
+    seen.note(Watermark(5, 1, "m"))
     assert seen.of_former_run("m", 2) == 5
 
 
@@ -419,12 +419,12 @@ def test_a_master_that_cannot_write_is_asked_again(slave, caplog) -> None:
     for _ in range(3):
         slave.find(ours)
         ours.take_in(code="journal", message="a full disk")
-        assert slave.link is Link.SEARCHING
+        assert slave.link is MasterLink.SEARCHING
     slave.find(ours)
     assert slave.endpoint.failure == ""
     assert [word for word in caplog.messages if "a full disk" in word] == caplog.messages[:1]
     ours.take_in()
-    assert slave.link is Link.REGISTERED
+    assert slave.link is MasterLink.REGISTERED
 
 
 def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) -> None:
@@ -438,5 +438,5 @@ def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) ->
     monkeypatch.setattr(slave.endpoint._reporter, "begin", fails)
     master.take_in()
     assert slave.wire.guard.failures == 1
-    assert slave.link is Link.SEARCHING
+    assert slave.link is MasterLink.SEARCHING
     monkeypatch.undo()

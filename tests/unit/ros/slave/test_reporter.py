@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.model.values import RESOURCE_SLOTS
-from rosrm.ros.master.reading_stats import Ledger
+from rosrm.ros.master.reading_stats import ReadingStats
 from rosrm.ros.reading_codec import decode
 from rosrm.ros.slave.reporter import RESOLUTION, Reporter
 
@@ -127,7 +127,7 @@ def test_the_newest_reading_can_be_told_before_its_time() -> None:
 )
 def test_each_cycle_is_either_accounted_for_or_missed(steps, lost, batch) -> None:
     """Both sides count the same cycles, whatever is idle and whatever is lost."""
-    slave, ledger = Slave(beat_period=0.4), Ledger()
+    slave, ledger = Slave(beat_period=0.4), ReadingStats()
     ledger.begin(HOST, RUN)
     for step in steps:
         slave.usage[0] = np.clip(slave.usage[0] + np.float32(step), 0.0, 1.0)

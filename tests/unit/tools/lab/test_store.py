@@ -12,7 +12,7 @@ import pytest
 from rosrm.errors import LabError
 from rosrm_lab import store
 from rosrm_lab.plan import LabPlan, uniform
-from rosrm_lab.store import Birth, Record
+from rosrm_lab.store import Birth, LabRecord
 from rosrm_lab.wires import Link
 
 
@@ -28,7 +28,7 @@ def folders(monkeypatch, tmp_path):
 def record(name="lab"):
     plan = LabPlan(name, tuple(uniform(2)), IPv4Network("10.9.8.0/24"))
     links = {"host1": Link().changed("in", cut=True), "host2": Link()}
-    return Record(plan, True, "boot", Birth(1, 2), {"host1": Birth(3, 4)}, links)
+    return LabRecord(plan, True, "boot", Birth(1, 2), {"host1": Birth(3, 4)}, links)
 
 
 def test_a_record_is_read_as_it_was_written():

@@ -227,7 +227,7 @@ def test_every_process_is_somewhere_exactly_once(hosts, plans):
     assert len(set(ended)) == len(ended) == outcome.finished
     running = [one.process for machine in made.machines.values() for one in machine.programs]
     assert not set(running) & set(ended)
-    moving = set(made.state.runs)
+    moving = set(made.state.migrations)
     assert all(running.count(name) == 1 for name in set(running) - moving)
     assert set(outcome.never_placed) == {
         name for name in made.state.processes if name not in outcome.placements

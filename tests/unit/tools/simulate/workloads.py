@@ -16,7 +16,7 @@ from rosrm_migration.handoff import Handoff, HandoffOptions
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 from rosrm_simulate.engine import Simulation
-from rosrm_simulate.workload import Curve, HostPlan, ProcessPlan, Workload
+from rosrm_simulate.workload import Curve, ProcessPlan, SimulatedHost, Workload
 from tests.unit.core.cluster import declared_by
 
 MIB = 2.0**20
@@ -24,14 +24,14 @@ EQ1 = ("weighted", Weighted(WeightedOptions()))
 STRATEGIES = {"relaunch": Relaunch(RelaunchOptions()), "handoff": Handoff(HandoffOptions())}
 
 
-def host(name: str, memory: float = 1024.0, cpu: float = 4.0, **fields) -> HostPlan:
+def host(name: str, memory: float = 1024.0, cpu: float = 4.0, **fields) -> SimulatedHost:
     """Return a host with `memory` MiB."""
     fields.setdefault("limits", {"memory": 0.8})
     resources = (
         ResourceDescription("memory", "B", memory * MIB),
         ResourceDescription("cpu", "core", cpu),
     )
-    return HostPlan(name, resources, **fields)
+    return SimulatedHost(name, resources, **fields)
 
 
 def plan(

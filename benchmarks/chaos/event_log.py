@@ -22,7 +22,7 @@ _KEPT: Final = {
 }
 
 
-class Story:
+class EventLog:
     """Lines with times, in seconds of the monotonic clock, as the lines of the workload have."""
 
     def __init__(self, seed: int) -> None:

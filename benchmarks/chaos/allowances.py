@@ -39,7 +39,7 @@ _RATE: Final = 10.0
 
 
 @dataclass(frozen=True)
-class Promise:
+class Guarantees:
     """The guarantees for a service.
 
     Attributes:
@@ -62,7 +62,7 @@ class Promise:
 
 
 @dataclass(frozen=True)
-class Harm:
+class Disturbance:
     """A fault, a request or an overload in the lab, and the deviations that it may explain.
 
     Attributes:
@@ -95,78 +95,87 @@ class Harm:
         return host in self.hosts or "*" in self.hosts
 
 
-def may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
+def may_end(
+    name: str, guarantees: Guarantees, run: Run, disturbances: Sequence[Disturbance]
+) -> bool:
     """Return True if a fault or a request explains the end of a run of a process."""
     return any(
-        harm.process == name or (harm.kills and harm.concerns(run.host)) for harm in harms
-    ) or _is_parted(promise, run, harms)
+        disturbance.process == name or (disturbance.kills and disturbance.concerns(run.host))
+        for disturbance in disturbances
+    ) or _is_parted(guarantees, run, disturbances)
 
 
-def _is_parted(promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
+def _is_parted(guarantees: Guarantees, run: Run, disturbances: Sequence[Disturbance]) -> bool:
     """Return True if the silence was long enough for its host or the master to end it."""
-    if not (promise.elsewhere or promise.isolated):
+    if not (guarantees.elsewhere or guarantees.isolated):
         return False
     until = run.last + _ENDING
-    here = [harm for harm in harms if harm.concerns(run.host)]
-    hidden = _silence([harm for harm in here if harm.hides], until)
-    deaf = _silence([harm for harm in here if harm.deafens], until)
+    here = [disturbance for disturbance in disturbances if disturbance.concerns(run.host)]
+    hidden = _silence([disturbance for disturbance in here if disturbance.hides], until)
+    deaf = _silence([disturbance for disturbance in here if disturbance.deafens], until)
     # In a cut, a host stops a process that is not isolated only if it cannot reach its slave.
-    return deaf >= _FENCED or hidden >= (_FENCED if promise.isolated else _LOST)
+    return deaf >= _FENCED or hidden >= (_FENCED if guarantees.isolated else _LOST)
 
 
-def _silence(harms: Iterable[Harm], until: float) -> float:
+def _silence(disturbances: Iterable[Disturbance], until: float) -> float:
     """Return the seconds until a moment that at least one of them covered; gaps do not count.
 
     A restarted part is silent until it is up.
     """
     silent, covered = 0.0, 0.0
-    for harm in sorted(harms, key=lambda one: one.begun):
-        begun = max(harm.begun, covered)
-        ended = min(harm.ended + (STARTING if harm.restarts else 0.0), until)
+    for disturbance in sorted(disturbances, key=lambda one: one.begun):
+        begun = max(disturbance.begun, covered)
+        ended = min(disturbance.ended + (STARTING if disturbance.restarts else 0.0), until)
         silent += max(0.0, ended - begun)
         covered = max(covered, ended)
     return silent
 
 
-def is_struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
+def is_struck(
+    name: str, guarantees: Guarantees, run: Run, disturbances: Sequence[Disturbance]
+) -> bool:
     """Return True if a run ended by force, and not by a migration."""
     return any(
-        (harm.process == name and harm.kind not in MOVES)
-        or (harm.kills and harm.concerns(run.host))
-        for harm in harms
-    ) or _is_parted(promise, run, harms)
+        (disturbance.process == name and disturbance.kind not in MOVES)
+        or (disturbance.kills and disturbance.concerns(run.host))
+        for disturbance in disturbances
+    ) or _is_parted(guarantees, run, disturbances)
 
 
-def unkept(one: Run, following: Run, harms: Sequence[Harm]) -> float:
+def unkept(one: Run, following: Run, disturbances: Sequence[Disturbance]) -> float:
     """Return the cycles that a successor may repeat because a disk was full; 0: no disk was.
 
     A successor on the same host restores the snapshot there, one on another host any replica.
     """
     since = [
-        harm.begun
-        for harm in harms
-        if harm.fills and (following.host != one.host or harm.concerns(one.host))
+        disturbance.begun
+        for disturbance in disturbances
+        if disturbance.fills and (following.host != one.host or disturbance.concerns(one.host))
     ]
     return _LAST_SECOND + _RATE * max(0.0, one.last - min(since)) if since else 0.0
 
 
 def most_behind(
-    name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
+    name: str, guarantees: Guarantees, one: Run, following: Run, disturbances: Sequence[Disturbance]
 ) -> float:
     """Return the cycles that the successor of a struck instance may repeat."""
-    if following.host == one.host and promise.kept:
+    if following.host == one.host and guarantees.kept:
         return _LAST_SECOND
     # For a migration the standby makes room. Where the migration fails, the replica is left.
-    asked = any(harm.kind in MOVES and harm.process == name for harm in harms)
-    second = asked or _is_struck_twice(promise, one, harms, name)
-    if promise.standby and not (second and promise.copied):
-        return LAST_CYCLES + _unseen(one, harms, one.host)
+    asked = any(
+        disturbance.kind in MOVES and disturbance.process == name for disturbance in disturbances
+    )
+    second = asked or _is_struck_twice(guarantees, one, disturbances, name)
+    if guarantees.standby and not (second and guarantees.copied):
+        return LAST_CYCLES + _unseen(one, disturbances, one.host)
     # The replica of a young instance may be its predecessor's, as young or in transit then.
     young = _RATE * 2 * _YOUNG if one.last - one.first < _YOUNG else 0.0
-    return promise.copied + young + _unseen(one, harms) if promise.copied else 0.0
+    return guarantees.copied + young + _unseen(one, disturbances) if guarantees.copied else 0.0
 
 
-def _is_struck_twice(promise: Promise, run: Run, harms: Sequence[Harm], name: str = "") -> bool:
+def _is_struck_twice(
+    guarantees: Guarantees, run: Run, disturbances: Sequence[Disturbance], name: str = ""
+) -> bool:
     """Return True if one fault hit its host, and another one the host of a replica or a standby.
 
     The host that holds it is not known here, so any other one counts. An overload does not count.
@@ -174,40 +183,52 @@ def _is_struck_twice(promise: Promise, run: Run, harms: Sequence[Harm], name: st
     Args:
         name: of the process, where a fault to itself counts too: its standby has the same name.
     """
-    blows = [harm for harm in harms if harm.kind != OVERLOAD and _is_blow(harm, name)]
+    blows = [
+        disturbance
+        for disturbance in disturbances
+        if disturbance.kind != OVERLOAD and _is_blow(disturbance, name)
+    ]
     here = [one for one in blows if one.process or one.concerns(run.host)]
     there = [one for one in blows if one.process or one.hosts - {run.host}]
     if any(one is not other for one in here for other in there):
         return True
     # Isolated processes, the standby included, stop at once wherever the master is not reachable.
-    return promise.isolated and any("*" in one.hosts for one in blows)
+    return guarantees.isolated and any("*" in one.hosts for one in blows)
 
 
-def _is_blow(harm: Harm, name: str) -> bool:
+def _is_blow(disturbance: Disturbance, name: str) -> bool:
     """Return True if it may take a replica or a standby out of reach."""
-    if harm.process:
-        return harm.process == name and harm.kind not in MOVES
-    silences = (harm.hides or harm.deafens) and _silence([harm], math.inf) >= _FENCED
-    return harm.kills or harm.fills or silences
+    if disturbance.process:
+        return disturbance.process == name and disturbance.kind not in MOVES
+    silences = (disturbance.hides or disturbance.deafens) and _silence(
+        [disturbance], math.inf
+    ) >= _FENCED
+    return disturbance.kills or disturbance.fills or silences
 
 
-def _unseen(run: Run, harms: Sequence[Harm], host: str = "") -> float:
+def _unseen(run: Run, disturbances: Sequence[Disturbance], host: str = "") -> float:
     """Return the cycles of a run that went unseen: a host was cut off, and the run continued.
 
     Args:
         host: that was cut off; "": any, because replicas may be on any.
     """
-    hiding = [harm for harm in harms if harm.hides and (not host or harm.concerns(host))]
+    hiding = [
+        disturbance
+        for disturbance in disturbances
+        if disturbance.hides and (not host or disturbance.concerns(host))
+    ]
     # A fault explains it, or else an overload, since the round began.
-    hiding = [harm for harm in hiding if harm.kind != OVERLOAD] or hiding
-    since = min((harm.begun for harm in hiding), default=run.last)
+    hiding = [disturbance for disturbance in hiding if disturbance.kind != OVERLOAD] or hiding
+    since = min((disturbance.begun for disturbance in hiding), default=run.last)
     return _RATE * max(0.0, run.last - since)
 
 
-def may_be_lost(promise: Promise, one: Run, following: Run, harms: Sequence[Harm]) -> bool:
+def may_be_lost(
+    guarantees: Guarantees, one: Run, following: Run, disturbances: Sequence[Disturbance]
+) -> bool:
     """Return True if the successor may lack a snapshot: no replica, none yet, or out of reach."""
     if following.host == one.host:
-        return not promise.kept
-    if _is_struck_twice(promise, one, harms) or one.last - one.first < _YOUNG:
+        return not guarantees.kept
+    if _is_struck_twice(guarantees, one, disturbances) or one.last - one.first < _YOUNG:
         return True
-    return not (promise.standby or promise.copied)
+    return not (guarantees.standby or guarantees.copied)

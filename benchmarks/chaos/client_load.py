@@ -33,30 +33,30 @@ _UNKNOWN: Final = ("it is not known whether", "old by this side's clock")
 
 
 @dataclass
-class Errand:
+class ClientRequest:
     """One request.
 
     Attributes:
         persistent: it is repeated until the master accepts it.
-        done: called by `Errands.collect` when it was answered.
+        done: called by `ClientLoad.collect` when it was answered.
         answer: the last one.
         unsure: it was sent more than once because an answer was lost.
     """
 
     request: Mapping[str, Any]
     persistent: bool = True
-    done: Callable[[Errand], None] | None = None
+    done: Callable[[ClientRequest], None] | None = None
     answer: dict[str, Any] = field(default_factory=dict)
     unsure: bool = False
 
 
-class Errands:
+class ClientLoad:
     """A client on the desk (the master's host) of a lab, and its thread."""
 
     def __init__(self, lab: Lab, log: Path, tell: Callable[[str], None]) -> None:
         self._tell = tell
-        self._queue: queue.Queue[Errand | None] = queue.Queue()
-        self._answered: queue.SimpleQueue[Errand] = queue.SimpleQueue()
+        self._queue: queue.Queue[ClientRequest | None] = queue.Queue()
+        self._answered: queue.SimpleQueue[ClientRequest] = queue.SimpleQueue()
         self._open = 0
         self._leaving = False
         self._lab = lab
@@ -68,7 +68,7 @@ class Errands:
     def _start_desk(self) -> subprocess.Popen[bytes]:
         with self._log.open("ab") as sink:
             return self._lab.popen(
-                DESK, [sys.executable, "-m", "benchmarks.chaos.desk"], cwd=str(ROOT),
+                DESK, [sys.executable, "-m", "benchmarks.chaos.client_process"], cwd=str(ROOT),
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=sink,
             )  # fmt: skip
 
@@ -87,33 +87,35 @@ class Errands:
         self._thread.join(10.0)
         self._desk.communicate()
 
-    def send(self, errand: Errand) -> Errand:
+    def send(self, client_request: ClientRequest) -> ClientRequest:
         """Queue a request behind those sent before."""
         self._open += 1
-        self._queue.put(errand)
-        return errand
+        self._queue.put(client_request)
+        return client_request
 
     def collect(self) -> bool:
         """Call `done` for each answered request; return True if no request is open."""
         while not self._answered.empty():
-            errand = self._answered.get()
+            client_request = self._answered.get()
             self._open -= 1
-            if errand.done is not None:
-                errand.done(errand)
+            if client_request.done is not None:
+                client_request.done(client_request)
         return self._open == 0
 
     def _serve(self) -> None:
-        while (errand := self._queue.get()) is not None:
-            self._run(errand)
-            self._answered.put(errand)
+        while (client_request := self._queue.get()) is not None:
+            self._run(client_request)
+            self._answered.put(client_request)
 
-    def _run(self, errand: Errand) -> None:
+    def _run(self, client_request: ClientRequest) -> None:
         while not self._leaving:
-            errand.answer = self._ask(errand.request)
-            if not errand.persistent or _accepted(errand):
+            client_request.answer = self._ask(client_request.request)
+            if not client_request.persistent or _accepted(client_request):
                 return
-            errand.unsure = errand.unsure or _may_have_been_taken(errand.answer)
-            self._tell(f"{errand.request['do']} is asked again: {errand.answer}")
+            client_request.unsure = client_request.unsure or _may_have_been_taken(
+                client_request.answer
+            )
+            self._tell(f"{client_request.request['do']} is asked again: {client_request.answer}")
             time.sleep(_PAUSE)  # no master, or no room at the master: the client asks again
 
     def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,7 +152,7 @@ def _may_have_been_taken(answer: Mapping[str, Any]) -> bool:
     return "no_master" in answer or any(words in refusal for words in _UNKNOWN)
 
 
-def _accepted(errand: Errand) -> bool:
-    if errand.unsure and _KNOWN in errand.answer.get("refused", ""):
+def _accepted(client_request: ClientRequest) -> bool:
+    if client_request.unsure and _KNOWN in client_request.answer.get("refused", ""):
         return True
-    return errand.answer.keys().isdisjoint({"refused", "no_master"})
+    return client_request.answer.keys().isdisjoint({"refused", "no_master"})
