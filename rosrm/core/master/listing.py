@@ -8,15 +8,10 @@ from typing import Any, Final
 from rosrm.core.master.assignment.assign import decide_now
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
-from rosrm.core.master.master_state import (
-    DesiredState,
-    Instance,
-    MasterState,
-    Process,
-    ProcessPhase,
-)
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy
 

@@ -24,6 +24,11 @@ class StepFailed:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class StepTimedOut(StepFailed):
+    """The current step of a plan was not done in time."""
+
+
 StepOutcome = StepProgress | StepFailed
 
 

@@ -8,9 +8,10 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.hosts.liveness import lease_of
-from rosrm.core.master.master_state import DesiredState, MasterState, Process, ProcessPhase
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.requests import count, known_host, known_processes, refuse
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
 from rosrm.model.event_kinds import EventKind
 from rosrm.wording import counted, listed
@@ -89,7 +90,7 @@ def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:
             f"again. Stop its slave if it runs; a host can be pruned once it has left or is lost, "
             f"which is after {lease_of(state, host):g} s of silence"
         )
-    held = [state.instances[number] for number in sorted(host.instances)]
+    held = state.instances_of(host)
     owned = [one.id.process for one in held if (process := state.owned_by(one)) is not None
              and process.wanted is not DesiredState.CANCEL]  # fmt: skip
     if owned and condition is HostCondition.LEFT:
@@ -101,10 +102,8 @@ def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:
     for instance in held:
         if instance.id.process in state.migrations:
             return f"{instance.id.process} is moving from or to {host.name}"
-    for name in state.images.of:
-        image = state.processes[name].image
-        if image is not None and image.host == host.name:
-            return f"the image of {name} is on {host.name}; cancel {name} first"
+    for name in state.images_on(host):
+        return f"the image of {name} is on {host.name}; cancel {name} first"
     return ""
 
 
@@ -115,11 +114,11 @@ def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
         the processes that may still run there, and the command that stops them; "" if none may.
     """
     ends_all = state.hosts.condition_of(host) is HostCondition.LEFT
-    held = [] if ends_all else [state.instances[number] for number in sorted(host.instances)]
     state.hosts.prune(host)
-    for number in sorted(host.instances):
-        lifecycle.gone(state, state.instances[number], now, f"{host.name} was pruned")
-    names = list(dict.fromkeys(instance.id.process for instance in held))
+    held = state.instances_of(host)
+    for instance in held:
+        lifecycle.gone(state, instance, now, f"{host.name} was pruned")
+    names = [] if ends_all else list(dict.fromkeys(instance.id.process for instance in held))
     for process in [state.processes[name] for name in names if name in state.processes]:
         if process.phase is ProcessPhase.CANCELLED:
             process.reason = f"it may still run on {host.name}, which was removed"

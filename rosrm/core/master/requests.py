@@ -13,11 +13,12 @@ from rosrm.core.master.checkpoint import image_requests, images, replication
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
-from rosrm.core.master.master_state import WAITING, DesiredState, MasterState, Process, ProcessPhase
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
 from rosrm.core.master.migration.start import why_busy
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import no_standby

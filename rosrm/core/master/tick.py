@@ -14,16 +14,11 @@ from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
 from rosrm.core.master.lifecycle import stop_instance
-from rosrm.core.master.master_state import (
-    DesiredState,
-    Instance,
-    MasterState,
-    Process,
-    ProcessPhase,
-)
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import evict_from_hosts
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
+from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.orders import ReportInstances
 
 #: Seconds between two ticks; this work need not be done with every event.

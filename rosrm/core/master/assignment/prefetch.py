@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core.master.master_state import Instance, MasterState
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.process import Instance
 from rosrm.model.values import InstanceState, InstanceStatus, Kind, ProcessSpec
 
 #: Seconds: jobs that run no longer than this on average are short.
@@ -35,11 +36,7 @@ def review_slots(state: MasterState, host: Host, now: float) -> None:
     most = host.description.max_processes
     if not most:
         return
-    running = [
-        instance
-        for instance in (state.instances[number] for number in host.instances)
-        if instance.is_running
-    ]
+    running = [instance for instance in state.instances_of(host) if instance.is_running]
     ahead = len(running) >= most and all(_ends_soon(state, one, now) for one in running)
     state.hosts.set_bound(host, most + ahead)
 

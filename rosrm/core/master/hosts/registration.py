@@ -15,9 +15,10 @@ from rosrm.core.master.commands import Reply
 from rosrm.core.master.hosts import loss
 from rosrm.core.master.hosts.liveness import lease_end, mark_up
 from rosrm.core.master.hosts.readings import take_readings
-from rosrm.core.master.master_state import DesiredState, MasterState, ProcessPhase
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.process import DesiredState, ProcessPhase
 from rosrm.extensions.contracts import Intent
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from operator import attrgetter
+from typing import Any, Final
 
+from rosrm.extensions.declared_fields import STANDARD_FIELDS
 from rosrm.model.values import EMPTY, ProcessSpec
+
+_standard_of: Final = attrgetter(*STANDARD_FIELDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +37,11 @@ class Demand:
     key: tuple[Any, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        spec = self.spec
         key = (
-            spec.package, spec.executable, spec.module, spec.command,
-            spec.namespace, spec.kind, spec.priority, _key(spec.needs),
-            _key(self.amounts), self.estimated, _key(self.excluded), self.headroom,
-            _key(spec.required_labels), _key(spec.preferred_labels), _key(spec.avoided_labels),
-            self.near,
+            *map(_key, _standard_of(self.spec)), _key(self.amounts), self.estimated,
+            _key(self.excluded), self.headroom, self.near,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
-            *(repr(getattr(spec, name)) for name in self.reads),
+            *(repr(getattr(self.spec, name)) for name in self.reads),
         )  # fmt: skip
         object.__setattr__(self, "key", key)
 
@@ -51,5 +51,8 @@ class Demand:
         return frozenset(name for name, much in self.amounts.items() if much > 0) - self.estimated
 
 
-def _key(mapping: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
-    return tuple(sorted(mapping.items())) if mapping else ()
+def _key(value: Any) -> Any:
+    """Return a value in a form that can be hashed."""
+    if not isinstance(value, Mapping):
+        return value
+    return tuple(sorted(value.items())) if value else ()

@@ -11,8 +11,7 @@ from typing import Any, Final
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.lazy import Lazy
-from rosrm.model.codec import to_plain
+from rosrm.core.master.state.lazy import Plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
 
@@ -42,6 +41,8 @@ class ProcessPhase(str, Enum):
 
 
 _TERMINAL: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
+#: Phases of processes that wait for a host.
+WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 
 
 class DesiredState(str, Enum):
@@ -54,19 +55,19 @@ class DesiredState(str, Enum):
 
 @dataclass(slots=True)
 class Instance:
-    """One run of a process on one host, as the master sees it.
+    """One start of a process on one host, as the master sees it.
 
     Attributes:
-        state: as last reported by the slave; None: assigned, nothing reported yet.
-        charged: (R',) reservation on its host, fractions.
+        since: time of the assignment.
         demand: base units that the assignment reserved.
         estimated: resources whose amount is an estimate and stops counting after `settle`.
-        since: time of the assignment.
+        reserved: (R',) reservation on its host, fractions.
+        state: as last reported by the slave; None: assigned, nothing reported yet.
         seen: newest usage in base units.
         peak: highest usage seen.
-        settled: its estimates no longer count.
         restarting: it was ordered to restart, and no report shows the restart yet.
-        given_again: the assignment was delivered again, because its slave did not accept it.
+        settled: its estimates no longer count.
+        redelivered: its assignment was delivered twice, because its slave did not accept it.
         recalled: a former run of the master ordered it to stop, so its end counts as ordered.
         at_once: it is to end without delay, because another instance owns the name.
         order_at: time of the last order to stop it, or to withdraw it; -inf: none.
@@ -112,13 +113,7 @@ _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 @dataclass(frozen=True, slots=True)
 class LeftBehind:
-    """The owning instance of a process on a host that was lost, as long as it has no successor.
-
-    Attributes:
-        number: of the instance.
-        host: name of the host.
-        node_name: name of its node, where that is not the process's name.
-    """
+    """The owning instance of a process on a host that was lost, as long as it has no successor."""
 
     number: int
     host: str
@@ -148,21 +143,6 @@ class Image:
     needs: Mapping[str, float] = field(default_factory=dict)
 
 
-class PlainSpec(Lazy):
-    """A spec as JSON, rendered once for all the intents that contain it."""
-
-    __slots__ = ("_spec",)
-
-    def __init__(self, spec: ProcessSpec) -> None:
-        super().__init__()
-        self._spec = spec
-
-    def render(self) -> Mapping[str, Any]:
-        """Return all fields of the spec."""
-        plain: Mapping[str, Any] = to_plain(self._spec)
-        return plain
-
-
 #: Fields of a process that the journal has unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
@@ -178,8 +158,9 @@ class Process:
         since: start of its phase by this master's clock; before the master's own start, where the
             journal has it.
         wall: unix time at which its phase began.
-        out_of_sight: its phase when its host was lost, with the start of that phase (`since` and
-            `wall`); None: its host reports, or the process has another phase since.
+        phase_before_loss: its phase when its host was lost, with the start of that phase (`since`
+            and `wall`); None: its host reports, or the process has had another phase since.
+        wanted: its desired state.
         born: lowest number that an instance of it can have; snapshots of lower ones are void.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
@@ -207,7 +188,7 @@ class Process:
     excluded: dict[str, str] = field(default_factory=dict)
     born: int = 0
     migrations: int = 0
-    moved_at: float = float("-inf")
+    moved_at: float = -inf
     exit_code: int | None = None
     ended_on: str = ""
     wall: float = 0.0
@@ -222,10 +203,10 @@ class Process:
     standby_reason: str = ""
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     demand: tuple[int, Demand] | None = None
-    plain: PlainSpec = field(init=False)
+    plain: Plain = field(init=False)
 
     def __post_init__(self) -> None:
-        self.plain = PlainSpec(self.spec)
+        self.plain = Plain(self.spec)
 
     @property
     def name(self) -> str:
