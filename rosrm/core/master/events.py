@@ -304,15 +304,8 @@ class TimePassed:
     """Time passed without another event; deadlines are checked."""
 
 
-Event = (
-    HostRegistered
-    | HostLeft
-    | ProcessRequested
-    | ReadingsReceived
-    | StatusesReceived
-    | UsagesReceived
-    | KeptStatesReceived
-    | SubmissionReceived
+ClientRequest = (
+    SubmissionReceived
     | CancelRequested
     | RestartRequested
     | MigrationRequested
@@ -320,6 +313,15 @@ Event = (
     | RestoreRequested
     | HostStateRequested
     | PruneRequested
+)
+#: Events that are answered by a `Reply`.
+Request = HostRegistered | HostLeft | ProcessRequested | ClientRequest
+Event = (
+    Request
+    | ReadingsReceived
+    | StatusesReceived
+    | UsagesReceived
+    | KeptStatesReceived
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported

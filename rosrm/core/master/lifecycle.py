@@ -202,7 +202,7 @@ def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: flo
 
 
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
-    """Order an instance to stop for good; the order is repeated until it has ended."""
+    """Order an instance to stop for good; `tick` repeats the order until it has ended."""
     instance.stopping = True
     order: Order = FenceInstance(instance.id) if instance.at_once else StopInstance(instance.id)
     state.send(instance.host, order)

@@ -1,9 +1,11 @@
-"""Outcomes of the steps of a plan, and of requests that may be turned down."""
+"""Outcomes of the steps of a plan, and of requests that may be refused."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+
+from rosrm.core.master.commands import RefusalCode
 
 
 class StepProgress(Enum):
@@ -46,3 +48,11 @@ class Rejected:
     """
 
     reason: str
+
+
+class RequestRefused(Exception):
+    """A client's request is refused, and nothing has changed; the message goes to the client."""
+
+    def __init__(self, message: str, code: RefusalCode = "invalid") -> None:
+        super().__init__(message)
+        self.code = code

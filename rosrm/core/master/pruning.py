@@ -9,7 +9,8 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.hosts.liveness import lease_of
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.requests import count, known_host, known_processes, refuse
+from rosrm.core.master.outcomes import RequestRefused
+from rosrm.core.master.requests import count, known_host, known_processes
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
@@ -22,10 +23,7 @@ _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
 def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
     """Remove the named processes and hosts, or all that ended or left; all of them, or none."""
     if event.names or event.hosts:
-        found = _named(state, event, now)
-        if found is None:
-            return
-        processes, hosts = found
+        processes, hosts = _named(state, event, now)
     else:
         ended = [state.processes[name] for name in state.terminal]
         processes = [process for process in ended if not _why_not_pruned(state, process)]
@@ -48,23 +46,14 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
 
 def _named(
     state: MasterState, event: happened.PruneRequested, now: float
-) -> tuple[list[Process], list[Host]] | None:
-    """Return the processes and hosts that a request names; None: it was refused."""
-    processes = known_processes(state, event.request, event.names)
-    if processes is None:
-        return None
-    hosts = []
-    for name in dict.fromkeys(event.hosts):
-        host = known_host(state, event.request, name)
-        if host is None:
-            return None
-        hosts.append(host)
+) -> tuple[list[Process], list[Host]]:
+    """Return the processes and hosts that a request names; refuse it if one cannot be removed."""
+    processes = known_processes(state, event.names)
+    hosts = [known_host(state, name) for name in dict.fromkeys(event.hosts)]
     faults = [_why_not_pruned(state, process) for process in processes]
     faults += [_why_not_pruned_host(state, host, now) for host in hosts]
-    for fault in faults:
-        if fault:
-            refuse(state, event.request, f"{fault}. Nothing was removed")
-            return None
+    for fault in filter(None, faults):
+        raise RequestRefused(f"{fault}. Nothing was removed")
     return processes, hosts
 
 

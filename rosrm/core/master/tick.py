@@ -78,11 +78,9 @@ def _cancel_prefetch(state: MasterState, instance: Instance, now: float) -> None
     """Return a prefetched process to its place in the queue, because its slot stays taken."""
     review_slots(state, instance.host, now)
     process = state.owned_by(instance)
-    if (
-        process is not None
-        and process.wanted is DesiredState.RUN
-        and process.name not in state.migrations
-    ):
+    if process is None or process.name in state.migrations:
+        return
+    if process.wanted is DesiredState.RUN:
         process.wanted = DesiredState.REQUEUE
         state.save(process)
         stop_instance(state, instance, now)

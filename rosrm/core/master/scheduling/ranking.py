@@ -217,7 +217,7 @@ class Ranking:
 
 
 def _tiers(table: HostTable, demand: Demand) -> IntArray | None:
-    """Return the tier of each host, (H,), lower first; None: all are alike.
+    """Return the tier of each host, (H,), lower first; None: all are equal.
 
     Avoided labels count up, preferred labels and hosts count down.
     """
