@@ -107,12 +107,12 @@ def _process(
     process, wrong = salvaged(ProcessInFile, node, problems)
     if process is None:
         return None
-    for complaint in complaints(process, wrong):
-        problems.add(node.deepest(complaint.path).place, complaint.text)
-    process = _on_host(process, path)
-    if options is not None:
-        process = replace(process, migration=replace(process.migration, options=options))
     spec = process.spec()
+    for complaint in complaints(spec, wrong):
+        problems.add(node.deepest(complaint.path).place, complaint.text)
+    spec = _on_host(spec, path)
+    if options is not None:
+        spec = replace(spec, migration=replace(spec.migration, options=options))
     fault = plugins.standby_fault(spec) if wrong.isdisjoint(("standby", "migration")) else ""
     if fault:
         problems.add(node.deepest(("standby",)).place, fault)
@@ -134,11 +134,11 @@ def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] 
     return {name: value for name, value in checked.items() if name in said}
 
 
-def _on_host(process: ProcessInFile, path: str | Path) -> ProcessInFile:
-    """Return the process with its program and directory as `settled_on_host` writes them."""
-    directory, command = process.working_directory, process.command
+def _on_host(spec: ProcessSpec, path: str | Path) -> ProcessSpec:
+    """Return the spec with its program and directory as `settled_on_host` writes them."""
+    directory, command = spec.working_directory, spec.command
     if directory:
-        process = replace(process, working_directory=settled_on_host(directory, path))
+        spec = replace(spec, working_directory=settled_on_host(directory, path))
     if command and "/" in command[0]:
-        process = replace(process, command=(settled_on_host(command[0], path), *command[1:]))
-    return process
+        spec = replace(spec, command=(settled_on_host(command[0], path), *command[1:]))
+    return spec
