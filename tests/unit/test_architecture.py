@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,16 @@ def test_repository_keeps(what: str) -> None:
 
     if run.returncode != 0:
         pytest.fail(f"{' '.join(COMMANDS[what])}\n{run.stdout}{run.stderr}", pytrace=False)
+
+
+def test_a_package_that_lists_its_modules_lists_all_of_them():
+    for init in (ROOT / "rosrm").rglob("__init__.py"):
+        docstring = ast.get_docstring(ast.parse(init.read_text())) or ""
+        listed = set(re.findall(r"\b[a-z]\w*(?:\.py|/)", docstring))
+        if any(name.endswith(".py") for name in listed):
+            inner = {path.parent for path in init.parent.glob("*/__init__.py")}
+            files = {path.name for path in init.parent.glob("[a-z]*.py")}
+            assert listed == files | {f"{folder.name}/" for folder in inner}, init
 
 
 def test_no_name_of_a_shipped_plugin_decides_anything():
