@@ -39,7 +39,7 @@ class HostColumns:
         asking: (H,) it has asked for work since its registration.
         accepting: (H,) by its newest reading it is under all its limits.
         closed: (H,) cordoned or draining.
-        untold: (H,) it was lost, and has not reported its instances since.
+        report_due: (H,) it was lost, and has not reported its instances since.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
         last_contact, registered: (H,) time of the last contact; of the registration.
         period: (H,) seconds between its readings.
