@@ -9,9 +9,9 @@ from typing import Final
 
 import typer
 
+from rosrm.cli.options import seconds_of
 from rosrm.client.waiting import UNTIL_ASKED, WaitResult
-from rosrm.errors import ConfigError, NoMaster
-from rosrm.extensions.units import Quantity
+from rosrm.errors import NoMaster
 from rosrm.model.rows import ProcessRow
 from rosrm.wording import listed, standing
 
@@ -19,11 +19,8 @@ _NOTEWORTHY: Final = UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
 
 
 def longest(text: str) -> float | None:
-    """Return a time-out of the command line in seconds; None for "". Raises `ConfigError`."""
-    try:
-        return Quantity("duration", above=True).parse(text) if text else None
-    except ValueError as error:
-        raise ConfigError(f"--timeout: {error}") from None
+    """Return the option --timeout in seconds, None for ""; raises `ConfigError`."""
+    return seconds_of("--timeout", text) if text else None
 
 
 @contextmanager

@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from rosrm import config
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, Host, Name, Names
 from rosrm.errors import ConfigError
@@ -17,7 +18,6 @@ from rosrm.wording import counted
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
-    from rosrm.model.values import ProcessSpec
 
 Wait = Annotated[
     bool, typer.Option("--wait", help="Wait for the result; exit 1 with the reason if it failed.")
@@ -56,10 +56,9 @@ def submit(
     If one process cannot be queued, none is.
     """
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
-    from rosrm.config import load_work
 
     limit = longest(timeout)
-    specs = [spec for file in files for spec in load_work(file)]
+    specs = [spec for file in files for spec in config.load_work(file)]
     with connection.master(ctx, domain) as client:
         typer.echo(client.submit(specs))
         if wait:
@@ -92,7 +91,7 @@ def cancel(
     if everything == bool(chosen):
         raise ConfigError("cancel: give names of processes or work files, or --all")
     named = [word for word in chosen if not _is_file(word)]
-    filed = [spec.name for word in chosen if _is_file(word) for spec in _load(word)]
+    filed = [spec.name for word in chosen if _is_file(word) for spec in config.load_work(word)]
     with connection.master(ctx, domain) as client:
         if everything or filed:
             live = [row.name for row in client.list_processes() if row.state not in ENDED]
@@ -113,12 +112,6 @@ def cancel(
 
 def _is_file(word: str) -> bool:
     return word == "-" or "/" in word or word.endswith(_FILE_ENDINGS)
-
-
-def _load(file: str) -> Sequence[ProcessSpec]:
-    from rosrm.config import load_work
-
-    return load_work(file)
 
 
 def restart(

@@ -18,7 +18,6 @@ from rich.live import Live
 
 from rosrm.cli.output import tables, top
 from rosrm.errors import ConfigError, NoMaster
-from rosrm.extensions.units import Quantity
 from rosrm.model.rows import Listing
 
 #: Least seconds between two views.
@@ -30,14 +29,6 @@ _HINT: Final = "q quits; sort: s state, c CPU, m memory, n name"
 #: Lines that are not of hosts and processes: title (two), heads, events, hint and gaps.
 _OTHER_LINES: Final = 13
 _LEAST_ROWS: Final = 5
-
-
-def period_of(text: str) -> float:
-    """Return the option --period in seconds; raises `ConfigError`."""
-    try:
-        return Quantity("duration", low=LEAST_PERIOD).parse(text)
-    except ValueError as error:
-        raise ConfigError(f"--period: {error}") from None
 
 
 def sort_of(text: str) -> str:
