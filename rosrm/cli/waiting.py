@@ -13,7 +13,7 @@ from rosrm.cli.options import seconds_of
 from rosrm.client.waiting import UNTIL_ASKED, WaitResult
 from rosrm.errors import NoMaster
 from rosrm.model.rows import ProcessRow
-from rosrm.wording import listed, standing
+from rosrm.wording import listed, standing, words
 
 _NOTEWORTHY: Final = UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
 
@@ -44,7 +44,7 @@ def show_change(row: ProcessRow) -> None:
 
 def show_processes(result: WaitResult) -> None:
     """Print the result of a wait for processes; exit with 1 if they are not done."""
-    counts = Counter(row.state.replace("_", " ") for row in result.processes)
+    counts = Counter(words(row.state) for row in result.processes)
     summary = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
     typer.echo(summary or "all processes were removed")
     states = {row.name: row.state for row in result.processes}

@@ -12,10 +12,9 @@ from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import expanded
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
-from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, complaints
-from rosrm.config.rules import check_amounts, check_name, settled_on_host
+from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, settled_on_host
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches

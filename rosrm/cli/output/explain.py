@@ -8,8 +8,8 @@ from typing import Any, Final
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from rosrm.cli.output import formats, tables
-from rosrm.wording import counted, listed
+from rosrm.cli.output import tables
+from rosrm.wording import amount, counted, duration, listed, size, words
 
 #: Wording of each decision of the master about a process.
 _DECIDED: Final = {
@@ -50,7 +50,7 @@ def _parts(story: Mapping[str, Any]) -> Iterator[RenderableType]:
         name = story["process"]
         yield Text(f"Older events are left out: `rosrm events --process {name}`", "dim")
     for entry in history:
-        ago = f"{formats.duration(entry['elapsed'])} ago"
+        ago = f"{duration(entry['elapsed'])} ago"
         yield tables.entry(f"{ago:>14}", entry["kind"], entry["message"])
 
 
@@ -66,8 +66,8 @@ def _headline(story: Mapping[str, Any]) -> Text:
 def _kept(replicas: list[Mapping[str, Any]]) -> Text:
     """Return the hosts with a replica of the snapshot, and the cycle of each."""
     places = [
-        f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
-        f"{formats.duration(one['elapsed'])} ago)"
+        f"{one['host']} (cycle {one['sequence']}, {size(one['size'])}, "
+        f"{duration(one['elapsed'])} ago)"
         for one in replicas
     ]
     return Text(f"Snapshots of its state are on {listed(places)}.")
@@ -79,23 +79,21 @@ def _checkpoint(told: Mapping[str, Any]) -> Text:
         text = "No periodic checkpoint of its memory exists yet"
     else:
         text = (
-            f"The last periodic checkpoint is {formats.duration(told['elapsed'])} old "
-            f"({formats.size(told['size'])}; the process was paused for {told['pause']:.1f} s)"
+            f"The last periodic checkpoint is {duration(told['elapsed'])} old "
+            f"({size(told['size'])}; the process was paused for {told['pause']:.1f} s)"
         )
     return Text(f"{text}: {told['trouble']}" if told["trouble"] else f"{text}.")
 
 
 def _sentence(name: str, decision: Mapping[str, Any]) -> Text:
-    ago = f" {formats.duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
-    said = _DECIDED.get(decision["kind"], "{process}: " + formats.words(decision["kind"]))
+    ago = f" {duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
+    said = _DECIDED.get(decision["kind"], "{process}: " + words(decision["kind"]))
     what = said.format(process=name, host=decision.get("chosen"), ago=ago)
     return Text(f"{what}. Scoring policy: {decision['policy'] or 'none'}; the lowest score wins.")
 
 
 def _needs(need: Mapping[str, float]) -> Text:
-    amounts = [
-        f"{name} {formats.amount(value, _UNITS.get(name, ''))}" for name, value in need.items()
-    ]
+    amounts = [f"{name} {amount(value, _UNITS.get(name, ''))}" for name, value in need.items()]
     return Text(f"Needs that were counted: {', '.join(amounts) or 'none'}.")
 
 

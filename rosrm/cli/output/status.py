@@ -9,8 +9,9 @@ from rich.console import Group, RenderableType
 from rich.styled import Styled
 from rich.text import Text
 
-from rosrm.cli.output import formats, tables
+from rosrm.cli.output import tables
 from rosrm.model.rows import HostRow, Listing, PluginRow, ProcessRow
+from rosrm.wording import duration, words
 
 #: States of a process that need an operator's attention.
 _TROUBLE = ("stuck", "unreachable", "unknown", "failed", "set_aside", "backoff")
@@ -23,7 +24,7 @@ def render(snapshot: Listing) -> RenderableType:
 
 
 def _lines(snapshot: Listing) -> Iterator[RenderableType]:
-    yield Text(f"master     {snapshot.master}, up {formats.duration(snapshot.uptime)}")
+    yield Text(f"master     {snapshot.master}, up {duration(snapshot.uptime)}")
     yield Text(f"hosts      {_counted(row.state for row in snapshot.hosts)}{_set(snapshot.hosts)}")
     yield Text(f"processes  {_counted(row.state for row in snapshot.processes)}")
     if snapshot.hosts:
@@ -38,7 +39,7 @@ def _lines(snapshot: Listing) -> Iterator[RenderableType]:
 
 def _counted(states: Iterable[str]) -> str:
     counts = Counter(states)
-    return ", ".join(f"{n} {formats.words(word)}" for word, n in counts.most_common()) or "none"
+    return ", ".join(f"{n} {words(word)}" for word, n in counts.most_common()) or "none"
 
 
 def _set(hosts: Iterable[HostRow]) -> str:

@@ -18,8 +18,9 @@ from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.text import Text
 
-from rosrm.cli.output import formats, tables
+from rosrm.cli.output import tables
 from rosrm.model.rows import HostRow, Listing, ProcessRow, ResourceRow
+from rosrm.wording import duration, percent, size, words
 
 #: Most processes in a view, if the height of the terminal is unknown.
 ROWS: Final = 18
@@ -112,13 +113,10 @@ def _title(snapshot: Listing, note: str, width: int) -> Iterator[Text]:
     """Yield the title; if it wraps, a number and its state stay on one line."""
     counts = Counter(row.state for row in snapshot.processes)
     states = sorted(counts, key=_rank)
-    parts = [
-        Text(f"{counts[word]} {formats.words(word)}", tables.STYLES.get(word, ""))
-        for word in states
-    ]
+    parts = [Text(f"{counts[word]} {words(word)}", tables.STYLES.get(word, "")) for word in states]
     if note:
         parts.append(Text(note, "bold yellow"))
-    line = Text(f"{snapshot.master}  {formats.duration(snapshot.uptime)}", "bold")
+    line = Text(f"{snapshot.master}  {duration(snapshot.uptime)}", "bold")
     for part in parts:
         if line.cell_len + 3 + part.cell_len > width:
             yield line
@@ -178,7 +176,7 @@ def bar(resource: ResourceRow, width: int = _BAR) -> Text:
             text.append("▒", style)
         else:
             text.append("░", "dim")
-    return text.append(f" {formats.percent(resource.usage):>3}%", style)
+    return text.append(f" {percent(resource.usage):>3}%", style)
 
 
 def _cells(fraction: float, width: int) -> int:
@@ -227,9 +225,9 @@ def _processes(
         "NAME": [Text(row.name) for row in shown],
         "STATE": [tables.state(row.state) for row in shown],
         "HOST": [Text(row.host) for row in shown],
-        "SINCE": [Text(formats.duration(row.since)) for row in shown],
+        "SINCE": [Text(duration(row.since)) for row in shown],
         "CPU": [tables.age(row, f"{row.cpu:.2f}" if row.pid else "") for row in shown],
-        "MEMORY": [tables.age(row, formats.size(row.memory) if row.pid else "") for row in shown],
+        "MEMORY": [tables.age(row, size(row.memory) if row.pid else "") for row in shown],
     }
     longest = max(cell_len(_why(row)) for row in shown)
     for column in _LEAVE:
