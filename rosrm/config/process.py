@@ -262,8 +262,8 @@ def _about_program(spec: ProcessSpec) -> Iterator[Complaint]:
     }
     given = [name for name, value in programs.items() if value]
     if len(given) != 1:
-        said = f"{listed(given)} are given" if given else "no program is given"
-        yield Complaint((), f"{said}; give one of package + executable, module or command")
+        fault = f"{listed(given)} are given" if given else "no program is given"
+        yield Complaint((), f"{fault}; give one of package + executable, module or command")
     elif spec.package and not spec.executable:
         text = f"package {spec.package!r} is given without an executable"
         yield Complaint(("package",), text)

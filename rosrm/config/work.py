@@ -127,10 +127,10 @@ def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] 
     strategy, given = node.get("migration", "strategy"), node.get("migration", "options")
     if strategy is None or not isinstance(strategy.value, str):
         return None
-    said = given.items if given is not None else {}
-    options = given if said else None
+    own = given.items if given is not None else {}
+    options = given if own else None
     checked = plugins.choice("migration", strategy.value, strategy, options, own=True)
-    return {name: value for name, value in checked.items() if name in said}
+    return {name: value for name, value in checked.items() if name in own}
 
 
 def _on_host(spec: ProcessSpec, path: str | Path) -> ProcessSpec:

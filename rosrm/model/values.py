@@ -1,7 +1,7 @@
 """Values of the core: processes, instances, hosts, resources.
 
-Seconds, bytes and fractions 0..1 are the base units. All values are frozen; mutable state lives in
-the reducers of `rosrm.core` and in the standing arrays of `hosts.py`.
+Seconds, bytes and fractions 0..1 are the base units. All values are frozen; mutable state is in
+`rosrm.core`.
 """
 
 from __future__ import annotations

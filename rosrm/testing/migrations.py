@@ -276,14 +276,13 @@ class MigrationContract:
                     "instances": list(pids),
                 }  # fmt: skip
                 self._check_executor(step)
-                told = {**step.arguments, "results": results, "here": here}
-                told = json.loads(json.dumps(told))
+                given = json.loads(json.dumps({**step.arguments, "results": results, "here": here}))
                 who, execute = (
                     f"the executor {step.executor!r}",
                     self.offer.executors[step.executor],
                 )
                 try:
-                    answer = call(who, step.timeout, partial(execute, told))
+                    answer = call(who, step.timeout, partial(execute, given))
                 except ContractBroken:
                     raise
                 except Exception:  # noqa: BLE001, S112 - an executor may fail its step by raising

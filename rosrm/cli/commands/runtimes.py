@@ -56,7 +56,7 @@ def master(
     if recover:
         typer.echo(_recover(settings.state), err=True)
     with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
-        typer.echo(_says(settings), err=True)
+        typer.echo(_master_summary(settings), err=True)
     become("rosrm.master", settings.to_json())
 
 
@@ -103,7 +103,7 @@ def slave(
         registry.default_probes()  # raises if there is none
     remedy = "another `host:` and `state:`"
     with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
-        typer.echo(_says_of_host(settings), err=True)
+        typer.echo(_slave_summary(settings), err=True)
     become("rosrm.slave", settings.to_json())
 
 
@@ -143,14 +143,14 @@ def _recover(state: Path) -> str:
         return recover(state / "journal.sqlite")
 
 
-def _says(settings: ClusterConfig) -> str:
+def _master_summary(settings: ClusterConfig) -> str:
     return (
         f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.scoring.policy}; "
         f"migration {', '.join(settings.migration.strategies) or 'none'}; state in {settings.state}"
     )
 
 
-def _says_of_host(settings: HostConfig) -> str:
+def _slave_summary(settings: HostConfig) -> str:
     limits = ", ".join(f"{name} {limit:.0%}" for name, limit in settings.limits.items())
     return (
         f"slave of {settings.host!r}: {settings.ros.describe()}; scope {settings.scope}; "

@@ -259,8 +259,8 @@ def _reasons(rows: Sequence[ProcessRow], room: int) -> list[str]:
 def _without_beginning(row: ProcessRow, reasons: set[str], room: int) -> str:
     """Return a reason from the word on at which it differs visibly from the other reasons."""
     shared = max((_alike(row.reason, other) for other in reasons - {row.reason}), default=0)
-    said = _BEGINNINGS.get(row.state, "")
-    begin = len(said) if said and row.reason.startswith(said) else 0
+    beginning = _BEGINNINGS.get(row.state, "")
+    begin = len(beginning) if beginning and row.reason.startswith(beginning) else 0
     if shared > max(begin, room // 2):
         enough = max(0, len(row.reason) - room)  # from there on the rest fits
         begin = max(begin, row.reason.find(" ", min(shared - 1, enough)) + 1)
