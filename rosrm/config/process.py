@@ -14,12 +14,16 @@ from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Sec
 from rosrm.model.values import (
     EMPTY,
     Health,
+    HostLossAction,
     HostLossPolicy,
+    IsolationAction,
     IsolationPolicy,
     Kind,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
+    ReadinessKind,
+    RestartCondition,
     RestartPolicy,
     StandbyPolicy,
     StopPolicy,
@@ -40,7 +44,7 @@ ListOfWords = Annotated[tuple[Text, ...], Words()]
 class RestartInFile:
     """Policy for restarts of an ended process on its host; `kind` gives the default of `when`."""
 
-    when: Literal["never", "on-failure", "always"] | None = None
+    when: RestartCondition | None = None
     delay: Seconds = _RESTART.delay
     max_delay: Seconds = _RESTART.max_delay
     factor: Annotated[float, Quantity(low=1.0, high=100.0)] = _RESTART.factor
@@ -61,7 +65,7 @@ class MigrationInFile:
 class ReadinessInFile:
     """Condition for an instance to count as ready."""
 
-    kind: Literal["auto", "graph", "running"] = "auto"
+    kind: ReadinessKind = "auto"
     timeout: PositiveSeconds = _READINESS.timeout
 
 
@@ -77,7 +81,7 @@ class StopInFile:
 class HostLossInFile:
     """Reaction of the master when the host of a process is lost."""
 
-    then: Literal["wait", "elsewhere", "stop"] = "wait"
+    then: HostLossAction = "wait"
     delay: Seconds = 0.0
 
 
@@ -85,7 +89,7 @@ class HostLossInFile:
 class IsolationInFile:
     """Reaction of a host that cannot reach the master; 0 s: before the process runs elsewhere."""
 
-    then: Literal["keep", "stop"] = "keep"
+    then: IsolationAction = "keep"
     after: Seconds = 0.0
 
 

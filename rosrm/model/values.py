@@ -19,6 +19,11 @@ ABSURD_USAGE: Final = 64.0
 
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 
+RestartCondition = Literal["never", "on-failure", "always"]
+ReadinessKind = Literal["auto", "graph", "running"]
+HostLossAction = Literal["wait", "elsewhere", "stop"]
+IsolationAction = Literal["keep", "stop"]
+
 
 class Kind(str, Enum):
     """Duration of a process: until it is stopped (service), or until its own end (job)."""
@@ -39,7 +44,7 @@ class RestartPolicy:
         window: seconds; after as long without a restart, the count begins at 0 again.
     """
 
-    when: Literal["never", "on-failure", "always"] = "never"
+    when: RestartCondition = "never"
     delay: float = 1.0
     max_delay: float = 30.0
     factor: float = 2.0
@@ -57,7 +62,7 @@ class Readiness:
         timeout: seconds; not ready by then, the start has failed.
     """
 
-    kind: Literal["auto", "graph", "running"] = "auto"
+    kind: ReadinessKind = "auto"
     timeout: float = 30.0
 
 
@@ -108,7 +113,7 @@ class HostLossPolicy:
         delay: seconds after the loss until that is done.
     """
 
-    then: Literal["wait", "elsewhere", "stop"] = "wait"
+    then: HostLossAction = "wait"
     delay: float = 0.0
 
 
@@ -121,7 +126,7 @@ class IsolationPolicy:
         after: seconds; 0: so soon that it has ended when a successor starts elsewhere.
     """
 
-    then: Literal["keep", "stop"] = "keep"
+    then: IsolationAction = "keep"
     after: float = 0.0
 
 

@@ -66,14 +66,23 @@ _RIGHT: Final = ("SINCE", "CPU", "MEMORY")
 
 @dataclass(frozen=True)
 class TopView:
-    """View of a listing, for a rich console of any width."""
+    """View of a listing, for a rich console of any width.
+
+    Attributes:
+        snapshot: listing with hosts and processes; its events are shown, if any.
+        rows: most processes shown.
+        events: most events shown.
+        note: text beside the title.
+        sort: order of the processes, a key of `SORTS`.
+        foot: the last line.
+    """
 
     snapshot: Listing
-    rows: int
-    events: int
-    note: str
-    sort: str
-    foot: str
+    rows: int = ROWS
+    events: int = 4
+    note: str = ""
+    sort: str = "state"
+    foot: str = ""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the parts from top to bottom."""
@@ -90,23 +99,6 @@ class TopView:
                 yield Text(tables.event_line(event), "dim", no_wrap=True, overflow="ellipsis")
         if self.foot:
             yield Text(self.foot, "dim italic", no_wrap=True, overflow="ellipsis")
-
-
-def render(
-    snapshot: Listing, *, rows: int = ROWS, events: int = 4, note: str = "", sort: str = "state",
-    foot: str = "",
-) -> RenderableType:  # fmt: skip
-    """Return the view of a listing.
-
-    Args:
-        snapshot: listing with hosts and processes; its events are shown, if any.
-        rows: most processes shown.
-        events: most events shown.
-        note: text beside the title.
-        sort: order of the processes, a key of `SORTS`.
-        foot: the last line.
-    """
-    return TopView(snapshot, rows, events, note, sort, foot)
 
 
 def _title(snapshot: Listing, note: str, width: int) -> Iterator[Text]:

@@ -54,7 +54,7 @@ def show(look: Callable[[], Listing], period: float, count: int, sort: str) -> N
     snapshot, note = look(), ""
     for shown in itertools.count(1):
         rows = top.ROWS if console.is_terminal else len(snapshot.processes)
-        console.print(top.render(snapshot, rows=rows, note=note, sort=sort))
+        console.print(top.TopView(snapshot, rows=rows, note=note, sort=sort))
         if shown == count:
             return
         time.sleep(period)
@@ -69,7 +69,7 @@ def _keep_up_to_date(
     with _keyboard() as key, Live(console=console, auto_refresh=False) as screen:
         for shown in itertools.count(1):
             rows = max(_LEAST_ROWS, console.height - _OTHER_LINES - len(snapshot.hosts))
-            picture = top.render(snapshot, rows=rows, note=note, sort=sort, foot=_HINT)
+            picture = top.TopView(snapshot, rows=rows, note=note, sort=sort, foot=_HINT)
             screen.update(picture, refresh=True)
             if shown == count:
                 return
