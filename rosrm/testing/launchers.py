@@ -66,7 +66,7 @@ class LauncherContract:
         return None if prepared is None else required(prepared, Launch)
 
     def test_prepares_a_command_line_of_text(self) -> None:
-        """The supervisor starts it, with an environment of text."""
+        """The launcher returns a command line and an environment of text for the supervisor."""
         prepared = self._prepared(self.make(), self.launch())
         if prepared is not None:
             assert prepared.argv, "the command line is empty"
@@ -75,13 +75,13 @@ class LauncherContract:
                 assert all(isinstance(text, str) for text in item), f"environment: {item}"
 
     def test_starts_the_same_instance(self) -> None:
-        """The order stays as the master gave it."""
+        """The launcher does not change the assignment."""
         launch = self.launch()
         prepared = self._prepared(self.make(), launch)
         assert prepared is None or prepared.assignment == launch.assignment
 
-    def test_says_nothing_of_a_process_that_it_has_not_started(self) -> None:
-        """Each launcher is asked about the instances of all others."""
+    def test_denies_instances_of_other_launchers(self) -> None:
+        """The launcher answers no for any process that it has not started."""
         launcher: object = self.make()
         if implements(launcher, ProcessTreeLauncher):
             leads = call("leads", CALL_LIMIT, partial(launcher.leads, os.getpid()))
@@ -91,7 +91,7 @@ class LauncherContract:
             assert gone is False, f"has_departed answered {gone} for another process"
 
     def test_discards_images_that_are_not_there(self) -> None:
-        """A user may restart any process."""
+        """The launcher accepts an instance without images: a user may restart any process."""
         launcher: object = self.make()
         if implements(launcher, ImageLauncher):
             instance = InstanceId(self.spec.name, 999)

@@ -231,7 +231,7 @@ class MigrationContract:
                         "a SetRestart before the Commit needs an undo with the policy of the spec"
                     )
 
-    def test_a_silent_source_goes_on_only_when_its_successor_has_given_up(self) -> None:
+    def test_a_silent_source_resumes_only_when_its_successor_has_given_up(self) -> None:
         """The undo of SWITCH is ABORT, and an earlier SHADOW has the undo RESUME."""
         for move in self.moves():
             undone_by = {
