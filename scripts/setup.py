@@ -51,7 +51,7 @@ PROGRESS = re.compile(
 
 
 class SetupError(Exception):
-    """What cannot be done, where, and what to do about it."""
+    """An error for the user: what is wrong, where, and what to do about it."""
 
 
 def main() -> int:
