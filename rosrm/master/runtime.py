@@ -100,11 +100,11 @@ class MasterRuntime:
         config: ClusterConfig,
         policy: ScoringPolicy,
         strategies: dict[str, MigrationStrategy],
-        plugins: Sequence[PluginRow] = (),
-        fallback: tuple[str, ScoringPolicy] | None = None,
-        checkpoint: CheckpointPolicy | None = None,
+        plugins: Sequence[PluginRow],
+        fallback: tuple[str, ScoringPolicy] | None,
+        checkpoint: CheckpointPolicy | None,
         *,
-        declared: Declared | None = None,
+        declared: Declared,
     ) -> None:
         self._config = config
         self._fallback = fallback

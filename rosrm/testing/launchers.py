@@ -1,4 +1,4 @@
-"""The contract of a launcher: the behaviour that the slave relies on."""
+"""Contract of launchers with the slave."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import sys
 from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
-from types import SimpleNamespace
 from typing import ClassVar
 from unittest import SkipTest
 
@@ -20,20 +19,18 @@ from rosrm.extensions.contracts import (
     LauncherOffer,
     ProcessTreeLauncher,
 )
-from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.plugin_calls import implements, required
-from rosrm.extensions.registry import Registry
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec
 from rosrm.slave.launch.launchers import PREPARE_LIMIT
-from rosrm.testing.calls import ContractBroken, call
+from rosrm.testing.calls import ContractBroken, call, registry_of
 
 
 class LauncherContract:
-    """The behaviour of a launcher that the slave relies on.
+    """Contract of a launcher with the slave.
 
     Attributes:
-        offer: what is tested.
+        offer: the tested offer.
         spec: of a process whose strategy declares this launcher.
     """
 
@@ -42,12 +39,8 @@ class LauncherContract:
 
     def make(self) -> Launcher:
         """Return a new launcher of a slave with an empty directory."""
-        hook = hookimpl(specname="register_launchers")(lambda: [self.offer])
-        registry = Registry.of(tested=SimpleNamespace(register_launchers=hook))
-        if registry.broken:
-            raise ContractBroken(registry.broken[0].reason)
         context = LauncherContext(Path(mkdtemp(prefix="rosrm-")), sys.executable, 1)
-        found = registry.launchers(context)
+        found = registry_of("launcher", self.offer).launchers(context)
         if found.absent:
             raise SkipTest(f"{self.offer.name} is absent: {found.absent[self.offer.name]}")
         if found.broken:
