@@ -34,7 +34,7 @@ def ros_settings(
     """
     settings = RosSettings()
     if path := cluster or os.environ.get(CLUSTER_VARIABLE):
-        from rosrm.config import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
+        from rosrm.config.cluster import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
 
         settings = load_cluster(os.fspath(path)).ros
     return settings if domain is None else replace(settings, domain=domain)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rosrm import config
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, Host, Name, Names
 from rosrm.errors import ConfigError
@@ -56,9 +55,10 @@ def submit(
     If one process cannot be queued, none is.
     """
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
+    from rosrm.config.work import load_work
 
     limit = longest(timeout)
-    specs = [spec for file in files for spec in config.load_work(file)]
+    specs = [spec for file in files for spec in load_work(file)]
     with connection.master(ctx, domain) as client:
         typer.echo(client.submit(specs))
         if wait:
@@ -91,7 +91,7 @@ def cancel(
     if everything == bool(chosen):
         raise ConfigError("cancel: give names of processes or work files, or --all")
     named = [word for word in chosen if not _is_file(word)]
-    filed = [spec.name for word in chosen if _is_file(word) for spec in config.load_work(word)]
+    filed = [name for word in chosen if _is_file(word) for name in _names_in(word)]
     with connection.master(ctx, domain) as client:
         if everything or filed:
             live = [row.name for row in client.list_processes() if row.state not in ENDED]
@@ -112,6 +112,12 @@ def cancel(
 
 def _is_file(word: str) -> bool:
     return word == "-" or "/" in word or word.endswith(_FILE_ENDINGS)
+
+
+def _names_in(file: str) -> list[str]:
+    from rosrm.config.work import load_work
+
+    return [spec.name for spec in load_work(file)]
 
 
 def restart(

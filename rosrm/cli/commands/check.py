@@ -114,9 +114,11 @@ def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
 
 def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     """Return a summary of a file; raises `ConfigError`."""
-    from rosrm.config import load_cluster, load_host, load_work
+    from rosrm.config.cluster import load_cluster
     from rosrm.config.documents import read
+    from rosrm.config.host import load_host
     from rosrm.config.kinds import kind_of
+    from rosrm.config.work import load_work
     from rosrm.core.master.graph_names import shared_nodes
 
     root = read(file)

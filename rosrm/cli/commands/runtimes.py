@@ -82,7 +82,8 @@ def slave(
     The slave runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes
     too, unless the file has `on_stop: keep`.
     """
-    from rosrm.config import HostConfig, load_host
+    from rosrm.config.host import load_host
+    from rosrm.config.settings import HostConfig
     from rosrm.extensions.registry import Registry
     from rosrm.runtime.state_lock import only_one
 

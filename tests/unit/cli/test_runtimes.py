@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.cli.commands import runtimes
-from rosrm.config import ClusterConfig, HostConfig
+from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.extensions.contracts import Intent, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.extensions.installed import installed_plugins
 from rosrm.extensions.registry import Registry
