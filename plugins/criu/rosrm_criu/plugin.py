@@ -25,7 +25,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             capabilities=capabilities,
             summary="the whole memory of a portable node is dumped, and restored elsewhere",
             executors={
-                plans.ABILITY: _when_asked("move", "say_ability"),
+                plans.ABILITY: _when_asked("move", "report_capability"),
                 plans.INTRODUCE: _when_asked("move", "introduce"),
                 plans.CHECKPOINT: _when_asked("move", "checkpoint"),
                 plans.GO_ON: _when_asked("move", "go_on"),
