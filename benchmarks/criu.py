@@ -28,7 +28,7 @@ from typing import Any, Final
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm.errors import LabError
-from rosrm_criu.engine.probe import ability
+from rosrm_criu.engine.probe import criu_support
 from rosrm_lab import DATA, GIB, HostPlan, Lab, uniform
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
@@ -249,7 +249,7 @@ def main() -> int:
         help="the flat figures are of the first one",
     )  # fmt: skip
     chosen = parser.parse_args()
-    able = ability()
+    able = criu_support()
     if not able.works:
         say(f"no CRIU that works here: {able.reason}")
         return 2

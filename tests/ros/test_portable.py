@@ -18,8 +18,8 @@ from std_msgs.msg import Int64, Int64MultiArray
 from std_srvs.srv import Trigger
 
 from rosrm.errors import PortableError
-from rosrm_criu.control.client import ask_prepare, ask_resume, await_joined, await_left, status_of
-from rosrm_criu.control.messages import VARIABLE, State
+from rosrm_criu.control.client import ask_prepare, ask_resume, await_joined, await_left
+from rosrm_criu.control.messages import VARIABLE, State, Status, read_message
 from rosrm_examples.portable_counter import filled
 from tests.ros.clusters import wait_until
 from tests.ros.nodes import PATIENCE
@@ -48,7 +48,7 @@ class Portable:
 
     def runs(self) -> bool:
         assert self.process.poll() is None, self.said()
-        status = status_of(self.directory)
+        status = read_message(self.directory, Status)
         return status is not None and status.state is State.RUNNING
 
     def prepare(self, request: str):
@@ -290,14 +290,14 @@ def test_sigterm_is_an_orderly_end(stage, start, heard, away) -> None:
         node.prepare("m1")
     node.process.terminate()
     assert node.process.wait(PATIENCE) == 0
-    assert status_of(node.directory) is None
+    assert read_message(node.directory, Status) is None
 
 
 def test_a_program_that_exits_has_not_failed(start) -> None:
     """Its own exit code, and no word of a failure."""
     node = start("exits")
     assert node.process.wait(PATIENCE) == 3
-    assert status_of(node.directory) is None
+    assert read_message(node.directory, Status) is None
 
 
 def test_started_by_hand_it_is_an_ordinary_node(stage, start, heard) -> None:

@@ -70,10 +70,10 @@ def test_a_damaged_one_is_named(parent, content):
         slots.newest(parent)
 
 
-def test_who_is_to_begin_anew_does_so_once(parent):
-    """`begin_anew` removes all images once, including one completed since; later ones are used."""
+def test_a_start_without_image_happens_once(parent):
+    """All images are removed once, including one completed since; later ones are used."""
     slot = image(parent)
-    slots.begin_anew(parent)
+    slots.start_without_image(parent)
     slots.complete(slot, REJOIN)
     assert slots.newest(parent) is None
     assert not parent.exists()

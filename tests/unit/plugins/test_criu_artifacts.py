@@ -97,5 +97,5 @@ def test_an_unused_image_goes_and_that_there_was_a_restore_stays(tmp_path, reaso
     (directory / image.MANIFEST).write_text("{}")
     restore_result.write(directory, Outcome(reason=reason, pid=7))
     artifacts.remove_unused(directory)
-    assert artifacts.was_restored(directory) is known
+    assert restore_result.was_restored(directory) is known
     assert not (directory / image.MANIFEST).exists()

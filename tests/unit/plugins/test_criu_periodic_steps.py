@@ -46,7 +46,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
     [
         (errno.ENOSPC, True, "no image can be made in .*: No space left"),
         (errno.ENOENT, True, "no image can be made in .*: No such file"),
-        (errno.ENOENT, False, "was started anew meanwhile"),
+        (errno.ENOENT, False, "was restarted during the checkpoint"),
     ],
 )
 def test_images_that_were_taken_away_are_no_fault_of_the_disk(tmp_path, number, there, said):
