@@ -23,7 +23,7 @@ import numpy as np
 import rclpy
 from std_msgs.msg import UInt8MultiArray
 
-from benchmarks.machine import percentile, print_report, say
+from benchmarks.machine import parser, percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm.node import Node
 from rosrm.testing.loopback import enter_private_network
@@ -100,11 +100,13 @@ def measured(size: int, cycles: int, *, keep: bool) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--node", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--cycles", type=int, default=1000)
-    parser.add_argument("--rounds", type=int, default=3)
-    options = parser.parse_args()
+    command_line = parser(__doc__)
+    command_line.add_argument("--node", type=int, help=argparse.SUPPRESS)
+    command_line.add_argument("--cycles", type=int, default=1000, help="cycles of each node")
+    command_line.add_argument(
+        "--rounds", type=int, default=3, help="runs with and without snapshots"
+    )
+    options = command_line.parse_args()
     if options.node is not None:
         node(options.node, options.cycles)
         return

@@ -59,7 +59,7 @@ class FaultInjector:
         return True
 
     def take_done(self) -> list[Disturbance]:
-        """Return the harm that was done and undone since the last call."""
+        """Return the disturbances that ended since the last call."""
         done, self.done = self.done, []
         return done
 
