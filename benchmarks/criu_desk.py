@@ -104,7 +104,7 @@ class CountReceiver(Observer):
         while not self._has(begin, counts, passes):
             if time.monotonic() > deadline:
                 raise TimeoutError(
-                    f"{counts} more counts were not received withwithin {_PATIENCE:g} s"
+                    f"{counts} more counts were not received within {_PATIENCE:g} s"
                 )
             time.sleep(0.01)
 
@@ -177,7 +177,7 @@ class MigrationDriver:
                 if event.kind in ("migrated", "stayed"):
                     return event
             self._client.spin(0.02)
-        raise TimeoutError(f"the migration did not end withwithin {_PATIENCE:g} s")
+        raise TimeoutError(f"the migration did not end within {_PATIENCE:g} s")
 
     def _wait(self, *states: str) -> None:
         deadline = time.monotonic() + _PATIENCE

@@ -121,7 +121,7 @@ def differences(summary: dict[str, Any], state: str, migrations: int) -> list[st
     if mapped != summary["scans_sent"]:
         wrong.append(f"the instances mapped {mapped} scans of {summary['scans_sent']}")
     if migrations and summary["gap_ms"] is None:
-        wrong.append("no successor was heard right after its source")
+        wrong.append("no successor has an output right after its source")
     deviation, largest = summary["max_deviation_m"], LARGEST_DEVIATION_M[state]
     if deviation is None or deviation > largest:
         wrong.append(f"max_deviation_m is {deviation}, more than {largest:g}")

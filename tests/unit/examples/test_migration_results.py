@@ -60,7 +60,7 @@ def test_a_scan_that_was_lost() -> None:
     assert summarise(seen, POSES, 1)["end_error_percent"] is None
     assert summarise(seen, POSES, 1)["gap_ms"] is None
     assert wrong(seen) == [
-        "scans_lost is 1, not 0", "no successor was heard right after its source",
+        "scans_lost is 1, not 0", "no successor has an output right after its source",
     ]  # fmt: skip
 
 
@@ -84,7 +84,7 @@ def test_no_migration() -> None:
     seen = replace(run(), parts=[part("a", 0, 6)])
     assert summarise(seen, POSES, 0)["gap_ms"] is None
     assert wrong(seen, migrations=0)[0] == "migrations is 0, not 1"
-    assert wrong(seen) == ["no successor was heard right after its source"]  # the move was too late
+    assert wrong(seen) == ["no successor has an output right after its source"]  # the move was too late
 
 
 def test_a_part_that_was_not_written() -> None:
