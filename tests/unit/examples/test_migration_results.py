@@ -84,7 +84,8 @@ def test_no_migration() -> None:
     seen = replace(run(), parts=[part("a", 0, 6)])
     assert summarise(seen, POSES, 0)["gap_ms"] is None
     assert wrong(seen, migrations=0)[0] == "migrations is 0, not 1"
-    assert wrong(seen) == ["no successor has an output right after its source"]  # the move was too late
+    # The migration was too late.
+    assert wrong(seen) == ["no successor has an output right after its source"]
 
 
 def test_a_part_that_was_not_written() -> None:
