@@ -94,7 +94,7 @@ def counter(*arguments: str, **fields) -> ProcessSpec:
 
 
 def ask(cluster: Cluster, to: str | None = None, name: str = NAME) -> str:
-    """Request a migration once the capabilities of the hosts are known; return the refusal, or ""."""
+    """Request a migration once the hosts' capabilities are known; return the refusal, or ""."""
     deadline = time.monotonic() + PATIENCE
     while "not known yet" in (refusal := _asked(cluster, to, name)):
         assert time.monotonic() < deadline, refusal

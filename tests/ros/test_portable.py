@@ -197,7 +197,7 @@ def test_a_node_that_is_called_back_at_once_runs_on(stage, start, heard) -> None
 
 
 def test_parameters_and_timers_are_as_they_were(stage, start, heard) -> None:
-    """Parameters keep their values, and timers their position; a cancelled timer stays cancelled."""
+    """Parameters keep their values, timers their position; a cancelled timer stays cancelled."""
     node = start()
     hear_more(stage, heard)
     values = [Parameter("step", value=3), Parameter("limit", value=7.5)]
