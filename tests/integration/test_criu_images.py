@@ -346,10 +346,10 @@ def test_a_process_that_ends_at_once_was_restored(theatre, option):
     assert process_tree.wait_until_stopped([actor.pid], TIMEOUT)
     directory = theatre.dump(actor)
     shim = theatre.shim(directory, *option)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / restore_result.FILE).exists, "the end of the restore")
     os.killpg(shim.pid, signal.SIGCONT)
     assert shim.process.wait(TIMEOUT) == 9
-    assert json.loads((directory / "hold.json").read_text())["reason"] == ""
+    assert json.loads((directory / restore_result.FILE).read_text())["reason"] == ""
 
 
 def test_signals_come_through_the_shim(theatre, counter):
@@ -432,10 +432,12 @@ def test_the_image_is_private_and_removed_on_request(theatre, counter):
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
     assert modes == {0}
     restored = theatre.restore(directory, remove=True)
-    eventually(lambda: [path.name for path in directory.iterdir()] == ["hold.json"], "a clean end")
+    eventually(
+        lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "a clean end"
+    )
     restored.process.terminate()
     restored.process.wait(TIMEOUT)
-    assert [path.name for path in directory.iterdir()] == ["hold.json"]
+    assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
 
 
 @pytest.mark.parametrize("victim", ["the process", "its shim"])
@@ -462,13 +464,19 @@ def host(tmp_path):
     host.clean_up()
 
 
+def restored_below(host, theatre, directory, *, order=None, **options):
+    """Restore an image below a supervisor; return its client, and the running instance."""
+    client = host.connect()
+    command = theatre.shim_command(directory, **options)
+    client.start([host.order("actor", *command, number=2, **(order or {}))])
+    running = host.running(client, "actor", number=2)
+    eventually((directory / restore_result.FILE).exists, "the end of the restore")
+    return client, running
+
+
 def test_below_a_supervisor(theatre, counter, host):
     """The supervisor starts a shim like any process: it stops it, and sees its end."""
-    directory = theatre.dump(counter)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = restored_below(host, theatre, theatre.dump(counter))
     assert process_tree.root_of(running.pid) != running.pid
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
@@ -477,11 +485,7 @@ def test_below_a_supervisor(theatre, counter, host):
 
 def test_the_next_supervisor_adopts_it(theatre, counter, host):
     """The process runs on while its supervisor is killed, and is stopped like any other."""
-    directory = theatre.dump(counter)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    before = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, before = restored_below(host, theatre, theatre.dump(counter))
     log = host.log("actor", 2)
     host.kill_supervisor(client)
     client = host.connect()
@@ -500,11 +504,7 @@ def test_the_supervisor_kills_a_process_that_does_not_stop(theatre, host):
     code = COUNTER.replace("count = 0", f"{ignoring}count = 0").replace("sys.exit(7)", "None")
     actor = theatre.start(code)
     actor.counts()
-    directory = theatre.dump(actor)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = restored_below(host, theatre, theatre.dump(actor))
     namespace = pid_namespace(process_tree.root_of(running.pid))
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
@@ -514,14 +514,11 @@ def test_the_supervisor_kills_a_process_that_does_not_stop(theatre, host):
 
 def test_below_a_supervisor_it_is_restarted_after_a_crash(theatre, counter, host):
     """The restart policy applies to a restored process: it counts from one, as after any crash."""
-    directory = theatre.dump(counter)
     then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "an argument"]
-    command = theatre.shim_command(directory, remove=True, then=then)
-    client = host.connect()
     restart = RestartPolicy("on-failure", delay=0.01)
-    client.start([host.order("actor", *command, number=2, restart=restart)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = restored_below(
+        host, theatre, theatre.dump(counter), order={"restart": restart}, remove=True, then=then
+    )
     log = host.log("actor", 2)
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
@@ -581,7 +578,7 @@ def test_a_flipped_byte_is_refused(theatre, pattern):
     assert shim.process.wait(TIMEOUT) == 125
     expected = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
     assert expected in shim.log.read_text()
-    assert expected in json.loads((directory / "hold.json").read_text())["reason"]
+    assert expected in json.loads((directory / restore_result.FILE).read_text())["reason"]
     assert not (directory / "restore.log").exists()
     assert count.read_text() == "of another process"
 
