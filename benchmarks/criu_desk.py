@@ -103,9 +103,7 @@ class CountReceiver(Observer):
         begin, deadline = len(self.received), time.monotonic() + _PATIENCE
         while not self._has(begin, counts, passes):
             if time.monotonic() > deadline:
-                raise TimeoutError(
-                    f"{counts} more counts were not received within {_PATIENCE:g} s"
-                )
+                raise TimeoutError(f"{counts} more counts were not received within {_PATIENCE:g} s")
             time.sleep(0.01)
 
     def _has(self, begin: int, counts: int, passes: int) -> bool:
