@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import weakref
 from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
@@ -38,8 +40,10 @@ class LauncherContract:
     spec: ClassVar[ProcessSpec] = ProcessSpec("p", command=("sleep", "60"))
 
     def make(self) -> Launcher:
-        """Return a new launcher of a slave with an empty directory."""
-        context = LauncherContext(Path(mkdtemp(prefix="rosrm-")), sys.executable, 1)
+        """Return a new launcher of a slave with an empty directory, removed after the test."""
+        folder = Path(mkdtemp(prefix="rosrm-"))
+        weakref.finalize(self, shutil.rmtree, folder)
+        context = LauncherContext(folder, sys.executable, 1)
         found = registry_of("launcher", self.offer).launchers(context)
         if found.absent:
             raise SkipTest(f"{self.offer.name} is absent: {found.absent[self.offer.name]}")
