@@ -18,10 +18,7 @@ HOSTS = ("host1", "host2")
 @pytest.fixture
 def hosts(criu, name, tmp_path):
     """Master and listener on a desk, and two hosts with a slave each."""
-    with (
-        Lab(name, [*uniform(2, disk=GIB), HostPlan("desk")]) as lab,
-        parts(lab, tmp_path),
-    ):
+    with Lab(name, [*uniform(2, disk=GIB), HostPlan("desk")]) as lab, parts(lab, tmp_path):
         yield lab
 
 

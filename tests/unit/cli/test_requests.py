@@ -185,12 +185,7 @@ def test_submit_takes_several_files_and_the_standard_input(rosrm, client, work, 
 
 @pytest.mark.parametrize(
     ("words", "asked"),
-    [
-        (["--all"], ["a", "c"]),
-        (["WORK"], ["a"]),
-        (["c", "WORK"], ["c", "a"]),
-        (["c", "c"], ["c"]),
-    ],
+    [(["--all"], ["a", "c"]), (["WORK"], ["a"]), (["c", "WORK"], ["c", "a"]), (["c", "c"], ["c"])],
     ids=" ".join,
 )
 def test_cancel_takes_all_processes_or_those_of_a_file(rosrm, client, work, words, asked):

@@ -12,13 +12,7 @@ import yaml
 from hypothesis import given
 
 from rosrm.errors import LaunchError
-from rosrm.model.values import (
-    Assignment,
-    InstanceId,
-    ProcessSpec,
-    RestartPolicy,
-    StopPolicy,
-)
+from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy, StopPolicy
 from rosrm.slave.launch.ament_index import find_executable
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import (
@@ -239,10 +233,7 @@ def test_no_parameters_no_file(tmp_path):
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 SCALARS = st.one_of(
-    st.booleans(),
-    st.integers(-(2**63), 2**63 - 1),
-    st.floats(allow_nan=False),
-    TEXTS,
+    st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), TEXTS
 )
 ARRAYS = st.one_of(
     *(st.lists(kind, min_size=1) for kind in (st.booleans(), st.integers(-9, 9), TEXTS))

@@ -72,10 +72,7 @@ def started(**policies):
 
 def test_policies_are_those_of_the_model():
     """The supervisor's light policies have the fields and defaults of the model's."""
-    for light, heavy in (
-        (RestartRule, values.RestartPolicy),
-        (StopRule, values.StopPolicy),
-    ):
+    for light, heavy in ((RestartRule, values.RestartPolicy), (StopRule, values.StopPolicy)):
         assert light._fields == tuple(field.name for field in dataclasses.fields(heavy))
         assert tuple(light()) == dataclasses.astuple(heavy())
     assert FenceRule._fields == tuple(field.name for field in dataclasses.fields(values.Fence))

@@ -65,8 +65,7 @@ def links(monkeypatch, control) -> HostLinks:
     links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
     links._client = FakeClient()
     monkeypatch.setattr(
-        "rosrm.ros.master.slave_links.order_to_msg",
-        lambda command: SimpleNamespace(envelope=None),
+        "rosrm.ros.master.slave_links.order_to_msg", lambda command: SimpleNamespace(envelope=None)
     )
     return links
 
