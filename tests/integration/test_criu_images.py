@@ -46,7 +46,7 @@ def counter(theatre):
 # --- what goes on -------------------------------------------------------------------------------
 
 
-def test_a_restored_process_goes_on_where_it_was_and_its_log_in_the_new_file(theatre, counter):
+def test_a_restored_process_continues_and_logs_into_the_new_file(theatre, counter):
     """No number is missing or written twice; the old log grows no more."""
     directory = theatre.dump(counter)
     before = counter.numbers()
@@ -118,7 +118,7 @@ turn("c")
     assert theatre.manifest.size > 8 << 20
 
 
-def test_a_child_comes_along(theatre):
+def test_child_and_pipe_are_restored_with_their_parent(theatre):
     """The tree is dumped, pipes within it too: the child's numbers go on through its parent."""
     code = f"""
 import subprocess, sys
@@ -150,7 +150,7 @@ def test_a_file_below_the_working_directory_follows(theatre):
     assert numbers == list(range(1, numbers[-1] + 1))
 
 
-def test_a_log_of_its_own_is_made_anew_where_it_is_missing(theatre):
+def test_a_missing_log_of_the_process_is_created(theatre):
     """As rcl's in ~/.ros/log: what is only appended to stays behind, and goes on empty."""
     own = theatre.folder / "logs/own.log"
     own.parent.mkdir()
@@ -163,7 +163,7 @@ def test_a_log_of_its_own_is_made_anew_where_it_is_missing(theatre):
     eventually(lambda: own.exists() and own.read_text().count("\n") > 2, "its log again")
 
 
-def test_who_runs_in_its_supervisors_directory_does_so_on_another_host(theatre):
+def test_a_process_in_its_supervisors_directory_moves_to_that_of_another_host(theatre):
     """There it has another path: working directory and files below it move along, hop by hop."""
 
     def state(number: int) -> dict[str, str]:
@@ -197,7 +197,7 @@ def working_directory(pid: int) -> str:
     return os.readlink(f"/proc/{pid}/cwd")  # noqa: PTH115 - as /proc says it
 
 
-def test_a_file_of_the_kernels_needs_not_lie_there(theatre):
+def test_files_of_proc_are_not_part_of_the_image(theatre):
     """What it reads of itself in /proc is elsewhere in /proc, and CRIU knows that."""
     actor = theatre.start(f"import os; own = open(f'/proc/{{os.getpid()}}/stat')\n{COUNTER}")
     actor.counts()
@@ -208,7 +208,7 @@ def test_a_file_of_the_kernels_needs_not_lie_there(theatre):
 # --- what becomes of the source -----------------------------------------------------------------
 
 
-def test_it_does_not_stand_still_for_the_checksums(theatre, counter, monkeypatch):
+def test_a_running_process_does_not_stop_for_the_checksums(theatre, counter, monkeypatch):
     """Of a large image they take as long as the dump; a process that runs on is not held up."""
     make = image.file_checksums
 
@@ -222,7 +222,7 @@ def test_it_does_not_stand_still_for_the_checksums(theatre, counter, monkeypatch
     assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
 
 
-def test_it_stands_still_until_it_is_resumed(theatre, counter):
+def test_a_stopped_source_runs_on_when_it_is_resumed(theatre, counter):
     """Until the commit nothing is lost: who takes the move back resumes the source."""
     theatre.dump(counter, leave="stopped")
     seen = counter.numbers()
@@ -232,7 +232,7 @@ def test_it_stands_still_until_it_is_resumed(theatre, counter):
     assert counter.numbers()[: len(seen) + 1] == list(range(1, len(seen) + 2))
 
 
-def test_who_stood_still_before_is_not_set_going(theatre, counter):
+def test_a_process_stopped_before_its_dump_stays_stopped(theatre, counter):
     """A process that somebody stopped stays stopped after its dump."""
     counter.process.send_signal(signal.SIGSTOP)
     assert process_tree.wait_until_stopped([counter.pid], TIMEOUT)
@@ -256,7 +256,7 @@ def test_a_pipe_to_outside_is_named_and_the_source_runs_on(theatre):
         os.close(theirs)
 
 
-def test_whatever_fails_the_source_runs_on(theatre, counter, monkeypatch):
+def test_after_any_error_the_source_runs_on(theatre, counter, monkeypatch):
     """A bug of ours too, after CRIU has stopped the process."""
     monkeypatch.setattr(image, "write", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -278,7 +278,7 @@ def test_a_unix_socket_to_outside_is_named_and_the_source_runs_on(theatre, kind)
         actor.counts()
 
 
-def test_a_socket_pair_within_the_process_is_no_tie(theatre):
+def test_a_socket_pair_within_the_process_is_no_external_resource(theatre):
     """As an event loop holds one to wake itself."""
     code = f"import socket; pair = socket.socketpair()\n{COUNTER}"
     actor = theatre.start(code)
@@ -286,7 +286,7 @@ def test_a_socket_pair_within_the_process_is_no_tie(theatre):
     theatre.restore(theatre.dump(actor)).counts()
 
 
-def test_a_debugger_is_named_and_goes_on(theatre, counter):
+def test_a_traced_process_is_refused_with_its_debugger(theatre, counter):
     """Two cannot hold one process; the process does not suffer."""
     code = """
 import ctypes, signal, sys
@@ -319,7 +319,7 @@ def test_a_device_is_named_and_the_source_runs_on(theatre):
     assert [path.name for path in (theatre.folder / "image").iterdir()] == ["dump.log"]
 
 
-def test_an_image_that_has_no_room_is_not_begun(theatre, counter, monkeypatch):
+def test_an_image_without_disk_space_is_not_begun(theatre, counter, monkeypatch):
     """The file system of the image keeps some space; the process is not touched."""
     monkeypatch.setattr(process_tree, "memory_of", lambda pids: 1 << 60)
     with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
@@ -339,7 +339,7 @@ def test_the_exit_code_comes_through_the_shim(theatre, counter):
 
 
 @pytest.mark.parametrize("option", [[], ["--no-namespace"]])
-def test_who_ends_at_once_was_restored_all_the_same(theatre, option):
+def test_a_process_that_ends_at_once_counts_as_restored(theatre, option):
     """A process that waits for nothing but its last instruction: its end comes through."""
     code = "import os, signal; os.kill(os.getpid(), signal.SIGSTOP); os._exit(9)"
     actor = theatre.start(code)
@@ -408,7 +408,7 @@ def living_in(namespace: str) -> list[int]:
     return [pid for pid in found if process_tree.is_alive(pid)]
 
 
-def test_what_the_process_leaves_behind_ends_with_it(theatre):
+def test_daemons_of_a_restored_process_end_with_it(theatre):
     """Its end is the end of the namespace, before the shim's own is seen."""
     code = f"""
 import os, signal
@@ -429,7 +429,7 @@ signal.signal(signal.SIGHUP, become_two)
     assert living_in(namespace) == []
 
 
-def test_marks_of_its_former_instance_are_gone(theatre):
+def test_marks_of_the_former_instance_are_removed(theatre):
     """A supervisor that looks for leftovers of the old instance does not find the restored one."""
     marks = {"ROSRM_INSTANCE": "actor#1", "ROSRM_SUPERVISOR": "/somewhere", "MORE": "kept"}
     actor = theatre.start(COUNTER, environment=marks)
@@ -439,7 +439,7 @@ def test_marks_of_its_former_instance_are_gone(theatre):
     assert {b"ROSRM_INSTANCE=", b"ROSRM_SUPERVISOR=", b"MORE=kept"} <= {*shown}
 
 
-def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
+def test_the_image_is_private_and_removed_on_request(theatre, counter):
     """Memory of a process is nobody else's business; how the restore went is all that is left."""
     directory = theatre.dump(counter)
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
@@ -452,7 +452,7 @@ def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
 
 
 @pytest.mark.parametrize("victim", ["the process", "its shim"])
-def test_that_it_was_restored_is_known_after_its_end(theatre, counter, victim):
+def test_the_result_of_a_restore_outlives_the_process(theatre, counter, victim):
     """The result of a restore survives any early end of the process; its memory is removed."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, remove=True)
@@ -475,7 +475,7 @@ def host(tmp_path):
     host.clean_up()
 
 
-def test_below_a_supervisor(theatre, counter, host):
+def test_a_supervisor_manages_a_restored_process(theatre, counter, host):
     """The supervisor starts a shim like any process: it stops it, and sees its end."""
     directory = theatre.dump(counter)
     client = host.connect()
@@ -488,7 +488,7 @@ def test_below_a_supervisor(theatre, counter, host):
     assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
 
 
-def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
+def test_the_next_supervisor_re_adopts_a_restored_process(theatre, counter, host):
     """It runs on meanwhile, is known again, and is stopped like any other."""
     directory = theatre.dump(counter)
     client = host.connect()
@@ -507,7 +507,7 @@ def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     assert not process_tree.is_alive(before.pid)
 
 
-def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
+def test_a_restored_process_that_ignores_sigint_is_killed(theatre, host):
     """The stop policy ends in a SIGKILL of the shim's group, which leaves no process."""
     ignoring = "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     code = COUNTER.replace("count = 0", f"{ignoring}count = 0").replace("sys.exit(7)", "None")
@@ -525,7 +525,7 @@ def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
 
 
-def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
+def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host):
     """The restart policy holds for what was restored: it begins at one, as after any crash."""
     directory = theatre.dump(counter)
     then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "a word of its own"]
@@ -546,7 +546,7 @@ def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
 # --- without a namespace ------------------------------------------------------------------------
 
 
-def test_without_a_namespace_it_is_held_all_the_same(theatre, counter):
+def test_without_a_namespace_pid_signals_and_end_are_the_same(theatre, counter):
     """Where no namespace may be entered: same pid, signals and end come through."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, "--no-namespace")
@@ -568,7 +568,7 @@ def test_without_a_namespace_a_guard_ends_it_with_its_shim(theatre, counter):
     )
 
 
-def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
+def test_without_a_namespace_a_pid_in_use_is_reported(theatre, counter):
     """The source still has it; it is not harmed."""
     directory = theatre.dump(counter, leave="stopped")
     with pytest.raises(CriuError, match=rf"its pid {counter.pid} is in use here"):
@@ -606,7 +606,7 @@ def flip_a_bit(path: Path) -> None:
     path.write_bytes(content)
 
 
-def test_an_image_without_checksums_is_restored_all_the_same(theatre, counter):
+def test_an_image_without_checksums_is_restored(theatre, counter):
     """As one that has just come from another host: the transfer has a checksum of its own."""
     directory = theatre.folder / "image"
     manifest = dump.dump(
@@ -635,7 +635,7 @@ def changed(directory: Path, **values: object) -> None:
         ({"mapped": (MappedFile("/etc/hostname", 1, 0o644),)}, "another one .* of 1"),
     ],
 )
-def test_what_is_missing_here_is_named(theatre, counter, values, said):
+def test_a_missing_requirement_of_an_image_is_named(theatre, counter, values, said):
     """Before CRIU begins: the path, and the host."""
     directory = theatre.dump(counter)
     changed(directory, **values)
@@ -643,7 +643,7 @@ def test_what_is_missing_here_is_named(theatre, counter, values, said):
         theatre.restore(directory)
 
 
-def test_a_file_that_it_reads_has_to_be_there(theatre):
+def test_a_file_that_the_process_reads_must_exist(theatre):
     """What it only reads does not follow."""
     table = theatre.folder / "table"
     table.write_text("rows")
@@ -663,7 +663,7 @@ def test_an_image_that_others_may_read_is_refused(theatre, counter):
         theatre.restore(directory)
 
 
-def test_what_tracing_maps_is_made_where_it_is_missing(theatre, counter):
+def test_the_shared_memory_of_lttng_is_created_where_it_is_missing(theatre, counter):
     """LTTng's shared memory, which every ROS process maps, has no content."""
     directory = theatre.dump(counter)
     path = Path(f"/dev/shm/lttng-ust-wait-rosrm-test-{os.getpid()}")
@@ -676,7 +676,7 @@ def test_what_tracing_maps_is_made_where_it_is_missing(theatre, counter):
         path.unlink(missing_ok=True)
 
 
-def test_criu_takes_no_id_that_it_is_to_restore():
+def test_criu_uses_no_pid_that_it_must_restore():
     """In a fresh namespace ids begin small, where those of a container's processes are too."""
     assert restore.id_for_criu((), 32768) == 300
     assert restore.id_for_criu((12, 13, 310), 32768) == 310

@@ -118,7 +118,7 @@ def nothing_left(slave: Slave) -> None:
     assert not list((slave.state / "images").glob("kept-*"))
 
 
-def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
+def test_a_process_continues_from_its_image_with_its_port(slave, counter):
     """A restored process loses and repeats no number, and its port stays reserved until then."""
     before, port = checkpointed(slave, counter), port_of(counter)
     assert checkpoint_numbers(slave.state) == [1]
@@ -133,7 +133,7 @@ def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
     eventually(lambda: is_free(port), "the port free")  # the restored process ends with its shim
 
 
-def test_it_can_be_checkpointed_again(slave, counter):
+def test_a_restored_process_can_be_checkpointed_again(slave, counter):
     """A restored process can be checkpointed as the instance of its shim."""
     before = checkpointed(slave, counter)
     slave.ask("take", destination=3)

@@ -41,7 +41,7 @@ def test_as_a_program_it_says_so_in_one_line(criu):
     ("suite", "version"), [("bookworm", "3.17"), ("trixie", "4.1")], ids=["3.17", "4.1"]
 )
 @pytest.mark.slow  # the packages are downloaded once
-def test_too_old_ones_are_told_apart(old, suite, version):
+def test_a_criu_that_is_too_old_is_reported(old, suite, version):
     """The probe rejects Debian 12's CRIU on current kernels, and Debian 13's at the socket."""
     found = old(suite)
     assert found.version.startswith(version)
@@ -55,7 +55,7 @@ def test_too_old_ones_are_told_apart(old, suite, version):
     assert able.facts["version"] == found.version
 
 
-def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
+def test_a_missing_criu_names_the_places_searched(tmp_path, monkeypatch):
     monkeypatch.delenv("ROSRM_CRIU", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("rosrm_criu.engine.binary._PLACES", str(tmp_path))

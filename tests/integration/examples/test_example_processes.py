@@ -225,7 +225,7 @@ def test_the_slam_node_says_what_it_cannot_use(start: Start) -> None:
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_holder_holds_what_it_is_told_until_a_signal(start: Start, stop: signal.Signals) -> None:
+def test_holder_holds_its_memory_until_a_signal(start: Start, stop: signal.Signals) -> None:
     """The process holds 60 MB more than an empty holder, and a signal ends it with 0."""
     empty, full = start("holder", "--mb", "0"), start("holder", "--mb", "60")
     wait_until(lambda: abs(resident_mb(full) - resident_mb(empty) - 60) < 3, "60 MB")

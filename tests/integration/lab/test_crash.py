@@ -187,7 +187,7 @@ def test_what_a_killed_lab_holds_does_not_hinder_the_next(name, monkeypatch):
     assert remains(name) == before
 
 
-def test_a_lab_that_is_up_is_said_to_be_up(lab, monkeypatch):
+def test_a_second_up_of_a_lab_is_refused(lab, monkeypatch):
     """The error names the existing lab even if memory for a second one is missing."""
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=MIB))
     with pytest.raises(LabError, match="is up already"):
@@ -326,7 +326,7 @@ def test_the_command_line_from_up_to_down(name):
     assert rosrm("exec", "host1", "true")[0] == 1
 
 
-def test_an_ordinary_user_is_told_what_is_missing(name):
+def test_an_unprivileged_user_learns_what_is_missing(name):
     """The error shows the alternative without root; no traceback, nothing created."""
     nobody = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=-all"]
     done = subprocess.run(

@@ -99,7 +99,7 @@ def move(lab):
         one.close()
 
 
-def test_a_transfer_goes_on_when_the_network_is_back(lab, move):
+def test_a_transfer_continues_when_the_network_is_back(lab, move):
     """TCP bridges a cut that is shorter than the time that a fetch waits for the next byte."""
     moving = move(timeout=PATIENCE)
     moving.wait_until_it_flows()

@@ -82,7 +82,7 @@ def test_an_end_while_no_supervisor_runs_follows_the_new_policy(host, client):
     assert found == {"copy": InstanceState.BACKOFF, "source": InstanceState.FAILED}
 
 
-def test_a_shadow_ends_for_good_whoever_is_killed(host, client):
+def test_an_unconfirmed_shadow_is_never_restarted(host, client):
     """An unconfirmed shadow does not restart, even after restarts of slave and supervisor."""
     client.start([shadow(host, "copy")])
     pid = host.running(client, "copy").pid
@@ -105,7 +105,7 @@ def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
     wait_until(lambda: host.log("copy").read_text() == said, "both runs have spoken")
 
 
-def test_what_is_to_be_remembered_is(host, client):
+def test_memos_outlive_slave_and_supervisor(host, client):
     """Memos outlive slave and supervisor (SIGKILL), and end with their instance."""
     kept, other = InstanceId("kept", 1), InstanceId("other", 1)
     orders = [host.order("kept", "sleep", "1000", memo="a"), host.order("other", "sleep", "1000")]

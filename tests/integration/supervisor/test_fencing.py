@@ -83,7 +83,7 @@ def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
     assert of_one(client).message.startswith("fenced: no confirmed contact with the master for 3 s")
 
 
-def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client):
+def test_an_alive_fence_is_renewed_by_the_running_slave_alone(host, client):
     """A fence with `alive` is renewed by the slave's sign of life alone, and ends without it."""
     fences = {"one": Fence(2.0, 0.0, alive=True), "two": Fence(2.0, 0.0)}
     client.start([host.order(name, *SLEEPS, fence=fence) for name, fence in fences.items()])
@@ -99,7 +99,7 @@ def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client
     assert "no activity of its slave" in status.message
 
 
-def test_all_of_it_ends_within_its_grace(host, client):
+def test_a_fenced_tree_ends_within_its_grace(host, client):
     """An instance deaf to SIGINT and SIGTERM ends by SIGKILL, with its child, within the fence."""
     graces = StopPolicy(interrupt_grace=500.0, terminate_grace=500.0)
     client.start([host.order("one", *DEAF, fence=Fence(2.0, 0.5), stop=graces)])
@@ -122,7 +122,7 @@ def test_a_killed_supervisor_puts_no_fence_off(host, client):
         host.ended(client, "one")
 
 
-def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
+def test_the_next_supervisor_knows_the_last_contact(host, client):
     """The next supervisor counts from the last renewal, not from the start of the instance."""
     heard = time.monotonic()
     client.start([host.order("one", *SLEEPS, fence=Fence(15.0, 0.0), heard=heard - 14.0)])
@@ -139,7 +139,7 @@ def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
     assert alive(pid)
 
 
-def test_without_a_supervisor_nobody_fences_until_the_next(host, client):
+def test_the_next_supervisor_ends_an_expired_instance(host, client):
     """An unsupervised instance outlives its fence; the next supervisor ends it at once."""
     client.start([host.order("one", *SLEEPS, fence=Fence(0.5, 0.0))])
     pid = host.running(client, "one").pid
@@ -208,7 +208,7 @@ def test_a_record_of_an_earlier_version_is_taken_over(host, client):
     assert (of_one(client).state, of_one(client).pid) == (InstanceState.RUNNING, pid)
 
 
-def test_a_supervisor_that_was_stopped_hears_first_what_was_said_in_time(host, client):
+def test_a_resumed_supervisor_reads_renewals_before_it_fences(host, client):
     """A resumed supervisor reads its client's renewals before it applies an expired fence."""
     client.start([host.order("one", *SLEEPS, fence=Fence(1.0, 0.0, alive=True))])
     pid = host.running(client, "one").pid

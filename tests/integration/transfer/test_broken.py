@@ -84,7 +84,7 @@ def test_a_transfer_that_takes_too_long_is_given_up(source, target, sender, dest
     assert nothing_left(target)
 
 
-def test_nobody_at_any_address(source, target, sender, destination):
+def test_a_server_at_no_address_is_an_error(source, target, sender, destination):
     """The error names all addresses that refused."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     sender.close()
@@ -199,7 +199,7 @@ def test_what_has_no_room_is_not_begun(source, sender, tmp_path, destination):
     destination.fetch(offer, tmp_path / "target")
 
 
-def test_a_disk_that_is_full_meanwhile(sender, tmp_path, destination):
+def test_a_disk_that_becomes_full_during_the_transfer(sender, tmp_path, destination):
     """A disk that others fill during the fetch fails it; the error names the file system."""
     source = tmp_path / "source"
     source.mkdir()

@@ -59,7 +59,7 @@ def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender, fetch
     assert nothing_left(target)
 
 
-def test_what_was_stopped_before_it_began_says_so(source, target, sender):
+def test_a_transfer_stopped_before_its_start_is_reported(source, target, sender):
     fetcher = Fetcher()
     offer = sender.offer(source, seconds=PATIENCE, to=fetcher.introduce())
     fetcher.close()
@@ -125,7 +125,7 @@ def is_dead(process: Path) -> bool:
         return True
 
 
-def test_a_sender_that_is_killed_says_so(source, sender, destination):
+def test_a_killed_sender_is_reported(source, sender, destination):
     sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     sender._process.kill()
     assert sender.wait(PATIENCE) == OfferResult("failed", 0)

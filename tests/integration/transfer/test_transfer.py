@@ -119,7 +119,7 @@ def test_a_destination_that_was_introduced_is_the_only_one(source, target, sende
     assert sender.wait(PATIENCE) == OfferResult("taken", fetched.received)
 
 
-def test_who_shows_no_certificate_is_not_spoken_with(source, sender, destination):
+def test_a_client_without_certificate_is_refused(source, sender, destination):
     """A client without a certificate gets no byte of an answer, even with a valid token."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     answer = b""
@@ -147,7 +147,7 @@ def test_an_introduction_that_is_none_is_refused(source, sender, to):
         sender.offer(source, seconds=PATIENCE, to=to)
 
 
-def test_another_server_is_told_nothing(source, target, sender, destination):
+def test_a_server_with_another_certificate_receives_nothing(source, target, sender, destination):
     """A server with another certificate does not even get the token."""
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with Sender() as other:
@@ -187,7 +187,7 @@ def test_the_token_is_in_no_command_line_environment_or_output(
     assert err == ""
 
 
-def test_a_stranger_that_says_nothing_hinders_nobody(source, target, sender, destination):
+def test_a_silent_client_does_not_block_others(source, target, sender, destination):
     offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     strangers = [
         socket.create_connection(("127.0.0.1", offer.port), timeout=PATIENCE) for _ in range(20)

@@ -63,7 +63,9 @@ def test_status_names_the_plugins_that_fail(rosrm, client):
 
 @pytest.mark.parametrize("command", ["status", "ps", "hosts", "events"])
 @pytest.mark.parametrize("json_too", [(), ("--json",)])
-def test_a_master_that_takes_no_work_is_told_beside_the_listing(rosrm, client, command, json_too):
+def test_a_master_that_accepts_no_work_is_reported_beside_the_listing(
+    rosrm, client, command, json_too
+):
     whole = rosrm(command, *json_too)
     client.trouble = "the master accepts no new work: the disk is full"
     result = rosrm(command, *json_too)
@@ -73,7 +75,7 @@ def test_a_master_that_takes_no_work_is_told_beside_the_listing(rosrm, client, c
         assert result.out == whole.out
 
 
-def test_ps_lists_what_is_not_over_and_says_what_it_leaves_out(rosrm, client):
+def test_ps_leaves_out_terminal_processes_and_counts_them(rosrm, client):
     out = rosrm("ps").out
     assert "done" not in out
     assert "1 finished or cancelled (--all shows them)" in out
@@ -264,7 +266,7 @@ def test_explain_says_that_older_events_are_left_out_and_where_they_are(explaine
         ("set_aside", "talker is set aside on alpha"),
     ],
 )
-def test_a_state_is_said_in_a_sentence(explained, state, sentence):
+def test_a_state_is_shown_in_a_sentence(explained, state, sentence):
     assert explained(state=state)[0] == sentence
 
 
@@ -273,7 +275,7 @@ def test_one_restart_is_singular(rosrm, client):
     assert re.search(r"1 restart\b", rosrm("ps").out)
 
 
-def test_restarts_that_the_reason_counts_are_not_said_twice(rosrm, client):
+def test_restarts_that_the_reason_counts_are_shown_once(rosrm, client):
     reason = "exit code 3; its restart policy allows 3 restarts within 300 s"
     client.processes = [process("crashed", "failed", restarts=3, reason=reason)]
     assert rosrm("ps").out.count("3 restarts") == 1
@@ -310,7 +312,7 @@ def test_explain_json_is_the_masters_own(rosrm, client):
     assert json.loads(rosrm("explain", "talker", "--json").out) == STORY
 
 
-def test_explain_says_where_a_state_is_kept(explained):
+def test_explain_lists_the_snapshot_replicas(explained):
     kept = [{"host": "beta", "number": 7, "sequence": 120, "size": 5_000_000, "elapsed": 0.4}]
     said = "Snapshots of its state are on beta (cycle 120, 5.0 MB, 0.4 s ago)."
     assert explained(kept=kept)[1] == said

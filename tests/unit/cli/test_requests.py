@@ -217,7 +217,7 @@ def test_cancel_wait_ends_when_all_have_ended(rosrm, client, while_asleep):
     assert (result.code, result.out, result.err) == (0, said, "")
 
 
-def test_cancel_wait_says_once_what_has_become_of_each(rosrm, client):
+def test_cancel_wait_reports_the_end_of_each_process_once(rosrm, client):
     """The summary is not repeated if the reply has the end of each process."""
     client.processes = [process("a", "cancelled"), process("b", "cancelled")]
     client.cancel = lambda names: f"{len(names)} processes cancelled"
@@ -248,7 +248,7 @@ def test_drain_wait_ends_when_the_host_is_drained(rosrm, client, while_asleep, l
     assert (result.code, "alpha is drained: so and so\n" in result.out + result.err) == (code, True)
 
 
-def test_drain_wait_ends_when_somebody_uncordons_the_host(rosrm, client):
+def test_drain_wait_ends_when_the_host_is_uncordoned(rosrm, client):
     client.hosts = [host("alpha")]
     result = rosrm("drain", "alpha", "--wait")
     assert (result.code, result.err) == (1, "rosrm: alpha is no longer draining\n")

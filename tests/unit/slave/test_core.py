@@ -81,14 +81,14 @@ def one() -> Slave:
     return Slave()
 
 
-def test_what_went_with_the_supervisor_cannot_be_refused_any_more(one):
+def test_an_instance_lost_with_its_supervisor_cannot_be_refused_any_more(one):
     """The instance was starting when its supervisor was killed: no supervisor holds it."""
     one.step(assigned())
     one.step(SupervisorReplaced((), {}, frozenset()))
     assert one.step(LaunchRefused(InstanceId("p", 1), "no such package")) == []
 
 
-def test_what_is_taken_back_at_once_is_not_launched(one):
+def test_what_the_supervisor_lost_at_once_is_not_launched(one):
     """An assignment and the next supervisor in one batch start nothing.
 
     The next supervisor does not know the instance. The master repeats the assignment and receives
@@ -120,7 +120,7 @@ def test_an_assignment_is_launched_once(one) -> None:
     assert one.step(assigned()) == []
 
 
-def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None:
+def test_a_change_during_the_registration_is_reported(one) -> None:
     """The registration request had the older status, and no batch was published without a link."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
@@ -130,7 +130,7 @@ def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None
     assert (states([report]), report.complete) == ([STATE.FAILED], False)
 
 
-def test_a_registration_without_news_is_not_followed_by_a_report(one) -> None:
+def test_a_registration_without_a_change_needs_no_report(one) -> None:
     """The request had all statuses."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
@@ -185,7 +185,7 @@ def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one)
     assert [type(c) for c in one.step(assigned())] == [slave_commands.Launch]
 
 
-def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
+def test_an_end_is_kept_until_a_master_knows_it(one) -> None:
     """The slave keeps the end of a job until a master has learned it, however long that takes."""
     one.step(assigned())
     one.step(MasterLost())
@@ -196,7 +196,7 @@ def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
     assert len(one.step(TimePassed(), after=REMEMBER_END)) == 1
 
 
-def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
+def test_a_number_refused_for_its_epoch_may_be_used_by_a_newer_master(one) -> None:
     """Only the order was too old: a newer master may still use the instance's number."""
     one.step(Registered(3))
     one.step(assigned(epoch=2, number=8))
@@ -204,7 +204,7 @@ def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
     assert one.of(number=9).status.state is STATE.STARTING
 
 
-def test_a_launch_that_is_refused_is_said(one) -> None:
+def test_a_refused_launch_is_reported(one) -> None:
     """The reason reaches the master."""
     one.step(assigned())
     (report,) = one.step(LaunchRefused(InstanceId("p", 1), "no such package"))
@@ -249,7 +249,7 @@ def test_readiness_kinds(one) -> None:
     assert not awaits_graph(PLAIN)
 
 
-def test_never_ready_is_stopped_and_has_failed(one) -> None:
+def test_an_instance_that_does_not_become_ready_is_stopped_and_has_failed(one) -> None:
     """The time-out is the reason, whatever the exit code."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
@@ -276,7 +276,7 @@ def test_each_run_has_its_own_time_to_become_ready(one) -> None:
     assert states(one.step(SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
 
 
-def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
+def test_an_instance_of_a_former_run_of_the_slave_is_ready(one) -> None:
     """Its spec is lost, but the process runs and keeps running."""
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.READY]
     assert one.step(TimePassed(), after=1000.0) == []
@@ -362,7 +362,7 @@ def test_a_restart_policy_is_settled_when_it_is_recorded() -> None:
         assert settled == slave_commands.Settle(ONE, NEVER)
 
 
-def test_a_restart_policy_of_what_the_slave_found_running() -> None:
+def test_a_restart_policy_of_a_re_adopted_instance() -> None:
     """The slave lost its spec, but the supervisor has all that is needed."""
     one = Slave()
     one.step(SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
@@ -389,7 +389,7 @@ def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one() -> None:
     assert one.step(replaced)[:-1] == [slave_commands.Amend(ONE, ON_FAILURE)]
 
 
-def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
+def test_a_restart_policy_of_an_ended_instance_reports_its_end() -> None:
     """The master receives the end, so its plan continues; the same holds for an end in between."""
     one = running()
     one.step(RestartPolicySet(ONE, NEVER))
@@ -401,7 +401,7 @@ def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
     assert slave_commands.Settle(ONE, NEVER) in one.step(replaced)
 
 
-def test_a_restart_policy_of_a_stranger_is_refused() -> None:
+def test_a_restart_policy_of_an_unknown_instance_is_refused() -> None:
     """The order is refused also if only a killed supervisor could have known the instance."""
     one = Slave()
     (settled,) = one.step(RestartPolicySet(ONE, NEVER))
@@ -413,7 +413,7 @@ def test_a_restart_policy_of_a_stranger_is_refused() -> None:
     assert settled.refusal
 
 
-def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
+def test_a_restart_policy_of_a_held_instance() -> None:
     """The waiting instance starts with the new policy, and not as a shadow."""
     one = running()
     one.state.max_processes = 1
@@ -439,7 +439,7 @@ def launched(commands) -> list[str]:
     return [one.instance.process for launch in launches for one in launch.assignments]
 
 
-def test_so_many_are_started_at_a_time(one) -> None:
+def test_at_most_max_starting_instances_start_at_a_time(one) -> None:
     """The others are held and reported; the next one starts once one is ready."""
     one.state.max_starting = 2
     commands = one.step(nodes(4))
@@ -450,7 +450,7 @@ def test_so_many_are_started_at_a_time(one) -> None:
     assert launched(one.step(SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
 
 
-def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
+def test_an_instance_that_ends_before_it_is_ready_frees_its_slot(one) -> None:
     """An instance that is stopped because it is not ready in time makes room, too."""
     one.state.max_starting = 1
     one.step(nodes(3))
@@ -460,7 +460,7 @@ def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
     assert launched(one.step(told(STATE.STOPPING, "n1", pid=5))) == ["n2"]
 
 
-def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
+def test_a_plain_program_has_started_as_soon_as_it_runs(one) -> None:
     """A bound on starts hardly delays plain programs."""
     one.state.max_starting = 1
     one.step(assigned(number=1))
@@ -468,7 +468,7 @@ def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
     assert launched(one.step(told(STATE.RUNNING, pid=5))) == ["q"]
 
 
-def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
+def test_a_restart_policy_of_a_forgotten_instance_is_settled() -> None:
     """The supervisor never records it, but the master still receives an answer."""
     one = running()
     one.step(Registered(1))
@@ -518,7 +518,9 @@ def test_a_complete_report_names_everything(one) -> None:
         ([], 0, 0, True),  # no probe at all
     ],
 )
-def test_who_may_ask_for_work(usage, present, stale, under) -> None:
+def test_a_host_is_under_its_limits_where_each_limited_reading_is(
+    usage, present, stale, under
+) -> None:
     """Every reading that has a limit is fresh and under it."""
     values = np.zeros(16, np.float32)
     values[: len(usage)] = usage

@@ -57,7 +57,7 @@ def refusals(commands) -> list[str]:
     return [one.message for one in reported if one.state in states]
 
 
-def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
+def test_a_contact_renews_the_fences_of_the_supervisor() -> None:
     """Renewals come at most every 0.1 s, and none without a fenced instance."""
     one = Slave()
     one.assign(fence=None)
@@ -70,7 +70,7 @@ def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
     assert one.hears(1.0) == []
 
 
-def test_an_older_word_puts_nothing_off() -> None:
+def test_an_older_beat_renews_from_its_own_time() -> None:
     """A delayed beat renews the fence from the time at which it was sent."""
     one = Slave()
     one.assign()
@@ -92,7 +92,7 @@ def test_a_fence_is_known_again_from_the_supervisor() -> None:
     assert reducer.step(new, replaced, 100.0)[0] == slave_commands.Renew(0.0, 100.0)
 
 
-def test_what_is_given_out_too_late_is_not_started() -> None:
+def test_an_assignment_older_than_its_fence_is_not_started() -> None:
     """The slave was stopped with the order in its sockets: the successor may run by now."""
     one = Slave()
     (message,) = refusals(one.assign(after=2.0))
@@ -100,7 +100,7 @@ def test_what_is_given_out_too_late_is_not_started() -> None:
     assert refusals(one.assign(number=2, after=0.0, fence=Fence(2.5, 0.0))) == []
 
 
-def test_an_answer_that_was_long_on_its_way_starts_nothing() -> None:
+def test_a_late_answer_starts_nothing() -> None:
     """DDS delivers the answer after a cut, when newer beats have arrived already."""
     one = Slave(max_age=5.0)
     spec = ProcessSpec("p", command=("true",))
@@ -135,7 +135,7 @@ def test_what_waits_for_its_start_is_fenced_too() -> None:
     assert refusals(one.assign(number=2)) == []  # it is remembered, and not started
 
 
-def test_a_slave_at_work_says_so_while_it_hears_nothing() -> None:
+def test_a_running_slave_renews_alive_fences_without_contact() -> None:
     """Fences with `alive` are renewed by the running slave, so their instances survive a cut."""
     one = Slave()
     alive = Fence(after=2.0, grace=0.0, alive=True)
@@ -158,7 +158,7 @@ def test_the_order_to_fence_is_passed_on() -> None:
 # --- age of beats -----------------------------------------------------------------------------
 
 
-def test_beats_that_were_waiting_are_as_old_as_they_are() -> None:
+def test_delayed_beats_count_with_their_true_age() -> None:
     """After a stop of 30 s the beats of the first second count as 30 s old."""
     clock = BeatClock()
     for tenth in range(10):
@@ -171,7 +171,7 @@ def test_beats_that_were_waiting_are_as_old_as_they_are() -> None:
     st.floats(-1e5, 1e5), st.floats(-5e-4, 5e-4),
     st.lists(st.tuples(st.floats(0.05, 100.0), st.floats(0.0, 60.0)), min_size=1, max_size=40),
 )  # fmt: skip
-def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift, beats) -> None:
+def test_the_age_of_a_beat_errs_by_the_least_delay_at_most(ahead, drift, beats) -> None:
     """With any clock offset, drift and delay, the error is at most the least delay."""
     clock = BeatClock()
     said, arrived, quickest = 1000.0, 0.0, 1e9
@@ -185,7 +185,7 @@ def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift
         assert taken - said <= quickest + 2e-3 * (arrived - 1000.0) + 1e-6
 
 
-def test_another_pace_of_the_clock_makes_no_beat_old() -> None:
+def test_clock_drift_makes_no_beat_old() -> None:
     """After an hour of beats from a clock that is 100 ppm slow, the newest counts as new."""
     clock = BeatClock()
     for second in range(0, 3600, 5):

@@ -98,14 +98,14 @@ def test_a_pause_shorter_than_its_time_is_forgiven() -> None:
 
 
 @given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0), st.floats(1.0, 10.0))
-def test_a_topic_as_fast_as_is_wanted_is_never_amiss(least, timeout, faster) -> None:
+def test_a_topic_at_its_required_rate_is_never_unhealthy(least, timeout, faster) -> None:
     """This holds for every rate, time and start of the windows."""
     node = Node(Health("scan", least, "", timeout))
     assert node.goes_on(max(10 * timeout, 10 / least), least * faster, timeout / 10) == ""
 
 
 @given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0))
-def test_a_topic_at_half_its_rate_or_less_is_always_noticed(least, timeout) -> None:
+def test_a_topic_at_half_its_rate_or_less_is_always_unhealthy(least, timeout) -> None:
     """The verdict comes within twice its time and two windows."""
     node = Node(Health("scan", least, "", timeout))
     window = max(timeout / 4, 3 / least)
@@ -119,7 +119,7 @@ def test_a_subscription_is_counted_from_its_matching_on() -> None:
     assert node.goes_on(30.0, rate=5.0) == ""
 
 
-def test_a_slave_that_did_not_look_blames_nobody() -> None:
+def test_a_slave_that_did_not_look_finds_no_instance_unhealthy() -> None:
     """Looks that failed because the slave itself was stopped for a minute do not count."""
     node = Node()
     assert node.goes_on(20.0, rate=5.0) == ""
@@ -160,7 +160,7 @@ def test_another_lifecycle_state_or_no_answer(state, said) -> None:
     assert verdict.endswith("the state active is required")
 
 
-def test_all_that_is_amiss_is_said() -> None:
+def test_the_verdict_has_every_finding() -> None:
     """The message has all findings in one line."""
     node = Node(Health("~/scan", 5.0, "active", 4.0))
     while "~/scan" not in (verdict := node.goes_on(20.0, rate=0.0, state="")):
@@ -252,7 +252,7 @@ def test_an_unhealthy_run_is_ended_as_failed() -> None:
         assert (fail.instance, fail.pid, fail.kill) == (LIDAR, 5, True)
 
 
-def test_a_restart_begins_anew() -> None:
+def test_a_restart_starts_the_time_again() -> None:
     """Looks at the former run, or at a run that is not ready, do not count."""
     one = Slave()
     one.runs(5)

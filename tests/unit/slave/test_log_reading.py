@@ -195,7 +195,7 @@ def test_one_answer_is_bounded(tmp_path, log) -> None:
     assert len(read(tmp_path).content) <= 1 << 20
 
 
-def test_no_log_is_said(tmp_path) -> None:
+def test_a_missing_log_is_refused(tmp_path) -> None:
     """The refusal names the file."""
     with pytest.raises(Refused, match="no log of robot/p#3"):
         read(tmp_path)

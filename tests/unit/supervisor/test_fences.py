@@ -48,7 +48,7 @@ def signals(core, until):
     return sent
 
 
-def test_it_is_stopped_when_nobody_says_that_it_is_heard():
+def test_an_instance_without_contact_is_stopped_within_its_fence():
     """The stop steps of its spec apply, shortened to the fence's grace; its status says why."""
     core, instance = running()
     assert signals(core, 13.5) == [(10.0, "SIGINT"), (11.0, "SIGTERM"), (13.0, "SIGKILL")]
@@ -78,7 +78,7 @@ def test_a_late_look_at_the_clock_kills():
     assert [c.number for c in commands if isinstance(c, Signal)] == [signal.SIGKILL]
 
 
-def test_every_word_puts_it_off_from_when_it_was_true():
+def test_a_contact_renews_the_fence_from_its_own_time():
     """The deadline counts from the contact, not from the message; older ones have no effect."""
     core, _ = running()
     core.handle(events.ContactReported(8.0), 9.5)
@@ -99,7 +99,7 @@ def test_the_clock_begins_with_what_the_start_knows():
     assert core.deadline() == 10.0
 
 
-def test_a_word_that_comes_after_it_has_begun_is_too_late():
+def test_a_contact_after_the_fence_has_begun_is_too_late():
     """Its successor may rely on its end."""
     core, instance = running()
     core.handle(events.TimePassed(), 10.0)
@@ -108,7 +108,7 @@ def test_a_word_that_comes_after_it_has_begun_is_too_late():
     assert instance.phase == FENCED
 
 
-def test_one_without_a_fence_is_left_alone():
+def test_an_instance_without_a_fence_keeps_running():
     """A robot's driver, for example, keeps running."""
     core, _ = running(fence=None)
     assert core.deadline() is None
@@ -165,7 +165,7 @@ def test_a_restart_under_way_becomes_an_end():
     ("code", "when", "phase"),
     [(0, "on-failure", EXITED), (1, "never", FAILED), (1, "always", FENCED)],
 )
-def test_what_had_ended_by_itself_keeps_its_end(code, when, phase):
+def test_an_instance_that_ended_before_its_fence_keeps_its_end(code, when, phase):
     """A job that completed before the fence has completed; it is not restarted."""
     core, instance = running(restart=RestartRule(when))
     core.handle(events.Exited(ONE, code, leftovers=True), 9.5)
@@ -206,7 +206,7 @@ def test_the_order_to_fence_ends_what_waits():
     assert core.handle(events.Spawned(ONE, 100), 0.2)[-1] == Signal(ONE, signal.SIGKILL)
 
 
-def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
+def test_the_order_to_fence_an_unknown_instance_refuses_its_later_start():
     """A late start is refused."""
     core = SupervisorState()
     core.handle(events.FenceOrdered(ONE), 0.0)
@@ -214,7 +214,7 @@ def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
     assert core.instances[ONE].phase == REFUSED
 
 
-def test_what_is_fenced_on_its_way_out_is_not_restarted_on_order():
+def test_an_instance_fenced_while_it_is_stopped_is_not_restarted_on_order():
     """The instance had failed, and its policy was to decide; now it has a successor."""
     core, instance = running(restart=RestartRule("always"))
     core.handle(events.FailOrdered(ONE, instance.pid, "hung", False), 1.0)

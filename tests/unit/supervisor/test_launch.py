@@ -147,7 +147,7 @@ def test_ros_arguments_of_the_user_are_closed_first(arguments, joined):
     assert join_arguments(arguments, ["--ros-args", "x"]) == joined
 
 
-def test_policies_and_directory_are_carried_over(tmp_path):
+def test_the_order_has_the_policies_and_directory_of_the_spec(tmp_path):
     """The order has the spec's restart and stop policies and its directory."""
     made = order(
         tmp_path,
@@ -323,7 +323,7 @@ def test_without_the_bootstrapper_nothing_is_touched():
     assert without_bootstrapper(environment) == environment
 
 
-def test_the_spec_has_the_last_word():
+def test_the_variables_of_the_spec_take_precedence():
     """A process has variables with its identity, and the spec's own variables take precedence."""
     made = process_environment(
         assignment(command=("x",), environment={"ROS_DOMAIN_ID": "9", "PYTHONUNBUFFERED": ""}),
@@ -343,7 +343,7 @@ def test_the_spec_has_the_last_word():
     }
 
 
-def test_a_node_is_told_by_which_name_it_is_known():
+def test_a_node_gets_its_own_name_in_its_environment():
     """The variables have the node's own name instead of the alias, and mark a shadow."""
     made = process_environment(shadow(), {}, HERE)
     assert made["ROSRM_NODE"] == "/robot/talker"
@@ -353,7 +353,7 @@ def test_a_node_is_told_by_which_name_it_is_known():
     assert process_environment(packaged, {}, HERE)["ROSRM_NODE"] == "/talker"
 
 
-def test_who_the_slave_is_itself_is_not_handed_on():
+def test_the_identity_of_the_slave_is_not_inherited():
     """A slave may itself run under rosrm, even as a shadow; its processes do not inherit that."""
     slave = process_environment(shadow(), {}, HERE)
     made = process_environment(assignment(command=("x",)), slave, HERE)

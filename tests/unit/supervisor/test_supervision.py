@@ -90,7 +90,7 @@ def test_status_is_that_of_the_model():
     assert {state.value for state in values.InstanceState if state.ended} == ENDED
 
 
-def test_rules_stand_in_the_table_of_the_module():
+def test_the_table_of_the_docstring_is_the_table_that_runs():
     """Each row of the docstring is a transition that runs, and the reverse; no event is left out.
 
     The phase "-" has the orders that may concern an unknown instance.
@@ -114,14 +114,14 @@ def test_start_is_recorded_before_it_is_tried():
     assert kinds(commands) == ["ReportStatus", "Spawn"]
 
 
-def test_repeated_start_only_tells_again():
+def test_a_repeated_start_only_reports_again():
     """DDS repeats messages: a start of a known instance spawns nothing."""
     core, _ = started()
     commands = core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 1.0)
     assert kinds(commands) == ["ReportStatus"]
 
 
-def test_late_start_of_a_stopped_stranger_is_refused():
+def test_a_late_start_of_a_stopped_unknown_instance_is_refused():
     """A stop that overtakes its start wins."""
     core = reducer.SupervisorState()
     core.handle(StopOrdered(TALKER), 0.0)
@@ -140,7 +140,7 @@ def test_forgotten_numbers_never_start(number, starts):
     assert ("Spawn" in kinds(commands)) is starts
 
 
-def test_what_runs_is_not_forgotten():
+def test_a_running_instance_is_not_forgotten():
     """Only a final status can be forgotten."""
     core, instance = started()
     assert kinds(core.handle(StatusStored(TALKER), 1.0)) == ["ReportStatus"]
@@ -212,7 +212,7 @@ def crashed(count, rule):
     return core
 
 
-def test_what_crashed_together_does_not_start_together():
+def test_processes_that_crashed_together_restart_apart():
     """The waits differ, by a fifth at most."""
     core = crashed(20, RestartRule("on-failure", delay=10.0))
     waits = {one.deadline - 10.0 for one in core.instances.values()}
@@ -233,7 +233,7 @@ def test_at_most_eight_restarts_begin_within_a_second():
     assert all(later - earlier >= 1.0 for earlier, later in zip(begun, begun[8:], strict=False))
 
 
-def test_stop_escalates_and_says_each_step():
+def test_a_stop_escalates_and_reports_each_step():
     """SIGTERM and SIGKILL follow SIGINT after their graces; the last message has all three."""
     core, instance = started(stop=StopRule(2.0, 3.0))
     sent = []
@@ -310,7 +310,7 @@ def test_an_unhealthy_run_that_does_not_end_is_killed():
     assert [command.number for command in sent] == [signal.SIGTERM, signal.SIGKILL]
 
 
-def test_what_is_stopped_is_killed_at_once():
+def test_a_process_stopped_by_a_signal_is_killed_at_once():
     """A stopped process does not handle SIGINT; after SIGKILL no milder signal follows."""
     core, instance = started()
     commands = core.handle(FailOrdered(TALKER, 100, "unhealthy: stopped", kill=True), 1.0)
@@ -354,7 +354,7 @@ def test_another_policy_counts_at_the_next_end():
     assert instance.phase == BACKOFF
 
 
-def test_a_repeated_policy_only_tells_again():
+def test_a_repeated_policy_only_reports_again():
     """DDS repeats messages, and so does a restarted master."""
     core, instance = started()
     core.handle(AmendOrdered(TALKER, ON_FAILURE), 1.0)
@@ -386,7 +386,7 @@ def test_a_policy_that_allows_no_restart_ends_the_wait_for_one(restart, phase):
         assert instance.message == "exit code 1; by its new policy it is not restarted"
 
 
-def test_a_policy_for_what_is_being_stopped_counts_afterwards():
+def test_a_policy_for_an_instance_being_stopped_counts_afterwards():
     """The leader ended and left other processes: the policy decides once they have ended."""
     core, instance = started(restart=ON_FAILURE)
     core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
@@ -395,7 +395,7 @@ def test_a_policy_for_what_is_being_stopped_counts_afterwards():
     assert instance.phase == FAILED
 
 
-def test_a_policy_for_what_has_ended_tells_its_end():
+def test_a_policy_for_an_ended_instance_reports_its_end():
     """The order starts nothing; for an unknown instance it has no effect either."""
     core, instance = started()
     core.handle(Exited(TALKER, 1), 1.0)

@@ -70,7 +70,7 @@ def links(monkeypatch, control) -> HostLinks:
     return links
 
 
-def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control):
+def test_an_order_waits_until_discovery_finds_the_service_of_the_slave(links, control):
     """An earlier order would be lost, and repeated only after `control.order_retry`."""
     control.ready = False
     links.renew(HOST, DESCRIPTION)

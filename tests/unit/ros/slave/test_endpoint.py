@@ -195,7 +195,7 @@ def slave(monkeypatch, caplog) -> Slave:
 
 
 @pytest.mark.parametrize("epoch", [1, 2, 3])
-def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> None:
+def test_another_run_of_the_master_is_reported_at_any_epoch(slave, epoch) -> None:
     """A master with a lost journal begins at epoch 1 again: the slave registers with it, too."""
     old, new = Master(slave, 11, epoch=2), Master(slave, 12, epoch=epoch, pid=8)
     slave.join(old)
@@ -216,7 +216,7 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     assert slave.newest(srv.RequestProcess).request.envelope.epoch == epoch
 
 
-def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
+def test_another_run_is_reported_without_a_contact_with_the_first(slave) -> None:
     """The first run is killed right after its greeting, which does not identify the run."""
     old, new = Master(slave, 11), Master(slave, 12, pid=8)
     slave.pass_time(PERIOD)
@@ -230,7 +230,7 @@ def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
     assert slave.link is MasterLink.REGISTERED
 
 
-def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
+def test_a_run_that_replaces_the_first_is_reported(slave) -> None:
     """In a container every master is pid 1 of the same host name."""
     old, new = Master(slave, 11, pid=1), Master(slave, 12, pid=1)
     slave.join(old)
@@ -249,7 +249,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     assert slave.host.events[-1] == events.Registered(1, renumbers=False)
 
 
-def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
+def test_of_two_masters_the_running_one_is_kept(slave) -> None:
     """The younger of two masters stops; the slave switches at once only to a newer epoch."""
     ours = Master(slave, 11, epoch=2)
     slave.join(ours)
@@ -260,7 +260,7 @@ def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
     assert slave.link is MasterLink.SEARCHING
 
 
-def test_beats_say_that_the_master_hears_this_host(slave) -> None:
+def test_beats_confirm_the_contact_of_this_host(slave) -> None:
     """Beats of the accepting master count, unless they list this host as silent."""
     ours, another = Master(slave, 11, epoch=2), Master(slave, 12, epoch=1, pid=8)
     slave.pass_time(PERIOD, ours)
@@ -276,7 +276,7 @@ def test_beats_say_that_the_master_hears_this_host(slave) -> None:
     assert slave.host.heard == pytest.approx([slave.clock.now])
 
 
-def test_old_beats_say_who_was_heard_then(slave) -> None:
+def test_delayed_beats_confirm_the_contact_of_their_time(slave) -> None:
     """A slave that was stopped finds old beats in its sockets."""
     ours = Master(slave, 11)
     slave.join(ours)
@@ -289,7 +289,7 @@ def test_old_beats_say_who_was_heard_then(slave) -> None:
     assert slave.host.heard == pytest.approx([now - 1.3, now - 1.1], abs=0.01)
 
 
-def test_an_answer_that_was_taken_in_late_greets_nobody(slave) -> None:
+def test_a_late_registration_answer_starts_no_session(slave) -> None:
     """Its round trip is too long to tell the age of the master's messages."""
     ours = Master(slave, 11)
     slave.pass_time(PERIOD)
@@ -319,7 +319,7 @@ def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave, 
     assert not [line for line in caplog.messages if "keep running" in line]
 
 
-def test_a_master_that_comes_back_is_told_that_the_slave_leaves(slave) -> None:
+def test_a_returning_master_learns_that_the_slave_leaves(slave) -> None:
     """The stop may take long; until its end the master must not count the host as staying."""
     slave.join(Master(slave, 11))
     slave.endpoint.leave(lambda: None)
@@ -362,7 +362,7 @@ def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
     assert slave.host.events.count(events.AssignmentsReceived((), None)) == 1
 
 
-def test_a_name_that_is_taken_is_said_at_once(slave, caplog) -> None:
+def test_a_host_name_in_use_is_reported_at_once(slave, caplog) -> None:
     """The slave retries for a moment, and logs the conflict once."""
     ours = Master(slave, 11)
     for _ in range(3):
@@ -376,7 +376,7 @@ def test_a_name_that_is_taken_is_said_at_once(slave, caplog) -> None:
 # --- remembered journal numbers ----------------------------------------------------------------
 
 
-def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_path) -> None:
+def test_the_journal_position_of_a_former_run_is_sent_back(monkeypatch, tmp_path) -> None:
     """A later run of the slave reports it, too; the same run of the master needs no report."""
     clock = Clock()
     monkeypatch.setattr(endpoint, "time", clock)

@@ -148,7 +148,7 @@ def assignment(*kept_on: str, kept_from: int = 1, number: int = 9, **fields) -> 
 # --- shipping ---------------------------------------------------------------------------------
 
 
-def test_a_state_is_shipped_when_it_has_changed(net):
+def test_a_snapshot_is_sent_when_it_has_changed(net):
     """The replica is identical, and is not sent again before there is a newer snapshot."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
@@ -166,7 +166,7 @@ def test_a_state_is_shipped_when_it_has_changed(net):
     net.until(lambda: net.age("b") == (7, 2), "the second state")
 
 
-def test_not_more_often_than_the_policy_says(net):
+def test_snapshots_are_sent_at_most_as_often_as_the_policy_allows(net):
     """The bound holds however fast the snapshot changes."""
     net.add("a").keep(P7, ["b"], 2.0)
     net.add("b")
@@ -177,7 +177,7 @@ def test_not_more_often_than_the_policy_says(net):
     assert 4 <= shipped <= 6
 
 
-def test_to_several_hosts(net):
+def test_each_host_receives_a_replica(net):
     """Each host receives the replica, one after the other."""
     net.add("a").keep(P7, ["b", "c", "a"], 1.0)
     net.add("b")
@@ -196,7 +196,7 @@ def test_the_rate_is_bounded(net):
     assert 3.5 <= net.now - begun <= 6.0
 
 
-def test_who_does_not_answer_is_tried_again_and_named_once(net):
+def test_a_silent_host_is_tried_again_and_logged_once(net):
     """Other hosts still receive their replicas."""
     net.add("a").keep(P7, ["b", "c"], 1.0)
     net.add("b")
@@ -211,7 +211,7 @@ def test_who_does_not_answer_is_tried_again_and_named_once(net):
     net.until(lambda: net.age("b") == (7, 1), "the copy on b")
 
 
-def test_a_newer_state_there_is_left_alone(net):
+def test_a_newer_snapshot_on_the_other_host_is_left_alone(net):
     """An old instance that still runs somewhere does not replace newer state."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
@@ -223,7 +223,7 @@ def test_a_newer_state_there_is_left_alone(net):
     assert net.log.messages == []
 
 
-def test_the_state_of_a_successor_is_not_sent_back(net):
+def test_the_snapshot_of_a_successor_is_not_sent_back(net):
     """The process has moved to b, whose slave sends its replicas to this host."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
@@ -238,7 +238,7 @@ def test_the_state_of_a_successor_is_not_sent_back(net):
     assert len(net.wires["a"].given) == given
 
 
-def test_room_is_bounded(net):
+def test_the_size_of_the_replicas_is_bounded(net):
     """The bound holds for the replicas of all processes together; existing ones stay."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b", max_bytes=10_000)
@@ -250,7 +250,7 @@ def test_room_is_bounded(net):
     assert net.age("b") == (7, 1)
 
 
-def test_a_state_that_is_damaged_on_its_way_is_refused(net):
+def test_a_snapshot_damaged_in_transfer_is_refused(net):
     """No part of the damaged replica is stored or left behind."""
     taker = net.add("b")
     net.write("b", 1, number=6)
@@ -264,7 +264,7 @@ def test_a_state_that_is_damaged_on_its_way_is_refused(net):
     assert not (net.directory("b") / "copy.new").exists()
 
 
-def test_parts_out_of_order_begin_anew(net):
+def test_a_part_out_of_order_restarts_the_transfer(net):
     """A part was lost, or two senders send at the same time."""
     taker = net.add("b")
     answers = []
@@ -273,7 +273,7 @@ def test_parts_out_of_order_begin_anew(net):
     assert answers[0].code == "order"
 
 
-def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
+def test_a_slow_disk_does_not_block_the_loop(net, monkeypatch):
     """Files are written by a thread, not by the loop."""
     slave = net.add("a")
     net.write("a", 1)
@@ -298,7 +298,7 @@ def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
 # --- reports to the master --------------------------------------------------------------------
 
 
-def test_the_master_is_told_what_is_kept_when_it_changes(net):
+def test_a_change_of_the_replicas_is_reported_to_the_master(net):
     """A new master receives the report at once."""
     slave = net.add("a")
     for _ in range(30):
@@ -313,7 +313,7 @@ def test_the_master_is_told_what_is_kept_when_it_changes(net):
     assert len(net.told["a"]) == before + 1
 
 
-def test_a_copy_that_has_come_is_told_at_once(net):
+def test_a_received_replica_is_reported_at_once(net):
     """The report must not wait for the next look, because the process may be lost before."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b")
@@ -325,7 +325,7 @@ def test_a_copy_that_has_come_is_told_at_once(net):
     assert [(one.instance, one.sequence) for one in net.told["b"][-1]] == [(P7, 1)]
 
 
-def test_what_lives_here_is_not_deleted(net):
+def test_the_snapshot_of_a_running_process_is_not_deleted(net):
     """A late order does not delete the snapshot of a running process."""
     slave = net.add("a")
     net.write("a", 3)
@@ -352,7 +352,7 @@ def prepare(net: Net, host: str, wanted: Assignment) -> list[Assignment]:
     return started
 
 
-def test_a_start_fetches_the_newest_state(net):
+def test_a_start_fetches_the_newest_snapshot(net):
     """The parts of the snapshot are stored as if the node had published it here."""
     net.add("a")
     net.add("b")
@@ -374,7 +374,7 @@ def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
     assert net.age("a") == (7, 41)
 
 
-def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
+def test_without_a_newer_snapshot_a_process_starts_from_the_local_one(net, monkeypatch):
     """The slave logs the reason."""
     monkeypatch.setattr(fetch, "PATIENCE", 0.05)
     net.add("a")
@@ -390,7 +390,7 @@ def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
     assert "it starts from cycle 5, which is here: b: its slave was not found" in second
 
 
-def test_what_is_here_and_as_new_is_not_fetched(net):
+def test_a_local_snapshot_as_new_is_not_fetched(net):
     net.add("a")
     net.add("b")
     net.write("a", 42)
@@ -399,7 +399,7 @@ def test_what_is_here_and_as_new_is_not_fetched(net):
     assert net.age("a") == (7, 42)
 
 
-def test_all_that_is_kept_is_the_owners_alone(net):
+def test_snapshots_and_replicas_are_private_to_their_owner(net):
     """The mode is 0o700 under any umask, whether a node or a replica creates the directory."""
     before = os.umask(0)
     try:
@@ -418,7 +418,7 @@ def test_all_that_is_kept_is_the_owners_alone(net):
 @pytest.mark.parametrize(
     "wanted", [assignment("a", "b"), assignment(), assignment("b", shadow=True)], ids=str
 )
-def test_what_needs_no_state_of_another_host_asks_none(net, wanted):
+def test_a_start_that_needs_no_snapshot_of_another_host_fetches_none(net, wanted):
     """The newest snapshot is here, or none exists, or the instance follows a source."""
     net.add("a")
     net.add("b")
@@ -427,13 +427,13 @@ def test_what_needs_no_state_of_another_host_asks_none(net, wanted):
     assert net.age("a") is None
 
 
-def test_a_process_without_a_state_starts_at_once(net):
+def test_a_stateless_process_starts_at_once(net):
     """No host is asked for a snapshot."""
     stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", kept_on=("b",))
     assert net.add("a").prepare(stateless, pytest.fail)
 
 
-def test_states_of_a_former_life_are_deleted_before_a_start(net):
+def test_snapshots_of_a_former_process_are_deleted_before_a_start(net):
     """The origin of these snapshots makes no difference."""
     net.add("a")
     net.write("a", 42)
@@ -441,7 +441,7 @@ def test_states_of_a_former_life_are_deleted_before_a_start(net):
     assert net.age("a") is None
 
 
-def test_a_start_goes_on_though_looking_for_its_state_failed(net, monkeypatch):
+def test_a_start_proceeds_though_the_search_for_its_snapshot_failed(net, monkeypatch):
     """The slave logs the error."""
     slave = net.add("a")
     monkeypatch.setattr(slave, "_look_for", lambda _: 1 / 0)

@@ -72,7 +72,7 @@ def test_processes_survive_a_killed_slave(host, slave):
     wait_until(lambda: command_of(status.pid).startswith("sleep"), "the process is executed")
 
 
-def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):
+def test_no_terminal_signal_of_the_slave_reaches_its_processes(host, slave):
     """Supervisor and process have sessions of their own, so Ctrl-C reaches neither."""
     supervisor = next(iter(host.pids))
     (process,) = wait_until(host.alive, "the process is executed")
@@ -125,7 +125,7 @@ def test_a_killed_supervisor_is_taken_over(host, client):
     assert host.log("kept").read_text() == "ran\n"
 
 
-def test_an_end_that_nobody_saw_is_said_to_be_unknown(host, client):
+def test_an_unobserved_end_is_reported_as_unknown(host, client):
     """A process that ended without a supervisor has failed, with exit code unknown; no restart."""
     client.start([host.order("gone", "sleep", "1000")])
     pid = host.running(client, "gone").pid
@@ -205,7 +205,7 @@ def test_a_spawn_without_a_record_is_found_by_its_marks(host, client):
     assert (status.state, status.pid) == (InstanceState.RUNNING, pid)
 
 
-def test_a_torn_tail_is_left_out_and_said(host, client):
+def test_a_torn_tail_is_left_out_and_reported(host, client):
     """A record that ends in half a line is read up to there, and the client gets a note."""
     client.start([host.order("kept", "sleep", "1000")])
     host.running(client, "kept")
@@ -217,7 +217,7 @@ def test_a_torn_tail_is_left_out_and_said(host, client):
     assert any("torn line" in note for note in client.notes)
 
 
-def test_a_damaged_line_is_left_out_and_said(host, client):
+def test_a_damaged_line_is_left_out_and_reported(host, client):
     """An unreadable line is skipped, and the client gets a note with its line number."""
     host.run(client, host.order("job", "true"))
     host.kill_supervisor(client)
@@ -320,7 +320,7 @@ def test_no_supervisor_is_started_unless_asked(host):
     assert not host.state.exists()
 
 
-def test_an_unusable_state_directory_is_said(tmp_path):
+def test_an_unusable_state_directory_is_reported(tmp_path):
     """The error names the directory that cannot be created, at once."""
     (tmp_path / "file").write_text("")
     with pytest.raises(SupervisorError, match="file/state cannot be used"):
@@ -339,7 +339,7 @@ def test_shutdown_ends_everything_and_leaves_nothing(host, client):
     assert not (host.state / "supervisor.sock").exists()
 
 
-def test_it_ends_when_nothing_runs_and_nobody_is_there(host):
+def test_a_supervisor_without_client_and_processes_ends(host):
     """A supervisor without a client ends when all its processes have ended."""
     first = host.connect()
     first.start([host.python("p", "import sys; sys.stdin.read(); input()")])
@@ -351,7 +351,7 @@ def test_it_ends_when_nothing_runs_and_nobody_is_there(host):
     assert [status.exit_code for status in second.instances] == [1]
 
 
-def test_it_stays_for_what_runs_and_ends_with_it(host):
+def test_a_supervisor_without_client_ends_with_its_last_process(host):
     """A supervisor without a client ends with its last process."""
     first = host.connect()
     first.start([host.python("p", "import time; time.sleep(1000)")])
@@ -365,7 +365,7 @@ def test_it_stays_for_what_runs_and_ends_with_it(host):
     assert host.connect().instances[0].exit_signal == signal.SIGKILL
 
 
-def test_a_lost_supervisor_is_told(host, client):
+def test_a_lost_supervisor_is_reported(host, client):
     """A waiting slave is notified at once of the end of its supervisor."""
     os.kill(client.pid, signal.SIGKILL)
     with pytest.raises(SupervisorError, match="is gone; its processes go on"):
@@ -382,7 +382,7 @@ def test_orders_pass_while_another_thread_waits(host, client):
     assert received
 
 
-def test_it_sleeps_while_nothing_happens(host, client):
+def test_an_idle_supervisor_sleeps(host, client):
     """Without processes or orders the supervisor is not scheduled at all."""
     host.run(client, host.order("job", "true"))
 
@@ -398,7 +398,7 @@ def test_it_sleeps_while_nothing_happens(host, client):
     assert switches() == before
 
 
-def test_it_imports_nothing_heavy():
+def test_the_supervisor_imports_nothing_heavy():
     """The supervisor's modules import the standard library only, and little of it."""
     root = str(Path(rosrm.__file__).parent.parent)
     code = f"import sys; sys.path.append({root!r}); import rosrm.supervisor.server"
@@ -412,7 +412,7 @@ def test_it_imports_nothing_heavy():
     assert "rosrm.model.values" not in loaded
 
 
-def test_it_is_small(client):
+def test_the_supervisor_is_small(client):
     """The supervisor uses at most 12 MiB, alone on the machine (about 8 beside other Pythons)."""
     rollup = Path(f"/proc/{client.pid}/smaps_rollup").read_text().split()
     assert int(rollup[rollup.index("Pss:") + 1]) < 12 * 1024
