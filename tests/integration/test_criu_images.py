@@ -1,4 +1,4 @@
-"""Real processes are dumped into images, and restored below the program that holds them."""
+"""Dumps of real processes into images, and restores below a shim."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.integration.supervisor.conftest import Host
 
 pytestmark = pytest.mark.timeout(240)
 
-#: Writes one number after the other; ends with 7 at SIGTERM, says so at SIGUSR1.
+#: Writes consecutive numbers; exits with 7 at SIGTERM, prints `usr1` at SIGUSR1.
 COUNTER = """
 import os, signal, sys, time
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
@@ -37,13 +37,13 @@ while True:
 
 @pytest.fixture
 def counter(theatre):
-    """A counter that counts."""
+    """Return a running counter."""
     actor = theatre.start(COUNTER)
     actor.counts()
     return actor
 
 
-# --- what goes on -------------------------------------------------------------------------------
+# --- restored state -----------------------------------------------------------------------------
 
 
 def test_a_restored_process_continues_and_logs_into_the_new_file(theatre, counter):
@@ -72,7 +72,7 @@ def test_five_hops_in_a_row(theatre, counter):
 
 
 def test_a_udp_socket_is_the_same_after_the_restore(theatre):
-    """It answers at the same address, and knows how often it was asked."""
+    """The socket has the same address, and the process its number of requests."""
     code = """
 import socket
 ours, count = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), 0
@@ -96,7 +96,7 @@ while True:
 
 
 def test_a_heap_of_numpy_with_its_threads_is_the_same(theatre):
-    """8 MB of chance numbers, three threads: the same sum, and the threads run."""
+    """A heap of 8 MB keeps its checksum, and its three threads run."""
     code = """
 import hashlib, threading, time, numpy
 heap = numpy.random.default_rng(1).random(1 << 20)
@@ -119,7 +119,7 @@ turn("c")
 
 
 def test_child_and_pipe_are_restored_with_their_parent(theatre):
-    """The tree is dumped, pipes within it too: the child's numbers go on through its parent."""
+    """The image has the tree and its pipes: the parent still prints the child's numbers."""
     code = f"""
 import subprocess, sys
 child = subprocess.Popen([sys.executable, "-I", "-S", "-c", {COUNTER!r}], stdout=subprocess.PIPE)
@@ -136,7 +136,7 @@ for line in child.stdout:
 
 
 def test_a_file_below_the_working_directory_follows(theatre):
-    """It is put back as it was when the process stood still, and written on at the same place."""
+    """The restore writes the file as it was at the dump; the process continues at its offset."""
     code = f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}"
     actor = theatre.start(code)
     count = theatre.work / "count"
@@ -151,7 +151,7 @@ def test_a_file_below_the_working_directory_follows(theatre):
 
 
 def test_a_missing_log_of_the_process_is_created(theatre):
-    """As rcl's in ~/.ros/log: what is only appended to stays behind, and goes on empty."""
+    """A file that is only appended to, such as rcl's in ~/.ros/log, is not part of the image."""
     own = theatre.folder / "logs/own.log"
     own.parent.mkdir()
     actor = theatre.start(f"import sys; sys.stdout = open({str(own)!r}, 'a')\n{COUNTER}")
@@ -164,7 +164,7 @@ def test_a_missing_log_of_the_process_is_created(theatre):
 
 
 def test_a_process_in_its_supervisors_directory_moves_to_that_of_another_host(theatre):
-    """There it has another path: working directory and files below it move along, hop by hop."""
+    """Working directory and files below it follow to the other path, at each hop."""
 
     def state(number: int) -> dict[str, str]:
         return {"ROSRM_SUPERVISOR": str(theatre.folder / f"host{number}")}
@@ -185,7 +185,7 @@ def test_a_process_in_its_supervisors_directory_moves_to_that_of_another_host(th
         shelter(number - 1).rmdir()
         actor = theatre.restore(directory, environment=state(number))
         assert working_directory(actor.outcome.pid) == str(shelter(number))
-        image.read(directory)  # nothing was changed in the image itself
+        image.read(directory)  # the image itself is unchanged
         size = theatre.manifest.files[0].size
         here = shelter(number) / "count"
         eventually(lambda: here.stat().st_size > size, "more numbers")  # noqa: B023
@@ -198,18 +198,18 @@ def working_directory(pid: int) -> str:
 
 
 def test_files_of_proc_are_not_part_of_the_image(theatre):
-    """What it reads of itself in /proc is elsewhere in /proc, and CRIU knows that."""
+    """CRIU restores an open file of /proc for the new pid."""
     actor = theatre.start(f"import os; own = open(f'/proc/{{os.getpid()}}/stat')\n{COUNTER}")
     actor.counts()
     theatre.restore(theatre.dump(actor)).counts()
     assert theatre.manifest.files == ()
 
 
-# --- what becomes of the source -----------------------------------------------------------------
+# --- the source -----------------------------------------------------------------------------------
 
 
 def test_a_running_process_does_not_stop_for_the_checksums(theatre, counter, monkeypatch):
-    """Of a large image they take as long as the dump; a process that runs on is not held up."""
+    """The checksums of a large image take as long as its dump, but stop no process."""
     make = image.file_checksums
 
     def make_while_it_counts(directory, names):
@@ -222,42 +222,16 @@ def test_a_running_process_does_not_stop_for_the_checksums(theatre, counter, mon
     assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
 
 
-def test_a_stopped_source_runs_on_when_it_is_resumed(theatre, counter):
-    """Until the commit nothing is lost: who takes the move back resumes the source."""
-    theatre.dump(counter, leave="stopped")
-    seen = counter.numbers()
-    assert process_tree.is_stopped(counter.pid)
-    dump.resume(counter.pid)
-    counter.counts()
-    assert counter.numbers()[: len(seen) + 1] == list(range(1, len(seen) + 2))
-
-
 def test_a_process_stopped_before_its_dump_stays_stopped(theatre, counter):
-    """A process that somebody stopped stays stopped after its dump."""
+    """A process that a user stopped stays stopped after its dump."""
     counter.process.send_signal(signal.SIGSTOP)
     assert process_tree.wait_until_stopped([counter.pid], TIMEOUT)
     theatre.dump(counter, leave="running")
     assert process_tree.is_stopped(counter.pid)
 
 
-def test_a_pipe_to_outside_is_named_and_the_source_runs_on(theatre):
-    """CRIU would dump it without a word; nobody would be at its other end."""
-    ours, theirs = os.pipe()
-    try:
-        actor = theatre.start(COUNTER, pass_fds=(theirs,))
-        actor.counts()
-        with pytest.raises(
-            CriuError, match=f"{theirs} of pid {actor.pid} .*a pipe .*{os.getpid()}"
-        ):
-            theatre.dump(actor)
-        actor.counts()
-    finally:
-        os.close(ours)
-        os.close(theirs)
-
-
 def test_after_any_error_the_source_runs_on(theatre, counter, monkeypatch):
-    """A bug of ours too, after CRIU has stopped the process."""
+    """The same holds for a bug of rosrm after CRIU has stopped the process."""
     monkeypatch.setattr(image, "write", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         theatre.dump(counter)
@@ -279,7 +253,7 @@ def test_a_unix_socket_to_outside_is_named_and_the_source_runs_on(theatre, kind)
 
 
 def test_a_socket_pair_within_the_process_is_no_external_resource(theatre):
-    """As an event loop holds one to wake itself."""
+    """An event loop, for example, has one to wake itself."""
     code = f"import socket; pair = socket.socketpair()\n{COUNTER}"
     actor = theatre.start(code)
     actor.counts()
@@ -287,7 +261,7 @@ def test_a_socket_pair_within_the_process_is_no_external_resource(theatre):
 
 
 def test_a_traced_process_is_refused_with_its_debugger(theatre, counter):
-    """Two cannot hold one process; the process does not suffer."""
+    """CRIU cannot trace a process that another one traces; the process runs on."""
     code = """
 import ctypes, signal, sys
 libc = ctypes.CDLL(None, use_errno=True)
@@ -310,7 +284,7 @@ while True:
 
 @pytest.mark.skipif(not os.access("/dev/fuse", os.W_OK), reason="/dev/fuse may not be opened")
 def test_a_device_is_named_and_the_source_runs_on(theatre):
-    """What CRIU itself refuses is said in words, and nothing but its log is left of the image."""
+    """The error explains what CRIU refuses, and only the log of CRIU is left of the image."""
     actor = theatre.start(f"device = open('/dev/fuse', 'rb+', buffering=0)\n{COUNTER}")
     actor.counts()
     with pytest.raises(CriuError, match=r"file descriptor \d+ is the device /dev/fuse"):
@@ -320,7 +294,7 @@ def test_a_device_is_named_and_the_source_runs_on(theatre):
 
 
 def test_an_image_without_disk_space_is_not_begun(theatre, counter, monkeypatch):
-    """The file system of the image keeps some space; the process is not touched."""
+    """The dump leaves some space free on the file system; the process is not touched."""
     monkeypatch.setattr(process_tree, "memory_of", lambda pids: 1 << 60)
     with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
         theatre.dump(counter)
@@ -328,11 +302,11 @@ def test_an_image_without_disk_space_is_not_begun(theatre, counter, monkeypatch)
     assert [*(theatre.folder / "image").iterdir()] == []
 
 
-# --- below the hold -----------------------------------------------------------------------------
+# --- below the shim -------------------------------------------------------------------------------
 
 
 def test_the_exit_code_comes_through_the_shim(theatre, counter):
-    """SIGTERM is passed on, and the process's own answer to it is the shim's end."""
+    """The process receives SIGTERM, and the shim exits with its exit code."""
     restored = theatre.restore(theatre.dump(counter))
     restored.process.terminate()
     assert restored.process.wait(TIMEOUT) == 7
@@ -340,7 +314,7 @@ def test_the_exit_code_comes_through_the_shim(theatre, counter):
 
 @pytest.mark.parametrize("option", [[], ["--no-namespace"]])
 def test_a_process_that_ends_at_once_counts_as_restored(theatre, option):
-    """A process that waits for nothing but its last instruction: its end comes through."""
+    """The exit code comes through although the restored process runs only its last instruction."""
     code = "import os, signal; os.kill(os.getpid(), signal.SIGSTOP); os._exit(9)"
     actor = theatre.start(code)
     assert process_tree.wait_until_stopped([actor.pid], TIMEOUT)
@@ -362,10 +336,8 @@ def test_signals_come_through_the_shim(theatre, counter):
     assert restored.process.wait(TIMEOUT) == -signal.SIGUSR2
 
 
-@pytest.mark.parametrize("group", [True, False])
-def test_sigkill_of_the_shim_ends_all_of_it(theatre, group):
-    """Also a daemon that has left group and session. It takes milliseconds on an idle machine."""
-    code = f"""
+#: The counter, which starts a daemon at SIGHUP.
+DAEMON = f"""
 import os, signal
 def become_two(*_):
     if os.fork() == 0:
@@ -375,12 +347,22 @@ def become_two(*_):
         os.write(1, b"daemon\\n")
 signal.signal(signal.SIGHUP, become_two)
 {COUNTER}"""
-    actor = theatre.start(code)
+
+
+def with_daemon(theatre):
+    """Return a restored process that has a daemon, and their namespace."""
+    actor = theatre.start(DAEMON)
     actor.counts()
     restored = theatre.restore(theatre.dump(actor))
     os.killpg(restored.pid, signal.SIGHUP)
     restored.says("daemon")
-    namespace = pid_namespace(restored.outcome.pid)
+    return restored, pid_namespace(restored.outcome.pid)
+
+
+@pytest.mark.parametrize("group", [True, False])
+def test_sigkill_of_the_shim_ends_all_of_it(theatre, group):
+    """The end includes a daemon that has left group and session, and takes milliseconds."""
+    restored, namespace = with_daemon(theatre)
     assert len(living_in(namespace)) == 3  # the init, the process, the daemon
     if group:
         os.killpg(restored.pid, signal.SIGKILL)
@@ -397,7 +379,7 @@ def pid_namespace(pid: int) -> str:
 
 
 def living_in(namespace: str) -> list[int]:
-    """Processes of a pid namespace that are not just waiting to be reaped."""
+    """Return the processes of a pid namespace, without zombies."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
@@ -409,28 +391,15 @@ def living_in(namespace: str) -> list[int]:
 
 
 def test_daemons_of_a_restored_process_end_with_it(theatre):
-    """Its end is the end of the namespace, before the shim's own is seen."""
-    code = f"""
-import os, signal
-def become_two(*_):
-    if os.fork() == 0:
-        os.setsid()
-        os.write(1, b"daemon\\n")
-signal.signal(signal.SIGHUP, become_two)
-{COUNTER}"""
-    actor = theatre.start(code)
-    actor.counts()
-    restored = theatre.restore(theatre.dump(actor))
-    os.killpg(restored.pid, signal.SIGHUP)
-    restored.says("daemon")
-    namespace = pid_namespace(restored.outcome.pid)
+    """The namespace ends with the process, before the shim ends."""
+    restored, namespace = with_daemon(theatre)
     restored.process.terminate()
     assert restored.process.wait(TIMEOUT) == 7
     assert living_in(namespace) == []
 
 
 def test_marks_of_the_former_instance_are_removed(theatre):
-    """A supervisor that looks for leftovers of the old instance does not find the restored one."""
+    """A supervisor that looks for processes of the old instance does not find the restored one."""
     marks = {"ROSRM_INSTANCE": "actor#1", "ROSRM_SUPERVISOR": "/somewhere", "MORE": "kept"}
     actor = theatre.start(COUNTER, environment=marks)
     actor.counts()
@@ -440,7 +409,7 @@ def test_marks_of_the_former_instance_are_removed(theatre):
 
 
 def test_the_image_is_private_and_removed_on_request(theatre, counter):
-    """Memory of a process is nobody else's business; how the restore went is all that is left."""
+    """Other users cannot read the memory; only the result of the restore stays."""
     directory = theatre.dump(counter)
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
     assert modes == {0}
@@ -456,7 +425,7 @@ def test_the_result_of_a_restore_outlives_the_process(theatre, counter, victim):
     """The result of a restore survives any early end of the process; its memory is removed."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, remove=True)
-    told = restored.outcome
+    result = restored.outcome
     eventually(
         lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "its removal"
     )
@@ -464,7 +433,7 @@ def test_the_result_of_a_restore_outlives_the_process(theatre, counter, victim):
     os.kill(pid, signal.SIGKILL)
     assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
     assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
-    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == told
+    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == result
 
 
 @pytest.fixture
@@ -475,13 +444,20 @@ def host(tmp_path):
     host.clean_up()
 
 
+def supervised(theatre, host, directory, restart=RestartPolicy(), **shim):  # noqa: B008
+    """Restore an image as instance 2 below a supervisor; return its client and the status."""
+    client = host.connect()
+    command = theatre.shim_command(directory, **shim)
+    client.start([host.order("actor", *command, number=2, restart=restart)])
+    running = host.running(client, "actor", number=2)
+    eventually((directory / "hold.json").exists, "the end of the restore")
+    return client, running
+
+
 def test_a_supervisor_manages_a_restored_process(theatre, counter, host):
     """The supervisor starts a shim like any process: it stops it, and sees its end."""
     directory = theatre.dump(counter)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = supervised(theatre, host, directory)
     assert process_tree.root_of(running.pid) != running.pid
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
@@ -489,12 +465,9 @@ def test_a_supervisor_manages_a_restored_process(theatre, counter, host):
 
 
 def test_the_next_supervisor_re_adopts_a_restored_process(theatre, counter, host):
-    """It runs on meanwhile, is known again, and is stopped like any other."""
+    """The process keeps running, and the next supervisor can stop it."""
     directory = theatre.dump(counter)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    before = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, before = supervised(theatre, host, directory)
     log = host.log("actor", 2)
     host.kill_supervisor(client)
     client = host.connect()
@@ -514,10 +487,7 @@ def test_a_restored_process_that_ignores_sigint_is_killed(theatre, host):
     actor = theatre.start(code)
     actor.counts()
     directory = theatre.dump(actor)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = supervised(theatre, host, directory)
     namespace = pid_namespace(process_tree.root_of(running.pid))
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
@@ -526,15 +496,11 @@ def test_a_restored_process_that_ignores_sigint_is_killed(theatre, host):
 
 
 def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host):
-    """The restart policy holds for what was restored: it begins at one, as after any crash."""
+    """After a crash the process starts from its program, not from the image."""
     directory = theatre.dump(counter)
-    then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "a word of its own"]
-    command = theatre.shim_command(directory, remove=True, then=then)
-    client = host.connect()
+    then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "another argument"]
     restart = RestartPolicy("on-failure", delay=0.01)
-    client.start([host.order("actor", *command, number=2, restart=restart)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = supervised(theatre, host, directory, restart=restart, remove=True, then=then)
     log = host.log("actor", 2)
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
@@ -547,7 +513,7 @@ def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host)
 
 
 def test_without_a_namespace_pid_signals_and_end_are_the_same(theatre, counter):
-    """Where no namespace may be entered: same pid, signals and end come through."""
+    """The restore works also where namespaces are forbidden."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, "--no-namespace")
     restored.counts()
@@ -569,7 +535,7 @@ def test_without_a_namespace_a_guard_ends_it_with_its_shim(theatre, counter):
 
 
 def test_without_a_namespace_a_pid_in_use_is_reported(theatre, counter):
-    """The source still has it; it is not harmed."""
+    """The error names the pid, which the source still has; the source is not harmed."""
     directory = theatre.dump(counter, leave="stopped")
     with pytest.raises(CriuError, match=rf"its pid {counter.pid} is in use here"):
         theatre.restore(directory, "--no-namespace")
@@ -582,32 +548,32 @@ def test_without_a_namespace_a_pid_in_use_is_reported(theatre, counter):
 
 @pytest.mark.parametrize("pattern", ["criu/pages-1.img", "files/*"])
 def test_a_flipped_byte_is_refused(theatre, pattern):
-    """The size is the same. Neither has CRIU begun, nor was a file put over what lies there."""
+    """The checksums are compared before CRIU starts and before any file is written."""
     actor = theatre.start(f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}")
     count = theatre.work / "count"
     eventually(lambda: count.exists() and count.read_text().count("\n") > 2, "its file")
     directory = theatre.dump(actor)
-    count.write_text("of somebody else")
+    count.write_text("of another user")
     [damaged] = directory.glob(pattern)
     flip_a_bit(damaged)
     shim = theatre.shim(directory)
     assert shim.process.wait(TIMEOUT) == 125
-    wanted = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
-    assert wanted in shim.log.read_text()
-    assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
+    damage = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
+    assert damage in shim.log.read_text()
+    assert damage in json.loads((directory / "hold.json").read_text())["reason"]
     assert not (directory / "restore.log").exists()
-    assert count.read_text() == "of somebody else"
+    assert count.read_text() == "of another user"
 
 
 def flip_a_bit(path: Path) -> None:
-    """In the middle of a file."""
+    """Flip a bit in the middle of a file."""
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
 
 
 def test_an_image_without_checksums_is_restored(theatre, counter):
-    """As one that has just come from another host: the transfer has a checksum of its own."""
+    """A transferred image has none, because the transfer has a checksum of its own."""
     directory = theatre.folder / "image"
     manifest = dump.dump(
         theatre.criu, counter.pid, directory, leave="killed", timeout=TIMEOUT, checksums=False
@@ -621,7 +587,7 @@ def test_an_image_without_checksums_is_restored(theatre, counter):
 
 
 def changed(directory: Path, **values: object) -> None:
-    """Another manifest."""
+    """Change the manifest of an image."""
     image.write(directory, replace(image.read(directory), **values))
 
 
@@ -636,7 +602,7 @@ def changed(directory: Path, **values: object) -> None:
     ],
 )
 def test_a_missing_requirement_of_an_image_is_named(theatre, counter, values, said):
-    """Before CRIU begins: the path, and the host."""
+    """The error comes before CRIU starts, and has the path and the host."""
     directory = theatre.dump(counter)
     changed(directory, **values)
     with pytest.raises(CriuError, match=said):
@@ -644,7 +610,7 @@ def test_a_missing_requirement_of_an_image_is_named(theatre, counter, values, sa
 
 
 def test_a_file_that_the_process_reads_must_exist(theatre):
-    """What it only reads does not follow."""
+    """Files that are only read are not part of the image."""
     table = theatre.folder / "table"
     table.write_text("rows")
     actor = theatre.start(f"table = open({str(table)!r})\n{COUNTER}")
@@ -656,7 +622,7 @@ def test_a_file_that_the_process_reads_must_exist(theatre):
 
 
 def test_an_image_that_others_may_read_is_refused(theatre, counter):
-    """Who can write to it can run what he likes as the process's user."""
+    """A user who can write to an image can run any code as the user of the process."""
     directory = theatre.dump(counter)
     directory.chmod(0o755)
     with pytest.raises(CriuError, match="open to others"):
@@ -664,7 +630,7 @@ def test_an_image_that_others_may_read_is_refused(theatre, counter):
 
 
 def test_the_shared_memory_of_lttng_is_created_where_it_is_missing(theatre, counter):
-    """LTTng's shared memory, which every ROS process maps, has no content."""
+    """Every ROS process maps the shared memory of LTTng, which has no content."""
     directory = theatre.dump(counter)
     path = Path(f"/dev/shm/lttng-ust-wait-rosrm-test-{os.getpid()}")
     changed(directory, mapped=(MappedFile(str(path), 4096, 0o640),))
@@ -677,7 +643,7 @@ def test_the_shared_memory_of_lttng_is_created_where_it_is_missing(theatre, coun
 
 
 def test_criu_uses_no_pid_that_it_must_restore():
-    """In a fresh namespace ids begin small, where those of a container's processes are too."""
+    """A container has small ids, and so has CRIU in a fresh namespace."""
     assert restore.id_for_criu((), 32768) == 300
     assert restore.id_for_criu((12, 13, 310), 32768) == 310
     assert restore.id_for_criu(tuple(range(1, 32700, 100)), 32768) == 300
