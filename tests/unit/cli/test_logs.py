@@ -183,12 +183,6 @@ def test_tail_counts_no_line_that_is_written_while_the_log_is_read(rosrm, client
     assert len(out.splitlines()) == lines
 
 
-def test_a_host_to_read_from_has_to_exist(rosrm, client, slaves):
-    result = rosrm("logs", "talker", "--host", "nix")
-    assert result.code == 1
-    assert "rosrm: no such host: 'nix'; there are: alpha, beta (" in result.err
-
-
 def test_since_begins_at_a_time(rosrm, client, slaves):
     """The bound applies within an instance, and leaves out earlier instances."""
     now = time.time()

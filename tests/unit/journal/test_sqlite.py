@@ -178,7 +178,7 @@ def test_a_damaged_log_costs_what_is_behind_the_damage(path, opened) -> None:
     assert journal.last_sequence == 2 * last
 
 
-def test_an_invalid_write_ahead_log_is_reported(path) -> None:
+def test_an_occupied_path_of_the_write_ahead_log_is_reported(path) -> None:
     """The log's path is occupied, and the message names it."""
     fill(path)
     path.with_name("journal.sqlite-wal").mkdir()
