@@ -6,22 +6,27 @@ import json
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from rosrm.errors import TransferError
 from rosrm_criu.transfer import Fetcher, Offer, OfferResult, Sender
-from tests.integration.transfer.trees import PATIENCE, digests, listens, nothing_left, slowly, until
+from tests.integration.transfer.trees import (
+    PATIENCE,
+    digests,
+    fetching,
+    listens,
+    nothing_left,
+    slowly,
+    until,
+)
 
 
 def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fetcher, destination):
     """A killed fetch leaves only a hidden directory, which the next fetch beside it removes."""
     offer = slowly(sender, source, fetcher.introduce())
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(fetcher, offer, target, timeout=PATIENCE) as going:
         fetcher._process.kill()
         with pytest.raises(TransferError, match="ended with status -9 and no answer"):
             going.result(PATIENCE)
@@ -38,9 +43,7 @@ def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fe
 def test_a_fetch_can_be_stopped(source, target, sender, fetcher):
     """A fetch can be stopped from another thread, and leaves nothing."""
     offer = slowly(sender, source, fetcher.introduce())
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(fetcher, offer, target, timeout=PATIENCE) as going:
         fetcher.close()
         with pytest.raises(TransferError, match="stopped before all had come"):
             going.result(PATIENCE)
@@ -49,9 +52,7 @@ def test_a_fetch_can_be_stopped(source, target, sender, fetcher):
 
 def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender, fetcher):
     offer = slowly(sender, source, fetcher.introduce())
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(fetcher, offer, target, timeout=PATIENCE) as going:
         assert sender.close().outcome == "withdrawn"
         assert not listens(offer.port)
         with pytest.raises(TransferError, match=r"the transfer was cut"):
@@ -142,9 +143,8 @@ def test_closing_twice_and_from_several_threads_does_no_harm(source, destination
     assert sender.close() == OfferResult("withdrawn", 0)
 
 
-def test_a_destination_that_was_not_introduced_fetches_nothing(source, target, sender, destination):
+def test_a_destination_that_was_not_introduced_fetches_nothing(offer, target):
     """A fetch without `introduce` fails at once, because the source would refuse it."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with Fetcher() as fetcher, pytest.raises(TransferError, match="was not introduced"):
         fetcher.fetch(offer, target, timeout=PATIENCE)
     assert nothing_left(target)

@@ -7,9 +7,12 @@ import hashlib
 import random
 import socket
 import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
-from rosrm_criu.transfer import DEFAULT_RESERVE, Fetched, Offer, Sender
+from rosrm_criu.transfer import DEFAULT_RESERVE, Fetched, Fetcher, Offer, Sender
 from rosrm_criu.transfer.certificate import new_identity
 from rosrm_criu.transfer.receiving import receive
 
@@ -76,6 +79,15 @@ def until(what: str, condition) -> None:
     while not condition():
         assert time.monotonic() < end, f"not within {PATIENCE} s: {what}"
         time.sleep(0.02)
+
+
+@contextmanager
+def fetching(by: Destination | Fetcher, offer: Offer, target: Path, **more) -> Iterator[Future]:
+    """Fetch in another thread; yield the running fetch once its first files have arrived."""
+    with ThreadPoolExecutor() as threads:
+        going = threads.submit(by.fetch, offer, target, **more)
+        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+        yield going
 
 
 def nothing_left(target: Path) -> bool:
