@@ -42,15 +42,17 @@ def shadow() -> Assignment:
     return Assignment(InstanceId("talker", 8), spec, 3, "talker_1700000000", shadow=True)
 
 
-def order(tmp_path, environment=None, **fields):
+def launched(tmp_path, given: Assignment, environment=None, python=sys.executable):
+    """Return the launch order for an assignment."""
     return launch_order(
-        assignment(**fields),
-        {"PATH": "/usr/bin", **(environment or {})},
-        sys.executable,
-        where=HERE,
-        state_directory=tmp_path,
+        given, environment or {}, python, where=HERE, state_directory=tmp_path,
         launchers=Launchers(),
-    )
+    )  # fmt: skip
+
+
+def order(tmp_path, environment=None, **fields):
+    environment = {"PATH": "/usr/bin", **(environment or {})}
+    return launched(tmp_path, assignment(**fields), environment)
 
 
 @pytest.fixture
@@ -112,9 +114,7 @@ def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
 
 def test_an_alias_names_the_node(tmp_path):
     """In a handoff the assignment has the node's name, not the spec."""
-    made = launch_order(
-        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
-    )
+    made = launched(tmp_path, shadow())
     assert "__node:=talker_1700000000" in made.argv
     (file,) = (tmp_path / "logs").glob("*.yaml")
     assert yaml.safe_load(file.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
@@ -122,14 +122,9 @@ def test_an_alias_names_the_node(tmp_path):
 
 def test_a_shadow_is_not_restarted(tmp_path):
     """A shadow's end is final, whatever its spec says; other instances follow their specs."""
-    made = launch_order(
-        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
-    )
+    made = launched(tmp_path, shadow())
     assert made.restart == RestartPolicy("never")
-    plain = replace(shadow(), shadow=False)
-    made = launch_order(
-        plain, {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
-    )
+    made = launched(tmp_path, replace(shadow(), shadow=False))
     assert made.restart == RestartPolicy("always")
 
 
@@ -173,14 +168,8 @@ def test_an_executable_is_found_through_the_ament_index(tmp_path, prefix):
 
 def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
     """The ROS wheels set no AMENT_PREFIX_PATH: their packages are in the virtual environment."""
-    made = launch_order(
-        assignment(package="demo_nodes", executable="talker"),
-        {},
-        str(prefix / "bin" / "python3"),
-        where=HERE,
-        state_directory=tmp_path,
-        launchers=Launchers(),
-    )
+    given = assignment(package="demo_nodes", executable="talker")
+    made = launched(tmp_path, given, python=str(prefix / "bin" / "python3"))
     assert made.argv[0] == str(prefix / "lib" / "demo_nodes" / "talker")
 
 
@@ -298,29 +287,23 @@ def test_what_no_parameter_can_hold_is_refused(value):
 # --- environment ------------------------------------------------------------------------------
 
 
-def test_the_bootstrappers_variables_are_removed():
-    """Both variables go; what was in LD_LIBRARY_PATH before stays."""
-    polluted = {
-        "LD_LIBRARY_PATH": f"{SITE}/ros_rcl.libs:/opt/mine:{VENV}/lib:{SITE}/ros_rclpy.libs",
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
-        "HOME": "/root",
-    }
-    assert without_bootstrapper(polluted) == {"LD_LIBRARY_PATH": "/opt/mine", "HOME": "/root"}
+BOOTSTRAPPED = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
 
 
-def test_nothing_is_left_of_an_empty_library_path():
-    """A variable without other content is removed altogether."""
-    polluted = {
-        "LD_LIBRARY_PATH": f"{sys.prefix}/lib:{SITE}/ros_rcl.libs",
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
-    }
-    assert without_bootstrapper(polluted) == {}
-
-
-def test_without_the_bootstrapper_nothing_is_touched():
-    """Apt's ROS 2 needs its own LD_LIBRARY_PATH."""
-    environment = {"LD_LIBRARY_PATH": "/opt/ros/jazzy/lib"}
-    assert without_bootstrapper(environment) == environment
+@pytest.mark.parametrize(
+    ("library_path", "bootstrapped", "left"),
+    [
+        (f"{SITE}/ros_rcl.libs:/opt/mine:{VENV}/lib:{SITE}/ros_rclpy.libs", True, "/opt/mine"),
+        (f"{sys.prefix}/lib:{SITE}/ros_rcl.libs", True, None),
+        ("/opt/ros/jazzy/lib", False, "/opt/ros/jazzy/lib"),
+    ],
+    ids=["wheels", "wheels alone", "apt"],
+)
+def test_the_bootstrappers_variables_are_removed(library_path, bootstrapped, left):
+    """What was in LD_LIBRARY_PATH before stays; apt's ROS 2 needs its own."""
+    before = {"LD_LIBRARY_PATH": library_path, "HOME": "/root"}
+    made = without_bootstrapper({**before, **(BOOTSTRAPPED if bootstrapped else {})})
+    assert made == {"HOME": "/root", **({"LD_LIBRARY_PATH": left} if left else {})}
 
 
 def test_the_variables_of_the_spec_take_precedence():
