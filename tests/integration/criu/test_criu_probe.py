@@ -16,6 +16,7 @@ import pytest
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.compatibility import FACTS
 from rosrm_criu.engine.probe import ability, probe
+from tests.waiting import wait_until
 
 
 def test_one_that_works(criu):
@@ -174,11 +175,9 @@ def left_in(folder: Path, *expected: Path) -> list[str]:
 
 def assert_all_gone(folder: Path) -> None:
     """Check that no file is in the folder, and that no process of it is left."""
-    until = time.monotonic() + 15  # less than the lifetime of the child
-    while left_in(folder) or processes_of(folder):
-        told = f"{left_in(folder)}, {processes_of(folder)}"
-        assert time.monotonic() < until, f"15 s after its end there is still: {told}"
-        time.sleep(0.05)
+    lifetime = 15.0  # less than that of the child
+    wait_until(lambda: not (left_in(folder) or processes_of(folder)), "an empty folder", lifetime,
+               seen=lambda: (left_in(folder), processes_of(folder)))  # fmt: skip
 
 
 def processes_of(folder: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""A node moves by CRIU between hosts of different addresses, and over a network that is cut."""
+"""Migration by CRIU between hosts of different addresses, and over a network that is cut."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ HOSTS = ("host1", "host2")
 
 @pytest.fixture
 def hosts(criu, name, tmp_path):
-    """Master and listener on a desk, and two hosts with a slave each."""
+    """Yield a lab with master and listener on a desk, and two hosts with a slave each."""
     with Lab(name, [*uniform(2, disk=GIB), HostPlan("desk")]) as lab, parts(lab, tmp_path):
         yield lab
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_node_counts_on_at_another_address(hosts):
-    """There and back: no count is heard twice, none of what it did is missing in its memory.
+def test_a_node_keeps_its_state_at_another_address(hosts):
+    """A node that moves there and back repeats no message and keeps its memory.
 
-    Then the destination is cut off while the image is on its way: the node goes on where it is.
+    If the destination is cut off during the transfer, the node keeps running on the source.
     """
     slow = {"max_rate": 2_000_000, "transfer_timeout": 5.0}
     asked = [
@@ -40,7 +40,7 @@ def test_a_node_counts_on_at_another_address(hosts):
         assert hop["end"] == "migrated", hop
         assert hop["repeated"] == 0
         assert len(hop["checksums"]) == 1
-    cutter = threading.Thread(target=cut_off_who_fetches, args=(hosts,))
+    cutter = threading.Thread(target=cut_off_the_fetching_host, args=(hosts,))
     cutter.start()
     hop = next(hops)
     cutter.join(PATIENCE)
@@ -54,12 +54,12 @@ def test_a_node_counts_on_at_another_address(hosts):
     assert next(hops, None) is None
     for host in HOSTS:
         left = hosts.outside(host, f"{DATA}/slave/images").rglob("*")
-        # That it was restored is known as long as it lives.
+        # The result of a restore stays as long as its process.
         assert not [one.name for one in left if one.is_file() and one.name != restore_result.FILE]
 
 
-def cut_off_who_fetches(lab: Lab) -> None:
-    """As soon as some of an image has come."""
+def cut_off_the_fetching_host(lab: Lab) -> None:
+    """Cut off the host that fetches, once a part of an image has arrived."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         for host in HOSTS:

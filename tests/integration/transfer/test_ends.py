@@ -19,8 +19,9 @@ from tests.integration.transfer.trees import (
     listens,
     nothing_left,
     slowly,
-    until,
+    wait_until_begun,
 )
+from tests.waiting import wait_until
 
 
 def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fetcher, destination):
@@ -101,7 +102,7 @@ def test_an_offer_ends_with_the_process_that_made_it(source, destination):
         serving = Path(f"/proc/{owner.stdout.readline().strip()}")
         assert listens(offer.port)
         owner.kill()
-        until("its process has ended", lambda: not serving.exists() or is_dead(serving))
+        wait_until(lambda: not serving.exists() or is_dead(serving), "its end")
         assert not listens(offer.port)
 
 
@@ -112,9 +113,9 @@ def test_a_fetch_ends_with_the_process_that_asked_for_it(source, target, sender)
         fetching = Path(f"/proc/{pid}")
         owner.stdin.write(json.dumps(slowly(sender, source, certificate).as_json()) + "\n")
         owner.stdin.flush()
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+        wait_until_begun(target)
         owner.kill()
-        until("its process has ended", lambda: not fetching.exists() or is_dead(fetching))
+        wait_until(lambda: not fetching.exists() or is_dead(fetching), "its end")
     assert nothing_left(target)
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import random
 import socket
-import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 from rosrm_criu.transfer import DEFAULT_RESERVE, Fetched, Fetcher, Offer, Sender
 from rosrm_criu.transfer.certificate import new_identity
 from rosrm_criu.transfer.receiving import receive
+from tests.waiting import wait_until
 
 #: Seconds; generous for a busy machine.
 PATIENCE = 60.0
@@ -74,11 +74,9 @@ def listens(port: int) -> bool:
     return True
 
 
-def until(what: str, condition) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f"not within {PATIENCE} s: {what}"
-        time.sleep(0.02)
+def wait_until_begun(target: Path) -> None:
+    """Wait until the first files of a fetch have arrived beside its target."""
+    wait_until(lambda: list(target.parent.glob(".rosrm-fetch-*/*")), "the first files")
 
 
 @contextmanager
@@ -86,7 +84,7 @@ def fetching(by: Destination | Fetcher, offer: Offer, target: Path, **more) -> I
     """Fetch in another thread; yield the running fetch once its first files have arrived."""
     with ThreadPoolExecutor() as threads:
         going = threads.submit(by.fetch, offer, target, **more)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+        wait_until_begun(target)
         yield going
 
 

@@ -246,7 +246,7 @@ def test_lines_without_a_time_stay_where_they_are_in_their_log(client, slaves, l
 
 
 def test_a_program_that_was_never_started_is_reported_with_its_reason(rosrm, client, slaves):
-    """Its log may exist, and is empty."""
+    """The log may exist, and is empty."""
     client.processes = [process("talker", "failed", number=1, reason="no executable 'x' exists")]
     slaves.path("alpha", 1).touch()
     result = rosrm("logs", "talker")

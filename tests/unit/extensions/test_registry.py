@@ -155,7 +155,7 @@ def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
     ],
 )
 def test_a_resource_that_no_message_can_carry_is_refused(context, described, said):
-    """Its probe fails with the class and its place, and the others are made."""
+    """The probe fails with its class and place, and the others are made."""
     probe = Probe("a")
     probe.resources = [described]
     result = registry_of(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
@@ -324,7 +324,7 @@ UNCLOSABLE = SimpleNamespace(resources=[NOTHING], read=None, close=None)  # None
     ],
 )
 def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_fails(context, second, said):
-    """Its stand-in has its declared resources that no other probe reads, up to 16."""
+    """A stand-in has the declared resources that no other probe reads, up to 16."""
     registry = registry_of(
         offered("first", lambda options, context: Probe("a"), resources=("a",)),
         offered(

@@ -158,7 +158,7 @@ def test_a_dead_number_stays_dead(one, end) -> None:
 
 
 def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one) -> None:
-    """That master begins at epoch 1 and may reuse numbers; a repeated registration may not."""
+    """A master without journal begins at epoch 1 and may reuse numbers; any other may not."""
     one.step(StopOrdered(ONE))
     one.step(Registered(7))
     one.step(TimePassed(), after=REMEMBER_END)
@@ -271,7 +271,7 @@ def test_each_run_has_its_own_time_to_become_ready(node) -> None:
 
 
 def test_an_instance_of_a_former_run_of_the_slave_is_ready(one) -> None:
-    """Its spec is lost, but the process runs and keeps running."""
+    """The slave lost the spec, but the process runs and keeps running."""
     assert states(one.status(STATE.RUNNING, "n")) == [STATE.READY]
     assert one.step(TimePassed(), after=1000.0) == []
     assert one.assign(NODE) == []

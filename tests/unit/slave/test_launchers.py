@@ -132,7 +132,7 @@ def test_a_launcher_that_leads_a_session_names_its_members(tmp_path):
 
 
 def test_a_launcher_that_fails_leaves_an_instance_as_any_other(caplog):
-    """Its fault is logged once."""
+    """The fault of a launcher is logged once."""
     caplog.set_level(logging.INFO)
     known = launchers(ours=Faulty())
     for _ in range(2):

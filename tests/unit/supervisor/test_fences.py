@@ -100,7 +100,7 @@ def test_the_clock_begins_with_what_the_start_knows():
 
 
 def test_a_contact_after_the_fence_has_begun_is_too_late():
-    """Its successor may rely on its end."""
+    """The successor may rely on the end of the instance."""
     core, instance = running()
     core.handle(events.TimePassed(), 10.0)
     core.handle(events.ContactReported(10.5), 10.5)

@@ -82,7 +82,7 @@ def test_a_launch_without_its_environment_is_compacted(tmp_path, core, record):
 
 
 def test_a_record_of_before_protocol_2_is_read(tmp_path, core):
-    """Its launches had no memo, its instances no fault."""
+    """Launches of that version had no memo, and instances no fault."""
     instance = core.instances[TALKER]
     state = {name: getattr(instance, name) for name in Instance.__slots__ if name != "fault"}
     lines = [

@@ -433,7 +433,7 @@ def test_shutdown_leaves_when_all_have_ended():
 
 @pytest.mark.parametrize("before", [None, Exited(TALKER, 1), RestartOrdered(TALKER)])
 def test_what_a_shutdown_ends_is_withdrawn(before):
-    """Neither the process nor an order ended it, whatever its exit code is."""
+    """The shutdown ended the instance, not the process or an order, whatever the exit code is."""
     core, instance = started(restart=RestartRule("on-failure"))
     if before is not None:
         core.handle(before, 0.5)

@@ -66,7 +66,7 @@ def test_readings_of_an_unregistered_host_are_not_entered(ledger: ReadingStats, 
 
 
 def test_another_run_of_a_slave_starts_its_own_statistics(ledger: ReadingStats) -> None:
-    """Its sequence starts again and its beat uses another clock; the old counts stay."""
+    """The new run starts its sequence again and beats by another clock; the old counts stay."""
     ledger.take(runs((1, 100, 1), beat=10**15), 0.0)
     ledger.begin(1, RUN + 1)
     assert not ledger.beat[1]

@@ -290,7 +290,7 @@ def test_delayed_beats_confirm_the_contact_of_their_time(slave) -> None:
 
 
 def test_a_late_greeting_starts_no_session(slave) -> None:
-    """Its round trip is too long to tell the age of the master's messages."""
+    """The round trip is too long to give the age of the master's messages."""
     ours = Master(slave, 11)
     slave.pass_time(PERIOD)
     slave.clock.now += 10.0
