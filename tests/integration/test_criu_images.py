@@ -1,4 +1,4 @@
-"""Dumps of real processes into images, and restores below a shim."""
+"""Dump of real processes into images, and their restore below the shim."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.integration.supervisor.conftest import Host
 
 pytestmark = pytest.mark.timeout(240)
 
-#: Writes consecutive numbers; exits with 7 at SIGTERM, prints `usr1` at SIGUSR1.
+#: Writes one number after the other; ends with 7 at SIGTERM, says so at SIGUSR1.
 COUNTER = """
 import os, signal, sys, time
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
@@ -37,13 +37,13 @@ while True:
 
 @pytest.fixture
 def counter(theatre):
-    """Return a running counter."""
+    """Return a counter that counts."""
     actor = theatre.start(COUNTER)
     actor.counts()
     return actor
 
 
-# --- restored state -----------------------------------------------------------------------------
+# --- what continues -----------------------------------------------------------------------------
 
 
 def test_a_restored_process_continues_and_logs_into_the_new_file(theatre, counter):
@@ -72,7 +72,7 @@ def test_five_hops_in_a_row(theatre, counter):
 
 
 def test_a_udp_socket_is_the_same_after_the_restore(theatre):
-    """The socket has the same address, and the process its number of requests."""
+    """The process answers at the same address, and continues its count."""
     code = """
 import socket
 ours, count = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), 0
@@ -96,7 +96,7 @@ while True:
 
 
 def test_a_heap_of_numpy_with_its_threads_is_the_same(theatre):
-    """A heap of 8 MB keeps its checksum, and its three threads run."""
+    """8 MB of random numbers and three threads have the same sum, and the threads run."""
     code = """
 import hashlib, threading, time, numpy
 heap = numpy.random.default_rng(1).random(1 << 20)
@@ -119,7 +119,7 @@ turn("c")
 
 
 def test_child_and_pipe_are_restored_with_their_parent(theatre):
-    """The image has the tree and its pipes: the parent still prints the child's numbers."""
+    """The tree is dumped with its pipes: the child's numbers still come through its parent."""
     code = f"""
 import subprocess, sys
 child = subprocess.Popen([sys.executable, "-I", "-S", "-c", {COUNTER!r}], stdout=subprocess.PIPE)
@@ -136,7 +136,7 @@ for line in child.stdout:
 
 
 def test_a_file_below_the_working_directory_follows(theatre):
-    """The restore writes the file as it was at the dump; the process continues at its offset."""
+    """The file has its content at the dump, and the process continues at its position."""
     code = f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}"
     actor = theatre.start(code)
     count = theatre.work / "count"
@@ -150,8 +150,8 @@ def test_a_file_below_the_working_directory_follows(theatre):
     assert numbers == list(range(1, numbers[-1] + 1))
 
 
-def test_a_missing_log_of_the_process_is_created(theatre):
-    """A file that is only appended to, such as rcl's in ~/.ros/log, is not part of the image."""
+def test_a_missing_log_of_its_own_is_created(theatre):
+    """A file that is only appended to, such as rcl's in ~/.ros/log, does not follow."""
     own = theatre.folder / "logs/own.log"
     own.parent.mkdir()
     actor = theatre.start(f"import sys; sys.stdout = open({str(own)!r}, 'a')\n{COUNTER}")
@@ -164,7 +164,7 @@ def test_a_missing_log_of_the_process_is_created(theatre):
 
 
 def test_a_process_in_its_supervisors_directory_moves_to_that_of_another_host(theatre):
-    """Working directory and files below it follow to the other path, at each hop."""
+    """Its path differs there: working directory and files below it follow, hop by hop."""
 
     def state(number: int) -> dict[str, str]:
         return {"ROSRM_SUPERVISOR": str(theatre.folder / f"host{number}")}
@@ -185,7 +185,7 @@ def test_a_process_in_its_supervisors_directory_moves_to_that_of_another_host(th
         shelter(number - 1).rmdir()
         actor = theatre.restore(directory, environment=state(number))
         assert working_directory(actor.outcome.pid) == str(shelter(number))
-        image.read(directory)  # the image itself is unchanged
+        image.read(directory)  # nothing was changed in the image itself
         size = theatre.manifest.files[0].size
         here = shelter(number) / "count"
         eventually(lambda: here.stat().st_size > size, "more numbers")  # noqa: B023
@@ -198,18 +198,18 @@ def working_directory(pid: int) -> str:
 
 
 def test_files_of_proc_are_not_part_of_the_image(theatre):
-    """CRIU restores an open file of /proc for the new pid."""
+    """CRIU itself restores an open file of the process's own folder in /proc."""
     actor = theatre.start(f"import os; own = open(f'/proc/{{os.getpid()}}/stat')\n{COUNTER}")
     actor.counts()
     theatre.restore(theatre.dump(actor)).counts()
     assert theatre.manifest.files == ()
 
 
-# --- the source -----------------------------------------------------------------------------------
+# --- the source -------------------------------------------------------------------------------
 
 
-def test_a_running_process_does_not_stop_for_the_checksums(theatre, counter, monkeypatch):
-    """The checksums of a large image take as long as its dump, but stop no process."""
+def test_it_is_not_stopped_for_the_checksums(theatre, counter, monkeypatch):
+    """The checksums of a large image take as long as its dump; the process runs in that time."""
     make = image.file_checksums
 
     def make_while_it_counts(directory, names):
@@ -222,8 +222,8 @@ def test_a_running_process_does_not_stop_for_the_checksums(theatre, counter, mon
     assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
 
 
-def test_a_process_stopped_before_its_dump_stays_stopped(theatre, counter):
-    """A process that a user stopped stays stopped after its dump."""
+def test_a_process_that_was_stopped_before_stays_stopped(theatre, counter):
+    """A dump does not continue a process that a user has stopped."""
     counter.process.send_signal(signal.SIGSTOP)
     assert process_tree.wait_until_stopped([counter.pid], TIMEOUT)
     theatre.dump(counter, leave="running")
@@ -231,7 +231,7 @@ def test_a_process_stopped_before_its_dump_stays_stopped(theatre, counter):
 
 
 def test_after_any_error_the_source_runs_on(theatre, counter, monkeypatch):
-    """The same holds for a bug of rosrm after CRIU has stopped the process."""
+    """This includes a bug of rosrm after CRIU has stopped the process."""
     monkeypatch.setattr(image, "write", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         theatre.dump(counter)
@@ -252,16 +252,16 @@ def test_a_unix_socket_to_outside_is_named_and_the_source_runs_on(theatre, kind)
         actor.counts()
 
 
-def test_a_socket_pair_within_the_process_is_no_external_resource(theatre):
-    """An event loop, for example, has one to wake itself."""
+def test_a_socket_pair_within_the_process_is_dumped(theatre):
+    """An event loop has one to wake itself."""
     code = f"import socket; pair = socket.socketpair()\n{COUNTER}"
     actor = theatre.start(code)
     actor.counts()
     theatre.restore(theatre.dump(actor)).counts()
 
 
-def test_a_traced_process_is_refused_with_its_debugger(theatre, counter):
-    """CRIU cannot trace a process that another one traces; the process runs on."""
+def test_a_debugger_is_named_and_the_source_runs_on(theatre, counter):
+    """Only one process can trace another one; the process is not harmed."""
     code = """
 import ctypes, signal, sys
 libc = ctypes.CDLL(None, use_errno=True)
@@ -284,7 +284,7 @@ while True:
 
 @pytest.mark.skipif(not os.access("/dev/fuse", os.W_OK), reason="/dev/fuse may not be opened")
 def test_a_device_is_named_and_the_source_runs_on(theatre):
-    """The error explains what CRIU refuses, and only the log of CRIU is left of the image."""
+    """The error explains CRIU's own refusal, and only CRIU's log is left of the image."""
     actor = theatre.start(f"device = open('/dev/fuse', 'rb+', buffering=0)\n{COUNTER}")
     actor.counts()
     with pytest.raises(CriuError, match=r"file descriptor \d+ is the device /dev/fuse"):
@@ -294,7 +294,7 @@ def test_a_device_is_named_and_the_source_runs_on(theatre):
 
 
 def test_an_image_without_disk_space_is_not_begun(theatre, counter, monkeypatch):
-    """The dump leaves some space free on the file system; the process is not touched."""
+    """The file system of the image keeps some space; the process is not touched."""
     monkeypatch.setattr(process_tree, "memory_of", lambda pids: 1 << 60)
     with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
         theatre.dump(counter)
@@ -302,28 +302,28 @@ def test_an_image_without_disk_space_is_not_begun(theatre, counter, monkeypatch)
     assert [*(theatre.folder / "image").iterdir()] == []
 
 
-# --- below the shim -------------------------------------------------------------------------------
+# --- below the shim -----------------------------------------------------------------------------
 
 
 def test_the_exit_code_comes_through_the_shim(theatre, counter):
-    """The process receives SIGTERM, and the shim exits with its exit code."""
+    """SIGTERM is forwarded, and the shim ends with the exit code of the process."""
     restored = theatre.restore(theatre.dump(counter))
     restored.process.terminate()
     assert restored.process.wait(TIMEOUT) == 7
 
 
 @pytest.mark.parametrize("option", [[], ["--no-namespace"]])
-def test_a_process_that_ends_at_once_counts_as_restored(theatre, option):
-    """The exit code comes through although the restored process runs only its last instruction."""
+def test_a_process_that_ends_at_once_was_restored(theatre, option):
+    """The exit code of a process with one last instruction arrives."""
     code = "import os, signal; os.kill(os.getpid(), signal.SIGSTOP); os._exit(9)"
     actor = theatre.start(code)
     assert process_tree.wait_until_stopped([actor.pid], TIMEOUT)
     directory = theatre.dump(actor)
     shim = theatre.shim(directory, *option)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / restore_result.FILE).exists, "the end of the restore")
     os.killpg(shim.pid, signal.SIGCONT)
     assert shim.process.wait(TIMEOUT) == 9
-    assert json.loads((directory / "hold.json").read_text())["reason"] == ""
+    assert json.loads((directory / restore_result.FILE).read_text())["reason"] == ""
 
 
 def test_signals_come_through_the_shim(theatre, counter):
@@ -336,8 +336,13 @@ def test_signals_come_through_the_shim(theatre, counter):
     assert restored.process.wait(TIMEOUT) == -signal.SIGUSR2
 
 
-#: The counter, which starts a daemon at SIGHUP.
-DAEMON = f"""
+@pytest.mark.parametrize("ends", ["the group of the shim", "the shim", "the process"])
+def test_with_the_shim_or_the_process_all_of_it_ends(theatre, ends):
+    """Even a daemon that has left group and session ends, within milliseconds on an idle machine.
+
+    If the process itself ends, all others have ended before the shim does.
+    """
+    code = f"""
 import os, signal
 def become_two(*_):
     if os.fork() == 0:
@@ -347,28 +352,23 @@ def become_two(*_):
         os.write(1, b"daemon\\n")
 signal.signal(signal.SIGHUP, become_two)
 {COUNTER}"""
-
-
-def with_daemon(theatre):
-    """Return a restored process that has a daemon, and their namespace."""
-    actor = theatre.start(DAEMON)
+    actor = theatre.start(code)
     actor.counts()
     restored = theatre.restore(theatre.dump(actor))
     os.killpg(restored.pid, signal.SIGHUP)
     restored.says("daemon")
-    return restored, pid_namespace(restored.outcome.pid)
-
-
-@pytest.mark.parametrize("group", [True, False])
-def test_sigkill_of_the_shim_ends_all_of_it(theatre, group):
-    """The end includes a daemon that has left group and session, and takes milliseconds."""
-    restored, namespace = with_daemon(theatre)
+    namespace = pid_namespace(restored.outcome.pid)
     assert len(living_in(namespace)) == 3  # the init, the process, the daemon
-    if group:
-        os.killpg(restored.pid, signal.SIGKILL)
-    else:
-        restored.process.kill()
+    if ends == "the process":
+        restored.process.terminate()
+        assert restored.process.wait(TIMEOUT) == 7
+        assert living_in(namespace) == []
+        return
     killed = time.monotonic()
+    if ends == "the shim":
+        restored.process.kill()
+    else:
+        os.killpg(restored.pid, signal.SIGKILL)
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
     assert time.monotonic() - killed < 10.0
     assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
@@ -379,7 +379,7 @@ def pid_namespace(pid: int) -> str:
 
 
 def living_in(namespace: str) -> list[int]:
-    """Return the processes of a pid namespace, without zombies."""
+    """Return the processes of a pid namespace, except zombies."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
@@ -390,16 +390,8 @@ def living_in(namespace: str) -> list[int]:
     return [pid for pid in found if process_tree.is_alive(pid)]
 
 
-def test_daemons_of_a_restored_process_end_with_it(theatre):
-    """The namespace ends with the process, before the shim ends."""
-    restored, namespace = with_daemon(theatre)
-    restored.process.terminate()
-    assert restored.process.wait(TIMEOUT) == 7
-    assert living_in(namespace) == []
-
-
 def test_marks_of_the_former_instance_are_removed(theatre):
-    """A supervisor that looks for processes of the old instance does not find the restored one."""
+    """A supervisor that looks for leftovers of the old instance does not find the restored one."""
     marks = {"ROSRM_INSTANCE": "actor#1", "ROSRM_SUPERVISOR": "/somewhere", "MORE": "kept"}
     actor = theatre.start(COUNTER, environment=marks)
     actor.counts()
@@ -409,15 +401,17 @@ def test_marks_of_the_former_instance_are_removed(theatre):
 
 
 def test_the_image_is_private_and_removed_on_request(theatre, counter):
-    """Other users cannot read the memory; only the result of the restore stays."""
+    """No other user can read the memory; only the result of the restore is left."""
     directory = theatre.dump(counter)
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
     assert modes == {0}
     restored = theatre.restore(directory, remove=True)
-    eventually(lambda: [path.name for path in directory.iterdir()] == ["hold.json"], "a clean end")
+    eventually(
+        lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "a clean end"
+    )
     restored.process.terminate()
     restored.process.wait(TIMEOUT)
-    assert [path.name for path in directory.iterdir()] == ["hold.json"]
+    assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
 
 
 @pytest.mark.parametrize("victim", ["the process", "its shim"])
@@ -425,7 +419,7 @@ def test_the_result_of_a_restore_outlives_the_process(theatre, counter, victim):
     """The result of a restore survives any early end of the process; its memory is removed."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, remove=True)
-    result = restored.outcome
+    outcome = restored.outcome
     eventually(
         lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "its removal"
     )
@@ -433,41 +427,39 @@ def test_the_result_of_a_restore_outlives_the_process(theatre, counter, victim):
     os.kill(pid, signal.SIGKILL)
     assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
     assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
-    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == result
+    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == outcome
 
 
 @pytest.fixture
 def host(tmp_path):
-    """A supervisor's state directory."""
+    """Yield a supervisor's state directory."""
     host = Host(tmp_path / "host")
     yield host
     host.clean_up()
 
 
-def supervised(theatre, host, directory, restart=RestartPolicy(), **shim):  # noqa: B008
-    """Restore an image as instance 2 below a supervisor; return its client and the status."""
+def restored_below(host, theatre, directory, *, order=None, **options):
+    """Restore an image below a supervisor; return its client, and the running instance."""
     client = host.connect()
-    command = theatre.shim_command(directory, **shim)
-    client.start([host.order("actor", *command, number=2, restart=restart)])
+    command = theatre.shim_command(directory, **options)
+    client.start([host.order("actor", *command, number=2, **(order or {}))])
     running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / restore_result.FILE).exists, "the end of the restore")
     return client, running
 
 
 def test_a_supervisor_manages_a_restored_process(theatre, counter, host):
     """The supervisor starts a shim like any process: it stops it, and sees its end."""
-    directory = theatre.dump(counter)
-    client, running = supervised(theatre, host, directory)
+    client, running = restored_below(host, theatre, theatre.dump(counter))
     assert process_tree.root_of(running.pid) != running.pid
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
     assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
 
 
-def test_the_next_supervisor_re_adopts_a_restored_process(theatre, counter, host):
-    """The process keeps running, and the next supervisor can stop it."""
-    directory = theatre.dump(counter)
-    client, before = supervised(theatre, host, directory)
+def test_the_next_supervisor_adopts_it(theatre, counter, host):
+    """The process runs on while its supervisor is killed, and is stopped like any other."""
+    client, before = restored_below(host, theatre, theatre.dump(counter))
     log = host.log("actor", 2)
     host.kill_supervisor(client)
     client = host.connect()
@@ -480,14 +472,13 @@ def test_the_next_supervisor_re_adopts_a_restored_process(theatre, counter, host
     assert not process_tree.is_alive(before.pid)
 
 
-def test_a_restored_process_that_ignores_sigint_is_killed(theatre, host):
+def test_the_supervisor_kills_a_process_that_does_not_stop(theatre, host):
     """The stop policy ends in a SIGKILL of the shim's group, which leaves no process."""
     ignoring = "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     code = COUNTER.replace("count = 0", f"{ignoring}count = 0").replace("sys.exit(7)", "None")
     actor = theatre.start(code)
     actor.counts()
-    directory = theatre.dump(actor)
-    client, running = supervised(theatre, host, directory)
+    client, running = restored_below(host, theatre, theatre.dump(actor))
     namespace = pid_namespace(process_tree.root_of(running.pid))
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
@@ -496,11 +487,12 @@ def test_a_restored_process_that_ignores_sigint_is_killed(theatre, host):
 
 
 def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host):
-    """After a crash the process starts from its program, not from the image."""
-    directory = theatre.dump(counter)
-    then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "another argument"]
+    """The restart policy applies to a restored process: it counts from one, as after any crash."""
+    then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "an argument"]
     restart = RestartPolicy("on-failure", delay=0.01)
-    client, running = supervised(theatre, host, directory, restart=restart, remove=True, then=then)
+    client, running = restored_below(
+        host, theatre, theatre.dump(counter), order={"restart": restart}, remove=True, then=then
+    )
     log = host.log("actor", 2)
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
@@ -512,8 +504,8 @@ def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host)
 # --- without a namespace ------------------------------------------------------------------------
 
 
-def test_without_a_namespace_pid_signals_and_end_are_the_same(theatre, counter):
-    """The restore works also where namespaces are forbidden."""
+def test_without_a_namespace_it_is_restored_too(theatre, counter):
+    """If no namespace may be entered, the pid is the same, and signals and exit code arrive."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, "--no-namespace")
     restored.counts()
@@ -535,7 +527,7 @@ def test_without_a_namespace_a_guard_ends_it_with_its_shim(theatre, counter):
 
 
 def test_without_a_namespace_a_pid_in_use_is_reported(theatre, counter):
-    """The error names the pid, which the source still has; the source is not harmed."""
+    """The source still has the pid, and is not harmed."""
     directory = theatre.dump(counter, leave="stopped")
     with pytest.raises(CriuError, match=rf"its pid {counter.pid} is in use here"):
         theatre.restore(directory, "--no-namespace")
@@ -548,21 +540,21 @@ def test_without_a_namespace_a_pid_in_use_is_reported(theatre, counter):
 
 @pytest.mark.parametrize("pattern", ["criu/pages-1.img", "files/*"])
 def test_a_flipped_byte_is_refused(theatre, pattern):
-    """The checksums are compared before CRIU starts and before any file is written."""
+    """The size is the same. CRIU does not start, and no file on the host is replaced."""
     actor = theatre.start(f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}")
     count = theatre.work / "count"
     eventually(lambda: count.exists() and count.read_text().count("\n") > 2, "its file")
     directory = theatre.dump(actor)
-    count.write_text("of another user")
+    count.write_text("of another process")
     [damaged] = directory.glob(pattern)
     flip_a_bit(damaged)
     shim = theatre.shim(directory)
     assert shim.process.wait(TIMEOUT) == 125
-    damage = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
-    assert damage in shim.log.read_text()
-    assert damage in json.loads((directory / "hold.json").read_text())["reason"]
+    expected = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
+    assert expected in shim.log.read_text()
+    assert expected in json.loads((directory / restore_result.FILE).read_text())["reason"]
     assert not (directory / "restore.log").exists()
-    assert count.read_text() == "of another user"
+    assert count.read_text() == "of another process"
 
 
 def flip_a_bit(path: Path) -> None:
@@ -573,7 +565,7 @@ def flip_a_bit(path: Path) -> None:
 
 
 def test_an_image_without_checksums_is_restored(theatre, counter):
-    """A transferred image has none, because the transfer has a checksum of its own."""
+    """An image of a migration has none, because the transfer has a checksum of its own."""
     directory = theatre.folder / "image"
     manifest = dump.dump(
         theatre.criu, counter.pid, directory, leave="killed", timeout=TIMEOUT, checksums=False
@@ -602,15 +594,15 @@ def changed(directory: Path, **values: object) -> None:
     ],
 )
 def test_a_missing_requirement_of_an_image_is_named(theatre, counter, values, said):
-    """The error comes before CRIU starts, and has the path and the host."""
+    """The error names path and host, before CRIU starts."""
     directory = theatre.dump(counter)
     changed(directory, **values)
     with pytest.raises(CriuError, match=said):
         theatre.restore(directory)
 
 
-def test_a_file_that_the_process_reads_must_exist(theatre):
-    """Files that are only read are not part of the image."""
+def test_a_file_that_it_reads_must_exist(theatre):
+    """Files that are only read do not follow the process."""
     table = theatre.folder / "table"
     table.write_text("rows")
     actor = theatre.start(f"table = open({str(table)!r})\n{COUNTER}")
@@ -622,15 +614,15 @@ def test_a_file_that_the_process_reads_must_exist(theatre):
 
 
 def test_an_image_that_others_may_read_is_refused(theatre, counter):
-    """A user who can write to an image can run any code as the user of the process."""
+    """A user who can write to the image could run any program as the user of the process."""
     directory = theatre.dump(counter)
     directory.chmod(0o755)
     with pytest.raises(CriuError, match="open to others"):
         theatre.restore(directory)
 
 
-def test_the_shared_memory_of_lttng_is_created_where_it_is_missing(theatre, counter):
-    """Every ROS process maps the shared memory of LTTng, which has no content."""
+def test_a_missing_file_of_tracing_is_created(theatre, counter):
+    """Every ROS process maps LTTng's shared memory, which has no content."""
     directory = theatre.dump(counter)
     path = Path(f"/dev/shm/lttng-ust-wait-rosrm-test-{os.getpid()}")
     changed(directory, mapped=(MappedFile(str(path), 4096, 0o640),))
@@ -643,7 +635,7 @@ def test_the_shared_memory_of_lttng_is_created_where_it_is_missing(theatre, coun
 
 
 def test_criu_uses_no_pid_that_it_must_restore():
-    """A container has small ids, and so has CRIU in a fresh namespace."""
+    """In a new namespace ids begin small, like those of a container's processes."""
     assert restore.id_for_criu((), 32768) == 300
     assert restore.id_for_criu((12, 13, 310), 32768) == 310
     assert restore.id_for_criu(tuple(range(1, 32700, 100)), 32768) == 300

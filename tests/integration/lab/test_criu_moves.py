@@ -1,4 +1,4 @@
-"""Migration by CRIU between hosts of different addresses, and over a network that is cut."""
+"""Migrations by CRIU between hosts with different addresses, and over a cut network."""
 
 from __future__ import annotations
 
@@ -17,30 +17,33 @@ HOSTS = ("host1", "host2")
 
 @pytest.fixture
 def hosts(criu, name, tmp_path):
-    """Yield a lab with master and listener on a desk, and two hosts with a slave each."""
-    with Lab(name, [*uniform(2, disk=GIB), HostPlan("desk")]) as lab, parts(lab, tmp_path):
+    """Yield a lab with master and observer on one host, and a slave on two others."""
+    with (
+        Lab(name, [*uniform(2, disk=GIB), HostPlan("desk")]) as lab,
+        parts(lab, tmp_path),
+    ):
         yield lab
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_node_keeps_its_state_at_another_address(hosts):
-    """A node that moves there and back repeats no message and keeps its memory.
+    """To and fro, no count is received twice, and the memory is the same.
 
-    If the destination is cut off during the transfer, the node keeps running on the source.
+    Then the destination is cut off during the transfer of the image: the source runs on.
     """
     slow = {"max_rate": 2_000_000, "transfer_timeout": 5.0}
-    asked = [
+    requests = [
         {"strategy": "criu", "mb": 1, "hops": 2},
         {"strategy": "criu", "mb": 1, "hops": 1, "options": slow},
     ]
-    hops = play(hosts, asked)
+    hops = play(hosts, requests)
     for _ in range(2):
         hop = next(hops)
         assert hop["end"] == "migrated", hop
         assert hop["repeated"] == 0
         assert len(hop["checksums"]) == 1
-    cutter = threading.Thread(target=cut_off_the_fetching_host, args=(hosts,))
+    cutter = threading.Thread(target=cut_off_who_fetches, args=(hosts,))
     cutter.start()
     hop = next(hops)
     cutter.join(PATIENCE)
@@ -54,12 +57,12 @@ def test_a_node_keeps_its_state_at_another_address(hosts):
     assert next(hops, None) is None
     for host in HOSTS:
         left = hosts.outside(host, f"{DATA}/slave/images").rglob("*")
-        # The result of a restore stays as long as its process.
+        # The result of a restore stays as long as its instance.
         assert not [one.name for one in left if one.is_file() and one.name != restore_result.FILE]
 
 
-def cut_off_the_fetching_host(lab: Lab) -> None:
-    """Cut off the host that fetches, once a part of an image has arrived."""
+def cut_off_who_fetches(lab: Lab) -> None:
+    """Cut off the host that has received the first part of an image."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         for host in HOSTS:

@@ -46,7 +46,7 @@ def test_a_fetch_can_be_stopped(source, target, sender, fetcher):
     offer = slowly(sender, source, fetcher.introduce())
     with fetching(fetcher, offer, target, timeout=PATIENCE) as going:
         fetcher.close()
-        with pytest.raises(TransferError, match="stopped before all had come"):
+        with pytest.raises(TransferError, match="stopped before everything was received"):
             going.result(PATIENCE)
     assert nothing_left(target)
 
