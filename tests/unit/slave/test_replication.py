@@ -246,7 +246,7 @@ def test_the_size_of_the_replicas_is_bounded(net):
     net.write("a", 1, 9_000)
     net.until(lambda: net.age("b") == (7, 1), "the first state")
     net.write("a", 2, 20_000)
-    net.until(lambda: net.log.messages, "a word about it")
+    net.until(lambda: net.log.messages, "a log line")
     assert "keep.max_bytes" in net.log.messages[0]
     assert net.age("b") == (7, 1)
 
@@ -305,7 +305,7 @@ def test_a_change_of_the_replicas_is_reported_to_the_master(net):
     net.pass_times(30)
     assert net.reports["a"] in ([], [()])
     net.write("a", 3)
-    net.until(lambda: net.reports["a"] and net.reports["a"][-1], "a word of it")
+    net.until(lambda: net.reports["a"] and net.reports["a"][-1], "a report")
     ((one,),) = [net.reports["a"][-1]]
     assert (one.instance, one.sequence) == (P7, 3)
     before = len(net.reports["a"])

@@ -300,7 +300,7 @@ BOOTSTRAPPED = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
     ids=["wheels", "wheels alone", "apt"],
 )
 def test_the_bootstrappers_variables_are_removed(library_path, bootstrapped, left):
-    """What was in LD_LIBRARY_PATH before stays; apt's ROS 2 needs its own."""
+    """Other entries of LD_LIBRARY_PATH stay, such as those that apt's ROS 2 needs."""
     before = {"LD_LIBRARY_PATH": library_path, "HOME": "/root"}
     made = without_bootstrapper({**before, **(BOOTSTRAPPED if bootstrapped else {})})
     assert made == {"HOME": "/root", **({"LD_LIBRARY_PATH": left} if left else {})}
