@@ -114,12 +114,7 @@ EVENTS = {
         happened.PruneRequested, INT, *2 * [st.lists(TEXT).map(tuple)], TEXT
     ),
     happened.OrderAnswered: st.builds(
-        happened.OrderAnswered,
-        ORDER_ID,
-        st.booleans(),
-        TEXT,
-        TEXT,
-        st.one_of(st.none(), JSON),
+        happened.OrderAnswered, ORDER_ID, st.booleans(), TEXT, TEXT, st.one_of(st.none(), JSON)
     ),
     happened.AssignmentWithdrawn: st.builds(happened.AssignmentWithdrawn, INSTANCE),
     happened.HandoffReported: st.builds(
