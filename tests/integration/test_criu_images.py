@@ -46,7 +46,7 @@ def counter(theatre):
 # --- what continues -----------------------------------------------------------------------------
 
 
-def test_a_restored_process_goes_on_where_it_was_and_its_log_in_the_new_file(theatre, counter):
+def test_a_restored_process_continues_and_logs_into_the_new_file(theatre, counter):
     """No number is missing or written twice; the old log grows no more."""
     directory = theatre.dump(counter)
     before = counter.numbers()
@@ -118,7 +118,7 @@ turn("c")
     assert theatre.manifest.size > 8 << 20
 
 
-def test_a_child_comes_along(theatre):
+def test_child_and_pipe_are_restored_with_their_parent(theatre):
     """The tree is dumped with its pipes: the child's numbers still come through its parent."""
     code = f"""
 import subprocess, sys
@@ -163,7 +163,7 @@ def test_a_missing_log_of_its_own_is_created(theatre):
     eventually(lambda: own.exists() and own.read_text().count("\n") > 2, "its log again")
 
 
-def test_who_runs_in_its_supervisors_directory_does_so_on_another_host(theatre):
+def test_a_process_in_its_supervisors_directory_moves_to_that_of_another_host(theatre):
     """Its path differs there: working directory and files below it follow, hop by hop."""
 
     def state(number: int) -> dict[str, str]:
@@ -197,7 +197,7 @@ def working_directory(pid: int) -> str:
     return os.readlink(f"/proc/{pid}/cwd")  # noqa: PTH115 - as /proc says it
 
 
-def test_a_file_of_the_kernels_needs_not_lie_there(theatre):
+def test_files_of_proc_are_not_part_of_the_image(theatre):
     """CRIU itself restores an open file of the process's own folder in /proc."""
     actor = theatre.start(f"import os; own = open(f'/proc/{{os.getpid()}}/stat')\n{COUNTER}")
     actor.counts()
@@ -222,16 +222,6 @@ def test_it_is_not_stopped_for_the_checksums(theatre, counter, monkeypatch):
     assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
 
 
-def test_it_is_stopped_until_it_is_resumed(theatre, counter):
-    """Until the commit nothing is lost: an undo resumes the source."""
-    theatre.dump(counter, leave="stopped")
-    seen = counter.numbers()
-    assert process_tree.is_stopped(counter.pid)
-    dump.resume(counter.pid)
-    counter.counts()
-    assert counter.numbers()[: len(seen) + 1] == list(range(1, len(seen) + 2))
-
-
 def test_a_process_that_was_stopped_before_stays_stopped(theatre, counter):
     """A dump does not continue a process that a user has stopped."""
     counter.process.send_signal(signal.SIGSTOP)
@@ -240,23 +230,7 @@ def test_a_process_that_was_stopped_before_stays_stopped(theatre, counter):
     assert process_tree.is_stopped(counter.pid)
 
 
-def test_a_pipe_to_outside_is_named_and_the_source_runs_on(theatre):
-    """CRIU would dump the pipe without an error, and its other end would be missing."""
-    ours, theirs = os.pipe()
-    try:
-        actor = theatre.start(COUNTER, pass_fds=(theirs,))
-        actor.counts()
-        with pytest.raises(
-            CriuError, match=f"{theirs} of pid {actor.pid} .*a pipe .*{os.getpid()}"
-        ):
-            theatre.dump(actor)
-        actor.counts()
-    finally:
-        os.close(ours)
-        os.close(theirs)
-
-
-def test_whatever_fails_the_source_runs_on(theatre, counter, monkeypatch):
+def test_after_any_error_the_source_runs_on(theatre, counter, monkeypatch):
     """This includes a bug of rosrm after CRIU has stopped the process."""
     monkeypatch.setattr(image, "write", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -319,7 +293,7 @@ def test_a_device_is_named_and_the_source_runs_on(theatre):
     assert [path.name for path in (theatre.folder / "image").iterdir()] == ["dump.log"]
 
 
-def test_an_image_that_has_no_room_is_not_begun(theatre, counter, monkeypatch):
+def test_an_image_without_disk_space_is_not_begun(theatre, counter, monkeypatch):
     """The file system of the image keeps some space; the process is not touched."""
     monkeypatch.setattr(process_tree, "memory_of", lambda pids: 1 << 60)
     with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
@@ -416,7 +390,7 @@ def living_in(namespace: str) -> list[int]:
     return [pid for pid in found if process_tree.is_alive(pid)]
 
 
-def test_marks_of_its_former_instance_are_gone(theatre):
+def test_marks_of_the_former_instance_are_removed(theatre):
     """A supervisor that looks for leftovers of the old instance does not find the restored one."""
     marks = {"ROSRM_INSTANCE": "actor#1", "ROSRM_SUPERVISOR": "/somewhere", "MORE": "kept"}
     actor = theatre.start(COUNTER, environment=marks)
@@ -441,7 +415,7 @@ def test_the_image_is_private_and_removed_on_request(theatre, counter):
 
 
 @pytest.mark.parametrize("victim", ["the process", "its shim"])
-def test_that_it_was_restored_is_known_after_its_end(theatre, counter, victim):
+def test_the_result_of_a_restore_outlives_the_process(theatre, counter, victim):
     """The result of a restore survives any early end of the process; its memory is removed."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, remove=True)
@@ -474,7 +448,7 @@ def restored_below(host, theatre, directory, *, order=None, **options):
     return client, running
 
 
-def test_below_a_supervisor(theatre, counter, host):
+def test_a_supervisor_manages_a_restored_process(theatre, counter, host):
     """The supervisor starts a shim like any process: it stops it, and sees its end."""
     client, running = restored_below(host, theatre, theatre.dump(counter))
     assert process_tree.root_of(running.pid) != running.pid
@@ -512,7 +486,7 @@ def test_the_supervisor_kills_a_process_that_does_not_stop(theatre, host):
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
 
 
-def test_below_a_supervisor_it_is_restarted_after_a_crash(theatre, counter, host):
+def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host):
     """The restart policy applies to a restored process: it counts from one, as after any crash."""
     then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "an argument"]
     restart = RestartPolicy("on-failure", delay=0.01)
@@ -552,7 +526,7 @@ def test_without_a_namespace_a_guard_ends_it_with_its_shim(theatre, counter):
     )
 
 
-def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
+def test_without_a_namespace_a_pid_in_use_is_reported(theatre, counter):
     """The source still has the pid, and is not harmed."""
     directory = theatre.dump(counter, leave="stopped")
     with pytest.raises(CriuError, match=rf"its pid {counter.pid} is in use here"):
@@ -619,7 +593,7 @@ def changed(directory: Path, **values: object) -> None:
         ({"mapped": (MappedFile("/etc/hostname", 1, 0o644),)}, "another one .* of 1"),
     ],
 )
-def test_what_is_missing_here_is_named(theatre, counter, values, said):
+def test_a_missing_requirement_of_an_image_is_named(theatre, counter, values, said):
     """The error names path and host, before CRIU starts."""
     directory = theatre.dump(counter)
     changed(directory, **values)
@@ -660,7 +634,7 @@ def test_a_missing_file_of_tracing_is_created(theatre, counter):
         path.unlink(missing_ok=True)
 
 
-def test_criu_takes_no_id_that_it_is_to_restore():
+def test_criu_uses_no_pid_that_it_must_restore():
     """In a new namespace ids begin small, like those of a container's processes."""
     assert restore.id_for_criu((), 32768) == 300
     assert restore.id_for_criu((12, 13, 310), 32768) == 310

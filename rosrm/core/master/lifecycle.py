@@ -229,6 +229,7 @@ def _ended(
     learn_from(state, process.spec, instance, status)
     learn_run_time(state, process.spec, status)
     end = _end(process, instance, status, before)
+    _note_end_of_standby(state, instance, end)
     migration = state.migrations.get(process.name)
     if migration is not None:
         migration.ended[instance.id.number] = end
@@ -379,6 +380,12 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
     return True
 
 
+def _note_end_of_standby(state: MasterState, instance: Instance, end: End) -> None:
+    standby = state.standbys.get(instance.id.process)
+    if standby is not None and standby.destination == instance.id:
+        standby.ended[instance.id.number] = end
+
+
 def gone(
     state: MasterState, instance: Instance, now: float, reason: str, *, comes_again: bool = True
 ) -> None:
@@ -389,6 +396,7 @@ def gone(
         return
     status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
     end = End(status, gone=comes_again)
+    _note_end_of_standby(state, instance, end)
     migration = state.migrations.get(process.name)
     if migration is not None:
         migration.ended[instance.id.number] = end

@@ -19,9 +19,11 @@ class StepFailed:
 
     Attributes:
         reason: a sentence.
+        timed_out: True if the time-out of the step has passed.
     """
 
     reason: str
+    timed_out: bool = False
 
 
 StepOutcome = StepProgress | StepFailed

@@ -27,7 +27,7 @@ def hosts(criu, name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_node_counts_on_at_another_address(hosts):
+def test_a_node_keeps_its_state_at_another_address(hosts):
     """To and fro, no count is received twice, and the memory is the same.
 
     Then the destination is cut off during the transfer of the image: the source runs on.

@@ -1,4 +1,4 @@
-"""A directory moved between hosts whose network is really cut."""
+"""Transfers of a directory between virtual hosts over a network that is cut."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 import pytest
 
 from rosrm_lab import DATA
+from tests.waiting import wait_until
 
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
 PATIENCE = 90.0
@@ -50,10 +51,10 @@ print(json.dumps([fetched, digest]))
 
 
 class Move:
-    """From host1 to host2.
+    """Transfer from host1 to host2.
 
     Attributes:
-        offer: as it travels by the master.
+        offer: the offer in its JSON form.
     """
 
     def __init__(self, lab, *, timeout: float) -> None:
@@ -73,10 +74,8 @@ class Move:
 
     def wait_until_it_flows(self) -> None:
         place = self.lab.outside("host2", f"{DATA}/tmp")
-        end = time.monotonic() + PATIENCE
-        while not any(one.stat().st_size for one in place.glob(".rosrm-fetch-*/pages")):
-            assert time.monotonic() < end, "nothing has come"
-            time.sleep(0.05)
+        pages = ".rosrm-fetch-*/pages"
+        wait_until(lambda: any(one.stat().st_size for one in place.glob(pages)), "the first bytes")
 
     def fetched(self) -> tuple[dict, str]:
         said, _ = self.destination.communicate(timeout=PATIENCE)
@@ -101,7 +100,7 @@ def move(lab):
         one.close()
 
 
-def test_a_transfer_goes_on_when_the_network_is_back(lab, move):
+def test_a_transfer_continues_when_the_network_is_back(lab, move):
     """TCP bridges a cut that is shorter than the time that a fetch waits for the next byte."""
     moving = move(timeout=PATIENCE)
     moving.wait_until_it_flows()
@@ -116,7 +115,7 @@ def test_a_transfer_goes_on_when_the_network_is_back(lab, move):
 
 
 def test_a_transfer_over_a_network_that_stays_cut_fails_in_time(lab, move):
-    """The destination says how far it was, and has nothing of it."""
+    """The error has the number of received bytes, and the destination keeps no file."""
     moving = move(timeout=7.0)
     moving.wait_until_it_flows()
     lab.cut("host1")

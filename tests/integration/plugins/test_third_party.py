@@ -44,10 +44,7 @@ def test_a_probe_is_installed_and_chosen_by_name(environment):
         "print(absent['heat'])\n"
     )
     lines = environment.python(code).splitlines()
-    assert lines == [
-        "heat 1.0 Reading(resource='heat', usage=0.5)",
-        "no sensor at /nowhere",
-    ]
+    assert lines == ["heat 1.0 Reading(resource='heat', usage=0.5)", "no sensor at /nowhere"]
 
 
 def test_a_wrong_option_of_a_probe_is_refused_by_its_own_rules(environment):

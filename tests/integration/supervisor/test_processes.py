@@ -43,7 +43,7 @@ def test_exit_status_usage_and_output_are_kept(host, client):
     assert host.log("short").read_text() == "out\nerr\n"
 
 
-def test_a_crash_is_told_by_its_signal(host, client):
+def test_a_crash_is_reported_with_its_signal(host, client):
     """A process killed by a foreign signal has failed, and the message names the signal."""
     status = host.run(client, host.order("crash", "sh", "-c", "kill -SEGV $$"))
     assert (status.state, status.exit_signal) == (InstanceState.FAILED, signal.SIGSEGV)
@@ -71,7 +71,7 @@ def test_a_process_starts_with_every_signal_at_its_default(host, client):
     assert int(ignored, 16) & ~own_to_glibc == 0
 
 
-def test_it_runs_in_its_environment_and_directory_alone(host, client, tmp_path):
+def test_a_process_has_only_its_own_environment_and_directory(host, client, tmp_path):
     """Environment and directory are those of the order, plus two marks of the supervisor."""
     order = host.order(
         "env", "/usr/bin/env", environment={"A": "1"}, working_directory=str(tmp_path)

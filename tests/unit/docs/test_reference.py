@@ -106,7 +106,7 @@ def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options)
     assert named - {name} == {field.name for field in fields(options)}
 
 
-def test_every_word_of_a_process_is_documented_and_nothing_else():
+def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
     wanted |= {"host_loss", "isolation", "standby", "health"}

@@ -218,7 +218,7 @@ def test_a_restored_node_finds_what_was_asked_at_the_same_path(directory, node) 
 # --- refusals, failures and missing nodes ---
 
 
-def test_who_does_not_leave_says_why(directory, node) -> None:
+def test_a_node_that_does_not_leave_reports_why(directory, node) -> None:
     """A refusal ends the wait with its reason, and the node still runs."""
     ask_prepare(directory, None, "m1")
     request = node.next_request()
@@ -227,7 +227,7 @@ def test_who_does_not_leave_says_why(directory, node) -> None:
         await_left(directory, "m1", 0.0)
 
 
-def test_who_cannot_join_says_why(directory, node) -> None:
+def test_a_node_that_cannot_join_reports_why(directory, node) -> None:
     """A failure of the node ends any wait at once with its reason."""
     node.report(Status(State.FAILED, "m1", "ValueError: no camera"))
     with pytest.raises(PortableError, match="cannot join the ROS graph again: ValueError: no cam"):
@@ -242,7 +242,7 @@ def test_a_process_without_a_portable_node_is_not_asked(directory) -> None:
         ask_prepare(directory, None, "m1")
 
 
-def test_the_signal_goes_to_nobody_whom_it_would_end(directory, node, start) -> None:
+def test_the_signal_is_not_sent_to_a_process_that_it_would_end(directory, node, start) -> None:
     """A process that neither catches nor blocks the signal gets no request, and survives."""
     process = start("")
     with pytest.raises(PortableError, match=f"does not catch signal {SIGNAL}"):
@@ -260,7 +260,7 @@ threading.Thread(target=lambda: (signal.sigwait([{0}]), os._exit(42))).start()
 
 
 @pytest.mark.parametrize("how", [CATCHES, BLOCKS], ids=["caught", "blocked"])
-def test_the_signal_wakes_who_catches_or_awaits_it(directory, node, start, how) -> None:
+def test_the_signal_wakes_a_process_that_catches_or_awaits_it(directory, node, start, how) -> None:
     """A process that catches or blocks the signal gets the request and the signal."""
     process = start(how.format(SIGNAL))
     ask_prepare(directory, process.pid, "m1")
@@ -294,7 +294,7 @@ def test_a_stopped_process_is_named_when_the_time_has_passed(directory, node, st
     assert f"process {process.pid} is stopped" in said
 
 
-def test_the_time_out_of_joining_says_how_it_stands(directory, node) -> None:
+def test_the_time_out_of_joining_reports_the_progress(directory, node) -> None:
     """The timeout error names the node's state, and no process if none was given."""
     ask_prepare(directory, None, "m1")
     leave(node)
@@ -322,7 +322,7 @@ def test_a_node_that_waits_opens_nothing(directory, node, monkeypatch) -> None:
      b'{"format": 1, "state": "asleep", "request": "", "fault": "", "seconds": {}, "missing": []}',
      b'{"format": 1, "state": "left", "request": 7, "fault": "", "seconds": {}, "missing": []}'],
 )  # fmt: skip
-def test_a_damaged_status_is_said(directory, node, content) -> None:
+def test_a_damaged_status_is_reported(directory, node, content) -> None:
     """A damaged status raises an error that names the file."""
     (directory / "status").write_bytes(content)
     with pytest.raises(PortableError, match="status"):
@@ -360,7 +360,7 @@ def test_a_status_is_seen_as_a_whole(directory, node) -> None:
         writer.join()
 
 
-def test_a_node_whose_directory_is_gone_goes_on(directory, node, capfd) -> None:
+def test_a_node_without_its_directory_keeps_running(directory, node, capfd) -> None:
     """A node with a removed directory logs the failed write and runs on."""
     remove_directory(directory)
     node.report(Status(State.LEFT, "m1"))
@@ -390,7 +390,7 @@ def test_a_directory_that_others_can_write_is_refused(directory) -> None:
         make_directory(directory / "deep")
 
 
-def test_control_directories_are_told_apart_by_user_and_instance() -> None:
+def test_control_directories_differ_by_user_and_instance() -> None:
     """The path is the same on all hosts; a name that leads elsewhere is refused."""
     assert str(control_directory("c-p-7", 1000)) == "/tmp/rosrm-1000/portable/c-p-7"
     for bad in ("", "..", "a/b"):

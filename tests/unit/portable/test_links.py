@@ -56,7 +56,7 @@ def unchanged(precious: Path) -> bool:
 
 
 @pytest.mark.parametrize("name", ["request", ".request.new", "status", ".status.new"])
-def test_what_is_written_goes_through_no_link(directory, precious, name) -> None:
+def test_a_write_follows_no_link(directory, precious, name) -> None:
     """A write replaces a link, and changes neither its target nor another name of the file."""
     for make in (os.symlink, os.link):
         (directory / name).unlink(missing_ok=True)

@@ -62,7 +62,7 @@ def test_no_change_goes_unseen(contents, data):
 
 
 @given(garbage=st.binary(max_size=300))
-def test_what_is_no_state_is_said_so(garbage):
+def test_a_file_that_is_no_snapshot_is_refused(garbage):
     with pytest.raises(Damaged):
         snapshots.decoded(garbage)
 
@@ -201,7 +201,7 @@ def test_dropped_are_the_states_of_older_instances_alone(tmp_path):
     assert not directory.exists()
 
 
-def test_a_writer_whose_files_were_deleted_goes_on_in_new_ones(tmp_path):
+def test_a_writer_whose_files_were_deleted_writes_new_ones(tmp_path):
     """The snapshot of a former instance may be dropped while the new one runs."""
     directory = tmp_path / "counter"
     write(directory, 5, b"old", instance=7)

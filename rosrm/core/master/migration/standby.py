@@ -165,8 +165,8 @@ def _why_given_up(migration: Migration) -> str | None:
 def _advance(state: MasterState, process: Process, migration: Migration, now: float) -> None:
     outcome = executor.advance_standby(state, migration, now)
     if isinstance(outcome, StepFailed):
-        late = now >= migration.deadline
-        why = f"{migration.destination} did not start in time" if late else outcome.reason
+        late = f"{migration.destination} did not start in time"
+        why = late if outcome.timed_out else outcome.reason
         _lost(state, process, migration, why, now)
     elif outcome is StepProgress.DONE:
         _note_ready(state, process, migration, now)

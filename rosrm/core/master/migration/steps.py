@@ -213,7 +213,7 @@ def _timed_out(state: MasterState, migration: Migration, step: Step, now: float)
         return handoff.timed_out(state, migration, step, now)
     if isinstance(step, AwaitReleased):
         return StepProgress.DONE
-    return StepFailed(f"{title(step)} took longer than {step.timeout:g} s")
+    return StepFailed(f"{title(step)} took longer than {step.timeout:g} s", timed_out=True)
 
 
 @singledispatch

@@ -67,8 +67,9 @@ def candidates(
     if more is not None:
         busy, processes = busy + need * more, processes + more
     return Candidates(
-        table, demand, columns, table.resources, need, cells, busy, processes, table.bound[columns]
-    )
+        table, demand, columns, table.resources, need, cells,
+        busy=busy, processes=processes, bound=table.bound[columns],
+    )  # fmt: skip
 
 
 def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from operator import attrgetter
+from typing import Any, Final
 
+from rosrm.extensions.declared_fields import STANDARD_FIELDS
 from rosrm.model.values import EMPTY, ProcessSpec
+
+_MAPPINGS: Final = tuple(
+    name for name in STANDARD_FIELDS if isinstance(getattr(ProcessSpec(""), name), Mapping)
+)
+_mappings_of: Final = attrgetter(*_MAPPINGS)
+_plain_fields_of: Final = attrgetter(*(name for name in STANDARD_FIELDS if name not in _MAPPINGS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +41,11 @@ class Demand:
     key: tuple[Any, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        spec = self.spec
         key = (
-            spec.package, spec.executable, spec.module, spec.command,
-            spec.namespace, spec.kind, spec.priority, _key(spec.needs),
-            _key(self.amounts), self.estimated, _key(self.excluded), self.headroom,
-            _key(spec.required_labels), _key(spec.preferred_labels), _key(spec.avoided_labels),
-            self.near,
+            *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
+            _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
-            *(repr(getattr(spec, name)) for name in self.reads),
+            *(repr(getattr(self.spec, name)) for name in self.reads),
         )  # fmt: skip
         object.__setattr__(self, "key", key)
 

@@ -52,12 +52,12 @@ class HostColumns:
 
     def __init__(self) -> None:
         self.resources: tuple[str, ...] = ()
-        self._count = 0
+        self._columns_in_use = 0
         self._allocate(rows=0, columns=4)
         self._trim()
 
     def __len__(self) -> int:
-        return self._count
+        return self._columns_in_use
 
     def _allocate(self, rows: int, columns: int) -> None:
         self._cells = np.empty((len(_ABSENT), rows, columns))
@@ -83,15 +83,15 @@ class HostColumns:
 
     def add_column(self) -> int:
         """Add a column for one more host, and return it."""
-        if self._count == self._cells.shape[2]:
+        if self._columns_in_use == self._cells.shape[2]:
             cells, lines = self._cells, self._lines
-            self._allocate(len(self.resources), 2 * self._count)
-            self._cells[:, :, : self._count] = cells
+            self._allocate(len(self.resources), 2 * self._columns_in_use)
+            self._cells[:, :, : self._columns_in_use] = cells
             for name, line in lines.items():
-                self._lines[name][: self._count] = line
-        self._count += 1
+                self._lines[name][: self._columns_in_use] = line
+        self._columns_in_use += 1
         self._trim()
-        return self._count - 1
+        return self._columns_in_use - 1
 
     def add_resource(self, name: str) -> None:
         """Add a row; no host has this resource yet."""
@@ -103,13 +103,13 @@ class HostColumns:
 
     def _trim(self) -> None:
         """Set the arrays as views of the columns in use; called only when the shape changes."""
-        self.cells: FloatArray = self._cells[:, :, : self._count]
+        self.cells: FloatArray = self._cells[:, :, : self._columns_in_use]
         self.usage: FloatArray = self.cells[USAGE]
         self.load: FloatArray = self.cells[LOAD]
         self.limit: FloatArray = self.cells[LIMIT]
         self.capacity: FloatArray = self.cells[CAPACITY]
         self.busy: FloatArray = self.cells[BUSY]
-        used = {name: line[: self._count] for name, line in self._lines.items()}
+        used = {name: line[: self._columns_in_use] for name, line in self._lines.items()}
         self.condition: npt.NDArray[np.int8] = used["condition"]
         self.asking: BoolArray = used["asking"]
         self.accepting: BoolArray = used["accepting"]

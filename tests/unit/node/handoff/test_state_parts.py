@@ -14,7 +14,7 @@ def part(*answers):
     return StateTopic("/state", Int64, lambda: next(left), lambda message: None)
 
 
-def test_what_was_wrong_is_said_again_while_nothing_has_changed():
+def test_an_error_is_reported_again_while_nothing_has_changed():
     """A later call names the original cause, instead of a state that was never saved."""
     one = part(Int64(data=7), None, None)
     for _ in range(3):

@@ -87,7 +87,7 @@ def test_a_supervisor_that_is_gone_has_stopped_nothing(slave, caplog) -> None:
     assert said.startswith("stopping 2 processes (SIGINT)")
 
 
-def test_a_slave_whose_supervisor_was_gone_before_says_so(slave, caplog) -> None:
+def test_a_slave_whose_supervisor_ended_before_names_its_processes(slave, caplog) -> None:
     """The slave does not claim "no process is left running" if nothing stopped them."""
     slave.ending.note_supervisor_left("the supervisor is gone")
     assert slave.end() == 1
