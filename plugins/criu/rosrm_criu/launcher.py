@@ -100,7 +100,7 @@ class CriuLauncher:
 
 def _is_portable(spec: ProcessSpec) -> bool:
     """Return True if its node is asked to leave the ROS graph before its memory is dumped."""
-    return spec.ros_node and spec.migration.strategy == NAME
+    return bool(spec.ros) and spec.migration.strategy == NAME
 
 
 def _is_periodic(spec: ProcessSpec) -> bool:

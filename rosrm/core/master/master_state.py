@@ -87,12 +87,12 @@ class MasterState:
 
     Attributes:
         declared: declarations in the offers of the selected plugins.
-        over: names of the terminal processes, in the order in which they ended.
+        terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the handoff whose destination is its standby.
         wants_standby: names of the processes that ask for one and are not terminal.
         held_since: time since when placement waits for first requests for work; inf: it does not.
-        in_company_since: time since when at least one host reports; inf: none does.
-        tail: the journal gap, if there is one.
+        contact_since: time since when at least one host reports; inf: none does.
+        journal_gap: the journal gap, if there is one.
         plugins: guards every call of a plugin.
     """
 

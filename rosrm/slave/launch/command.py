@@ -47,7 +47,7 @@ def launch_order(
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
     command = _command(spec, environment, python)
-    if spec.ros_node:
+    if spec.ros:
         parameters_file = _write_parameters(assignment, state_directory)
         ros = ros_arguments(spec, assignment.node_name, parameters_file)
         arguments = join_arguments(spec.arguments, ros)

@@ -82,7 +82,7 @@ def process_environment(
     environment["ROSRM_STATE_CONFIG"] = where.state_config
     environment["ROSRM_MASTER"] = where.cluster
     environment["ROSRM_EPOCH"] = str(assignment.epoch)
-    if spec.ros_node:  # the name without the alias
+    if spec.ros:  # the name without the alias
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:
         environment[SHADOW] = "1"

@@ -13,7 +13,7 @@ from rosrm.extensions.registry import Registry
 from rosrm.testing import FakeProbe
 from tests.plugin_kit import plugin
 
-from .test_start import OURS
+from .test_runtimes import OURS
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,8 @@ from typing import Annotated
 import pytest
 from annotated_types import Le
 
-from rosrm.config import ClusterConfig, load_cluster
+from rosrm.config.cluster import load_cluster
+from rosrm.config.settings import ClusterConfig
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.extensions.registry import Registry

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.config import HostConfig, load_host
+from rosrm.config.host import load_host
+from rosrm.config.settings import HostConfig
 from rosrm.errors import ConfigError
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from rosrm.config import HostConfig, load_host
+from rosrm.config.host import load_host
+from rosrm.config.settings import HostConfig
 from rosrm.errors import SkipPlugin
 from rosrm.extensions.contracts import ProbeOffer
 from tests.plugin_kit import registry_of

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 
 import pytest
 
-from rosrm.config import load_work
 from rosrm.config.process import ProcessInFile
+from rosrm.config.work import load_work
 from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (

@@ -15,8 +15,11 @@ import typer.main
 
 import rosrm
 from rosrm.cli.commands import app
-from rosrm.config import ClusterConfig, HostConfig, load_cluster, load_host, load_work
+from rosrm.config.cluster import load_cluster
+from rosrm.config.host import load_host
 from rosrm.config.process import ProcessInFile
+from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.config.work import load_work
 from rosrm.extensions import contracts, hookspecs, installed
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.discovery import HOOKS

@@ -166,6 +166,14 @@ def test_an_executable_is_found_through_the_ament_index(tmp_path, prefix):
     assert made.argv[:2] == (str(prefix / "lib" / "demo_nodes" / "talker"), "--ros-args")
 
 
+def test_a_program_of_a_package_that_is_no_node_gets_no_ros_arguments(tmp_path, prefix):
+    environment = {"AMENT_PREFIX_PATH": str(prefix)}
+    plain = {"package": "demo_nodes", "executable": "talker", "ros": False}
+    made = order(tmp_path, environment, **plain)
+    assert made.argv == (str(prefix / "lib" / "demo_nodes" / "talker"),)
+    assert "ROSRM_NODE" not in process_environment(assignment(**plain), {}, HERE)
+
+
 def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
     """The ROS wheels set no AMENT_PREFIX_PATH: their packages are in the virtual environment."""
     given = assignment(package="demo_nodes", executable="talker")

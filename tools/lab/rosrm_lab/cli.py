@@ -402,8 +402,8 @@ def _table(rows: Iterable[HostStatus]) -> Any:
 
 
 def _used(used: int | None, limit: int | None) -> str:
-    from rosrm.cli.output import formats
+    from rosrm.wording import size
 
     binary = limit is not None and limit % _MIB == 0
-    said = "?" if used is None else formats.size(used, binary=binary)
-    return said if limit is None else f"{said}/{formats.size(limit, binary=binary)}"
+    said = "?" if used is None else size(used, binary=binary)
+    return said if limit is None else f"{said}/{size(limit, binary=binary)}"

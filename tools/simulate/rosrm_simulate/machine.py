@@ -55,7 +55,7 @@ class Machine(Host[Work]):
         up: it runs; a host that is down neither receives nor sends anything.
         stopping: its slave is shutting down, and the host goes with its last process.
         asked: it has asked for work.
-        told_usage: usages that the master knows.
+        published_usage: usages that the master knows.
     """
 
     def __init__(

@@ -15,10 +15,9 @@ from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import expanded
 from rosrm.config.kinds import SIMULATION_KEYS, check_kind
 from rosrm.config.merging import merged, written_out
-from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import Labels, LabelsInFile, MigrationInFile
-from rosrm.config.rules import check_amounts, check_name
+from rosrm.config.rules import check_amounts, check_name, refuse_namesakes
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Amount, Count, Fraction, PositiveSeconds, Quantity, Seconds

@@ -58,7 +58,7 @@ class Instance:
 
     Attributes:
         state: as last reported by the slave; None: assigned, nothing reported yet.
-        charged: (R',) reservation on its host, fractions.
+        reserved: (R',) reservation on its host, fractions.
         demand: base units that the assignment reserved.
         estimated: resources whose amount is an estimate and stops counting after `settle`.
         since: time of the assignment.
@@ -66,7 +66,7 @@ class Instance:
         peak: highest usage seen.
         settled: its estimates no longer count.
         restarting: it was ordered to restart, and no report shows the restart yet.
-        given_again: the assignment was delivered again, because its slave did not accept it.
+        redelivered: the assignment was delivered again, because its slave did not accept it.
         recalled: a former run of the master ordered it to stop, so its end counts as ordered.
         at_once: it is to end without delay, because another instance owns the name.
         order_at: time of the last order to stop it, or to withdraw it; -inf: none.
@@ -178,8 +178,8 @@ class Process:
         since: start of its phase by this master's clock; before the master's own start, where the
             journal has it.
         wall: unix time at which its phase began.
-        out_of_sight: its phase when its host was lost, with the start of that phase (`since` and
-            `wall`); None: its host reports, or the process has another phase since.
+        phase_before_loss: its phase when its host was lost, with the start of that phase (`since`
+            and `wall`); None: its host reports, or the process has another phase since.
         born: lowest number that an instance of it can have; snapshots of lower ones are void.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.

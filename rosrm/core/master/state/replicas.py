@@ -110,7 +110,7 @@ class ReplicationState:
     Attributes:
         policy: chooses the hosts of replicas; None: snapshots stay on their own hosts alone.
         policy_name: in the configuration.
-        holdings: index of snapshots by process and host.
+        replicas: index of snapshots by process and host.
         last_orders: process name to the last order to its slave.
         dropped_at: time of the last order to a host to drop its replica of a process.
         removed: stateful processes that were removed, each with a number above those of all its
