@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -15,8 +15,6 @@ from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 
 #: Source time stamps in every mark: those of the newest messages of each input.
 COVERED_KEPT: Final = 256
-#: Most messages that are taken from one reader in a row.
-_AT_A_TIME: Final = 1000
 #: Bytes assumed for a field without a size of its own.
 _SMALL: Final = 32
 
@@ -98,21 +96,6 @@ def wants_all(qos: Any) -> bool:
     if qos.reliability is ReliabilityPolicy.BEST_EFFORT:
         return False
     return qos.history is HistoryPolicy.KEEP_ALL or qos.depth > 1
-
-
-def waiting(subscription: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield received messages that the executor has not served yet, with their information.
-
-    They are taken from the reader, as by the executor. Their number is limited, so the loop ends
-    even if messages arrive faster than it takes them.
-    """
-    handle = subscription.handle
-    with handle:
-        for _ in range(_AT_A_TIME):
-            taken = handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                return
-            yield taken
 
 
 def wants_info(callback: Callable[..., Any]) -> bool:

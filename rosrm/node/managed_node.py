@@ -26,13 +26,13 @@ from rosrm.node.entities import (
     TimerOf,
     refuse_coroutine,
     size_of,
-    waiting,
     wants_all,
     wants_info,
 )
 from rosrm.node.handoff.buffer import InputBuffer, Sent
 from rosrm.node.handoff.replay import InputReplay
 from rosrm.node.identity import NodeIdentity
+from rosrm.ros.polling import waiting
 
 #: Most messages of one input, and most bytes of all inputs, that are buffered for a successor: a
 #: silent source with a stuck destination may have to buffer half a minute of a fast sensor.

@@ -266,7 +266,7 @@ class Server:
         if isinstance(order, messages.Hello):
             self._welcome(connection, order)
         elif connection is not self._client:
-            raise ProtocolError("say hello first")
+            raise ProtocolError("the first order must be hello")
         elif isinstance(order, messages.Environment):
             self._learn_environment(connection, order)
         elif isinstance(order, messages.Launch):
@@ -285,7 +285,7 @@ class Server:
 
     def _welcome(self, connection: Connection, hello: messages.Hello) -> None:
         if connection is self._client:
-            raise ProtocolError("hello was said already")
+            raise ProtocolError("hello was sent twice")
         if hello.protocol != messages.PROTOCOL:
             raise ProtocolError(
                 f"this supervisor (pid {os.getpid()}) speaks protocol {messages.PROTOCOL}, "

@@ -14,8 +14,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64, Int64MultiArray
 
 from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
-from rosrm.node.handoff.channel import CHANNEL, STATE_CONFIG
 from rosrm.ros import qos
+from rosrm.ros.qos import HANDOFF, STATE_CONFIG
 from rosrm.supervisor.procfs import read_environment
 from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
 from tests.ros.clusters import Cluster, pids_of, zombie
@@ -109,7 +109,7 @@ class Watcher:
     def _said(self, config: StateConfig) -> None:
         if config.channel not in self._channels:
             self._channels.add(config.channel)
-            self._node.create_subscription(HandoffReport, config.channel, self._reported, CHANNEL)
+            self._node.create_subscription(HandoffReport, config.channel, self._reported, HANDOFF)
         if config.source == self._source:
             self._hear(f"says {SAID[config.phase]}")
 

@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.core.supervisor.events import StopOrdered
 from rosrm.errors import CriuError
 from rosrm.model.values import RestartPolicy
+from rosrm.supervisor.client_values import key_of
 from rosrm_criu.engine import dump, image, process_tree, restore, restore_result
 from rosrm_criu.engine.image import MappedFile
 from tests.criu_kit import TIMEOUT, eventually
@@ -483,7 +485,7 @@ def test_below_a_supervisor(theatre, counter, host):
     running = host.running(client, "actor", number=2)
     eventually((directory / "hold.json").exists, "the end of the restore")
     assert process_tree.root_of(running.pid) != running.pid
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     ended = host.ended(client, "actor", number=2)
     assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
 
@@ -501,7 +503,7 @@ def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     [after] = client.instances
     seen = log.read_text()
     eventually(lambda: len(log.read_text()) > len(seen), "more numbers")
-    client.stop(after.instance)
+    client.send(StopOrdered(key_of(after.instance)))
     host.ended(client, "actor", number=2)
     assert (after.state, after.pid) == (before.state, before.pid)
     assert not process_tree.is_alive(before.pid)
@@ -519,7 +521,7 @@ def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
     running = host.running(client, "actor", number=2)
     eventually((directory / "hold.json").exists, "the end of the restore")
     namespace = pid_namespace(process_tree.root_of(running.pid))
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     ended = host.ended(client, "actor", number=2)
     assert ended.exit_signal == signal.SIGKILL
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
@@ -539,7 +541,7 @@ def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
     eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     host.ended(client, "actor", number=2)
 
 

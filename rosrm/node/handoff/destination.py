@@ -8,13 +8,13 @@ from functools import partial
 from math import inf
 from typing import Any, Final
 
-from rosrm.node.entities import waiting
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.snapshot_assembler import Cut, CutAssembler
 from rosrm.node.handoff.state_parts import StateError, StateTopic
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
+from rosrm.ros.polling import waiting
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
@@ -147,7 +147,7 @@ class Destination:
             elif report.phase == HandoffReport.SILENT:
                 self._silent_at = report.sequence
             elif report.phase == HandoffReport.FAILED:
-                self._end(HandoffReport.FAILED, f"the source cannot go on: {report.message}")
+                self._end(HandoffReport.FAILED, f"the source failed: {report.message}")
             self._go_on()
 
     def _came(self, take: Callable[[Any], None], message: Any) -> None:

@@ -14,6 +14,7 @@ from rosrm.ros import convert, names, qos
 from rosrm.ros.control import version_refusal
 from rosrm.ros.master.slave_links import HostLinks
 from rosrm.ros.participant import Participant
+from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
 from rosrm_msgs import msg
 
@@ -67,8 +68,8 @@ class SlaveSubscriptions:
         node, path = participant.node, names.Names(participant.settings.namespace)
         # Thousands of readings arrive: they are taken raw, in batches, without the executor.
         intake = participant.unwatched_node(f"{node.get_name()}_intake")
-        self._readings = intake.create_subscription(
-            msg.ResourceInfo, path(names.RESOURCE_INFO), _never_called, qos.READINGS, raw=True
+        self._readings = polled_subscription(
+            intake, msg.ResourceInfo, path(names.RESOURCE_INFO), qos.READINGS
         )
         for kind, topic, take in (
             (msg.ProcessStatusBatch, names.PROCESS_STATUS, self._take_statuses),
@@ -79,12 +80,7 @@ class SlaveSubscriptions:
 
     def poll_readings(self) -> happened.ReadingsReceived | None:
         """Take all received readings; None: there are none."""
-        handle, kind = self._readings.handle, self._readings.msg_type
-        taken = []
-        with handle:
-            take = handle.take_message
-            while (message := take(kind, True)) is not None:
-                taken.append(message[0])
+        taken = [message for message, _ in waiting(self._readings, qos.READINGS.depth)]
         if not taken:
             return None
         batch = decode(taken)
@@ -146,7 +142,3 @@ class SlaveSubscriptions:
 
 def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:
     return {row.name: row.reason for row in message.failing if row.kind == kind}
-
-
-def _never_called(_message: object) -> None:
-    raise AssertionError("readings are polled, never called back")

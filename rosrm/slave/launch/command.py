@@ -27,7 +27,7 @@ def launch_order(
     where: ProcessLocation,
     state_directory: Path,
     launchers: Launchers,
-    heard: float = 0.0,
+    last_contact: float = 0.0,
 ) -> LaunchOrder:
     """Return the supervisor's order for an assignment, and write its parameters to a file.
 
@@ -38,7 +38,7 @@ def launch_order(
         where: host and cluster of the instance.
         state_directory: of this host's supervisor; the parameters are beside the instance's log.
         launchers: of this host.
-        heard: monotonic time of the master's last contact with this host, seconds; 0.0: now.
+        last_contact: of the master with this host, monotonic seconds; 0.0: now.
 
     Raises:
         LaunchError: the program was not found, with the searched places; or another error of the
@@ -65,7 +65,7 @@ def launch_order(
         restart=RestartPolicy("never") if assignment.on_trial else spec.restart,
         stop=spec.stop,
         fence=assignment.fence,
-        heard=heard,
+        last_contact=last_contact,
     )
 
 

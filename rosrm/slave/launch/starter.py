@@ -136,7 +136,7 @@ class Starter:
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
                     state_directory=self.supervisor.state, launchers=self.launchers,
-                    heard=self.state.last_contact,
+                    last_contact=self.state.last_contact,
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:

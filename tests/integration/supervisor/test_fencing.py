@@ -13,7 +13,10 @@ from pathlib import Path
 import pytest
 
 import rosrm
+from rosrm.core.supervisor.events import ContactReported
 from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
+from rosrm.supervisor.client_values import key_of
+from rosrm.supervisor.messages import Remember
 from tests.waiting import PATIENCE, holds_for, wait_gone, wait_until
 
 SLEEPS = ("sleep", "1000")
@@ -25,6 +28,7 @@ ALWAYS = RestartPolicy("always", delay=0.05)
 SLAVE = """
     import os, sys, time
     from pathlib import Path
+    from rosrm.core.supervisor.events import ContactReported
     from rosrm.model.values import Fence, InstanceId
     from rosrm.supervisor.client_values import LaunchOrder
     from rosrm.supervisor.client import SupervisorClient
@@ -36,7 +40,7 @@ SLAVE = """
     ])
     pids = {}
     while True:
-        client.heard(time.monotonic(), 0.0)
+        client.send(ContactReported(time.monotonic(), 0.0))
         for status in client.receive(0.1):
             if status.pid and status.instance.process not in pids:
                 pids[status.instance.process] = status.pid
@@ -91,7 +95,7 @@ def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client
     until, told = time.monotonic() + 5.0, []
     while time.monotonic() < until:
         alive = time.monotonic()
-        client.heard(0.0, alive)
+        client.send(ContactReported(0.0, alive))
         told += client.receive(0.1)
     assert {status.instance.process for status in told if status.state.ended} == {"two"}
     status = host.ended(client, "one")
@@ -125,10 +129,10 @@ def test_a_killed_supervisor_puts_no_fence_off(host, client):
 def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
     """The next supervisor counts from the last renewal, not from the start of the instance."""
     heard = time.monotonic()
-    client.start([host.order("one", *SLEEPS, fence=Fence(15.0, 0.0), heard=heard - 14.0)])
+    client.start([host.order("one", *SLEEPS, fence=Fence(15.0, 0.0), last_contact=heard - 14.0)])
     pid = host.running(client, "one").pid
-    client.heard(time.monotonic(), 0.0)
-    client.remember(ONE, "after the word that counts")
+    client.send(ContactReported(time.monotonic(), 0.0))
+    client.send(Remember(key_of(ONE), "after the word that counts"))
     client.start([host.order("other", "true")])
     host.ended(client, "other")  # by then the supervisor has read all orders
     wait_until(lambda: time.monotonic() > heard + 1.5, "its start lies back so far")
@@ -212,16 +216,20 @@ def test_a_supervisor_that_was_stopped_hears_first_what_was_said_in_time(host, c
     """A resumed supervisor reads its client's renewals before it applies an expired fence."""
     client.start([host.order("one", *SLEEPS, fence=Fence(1.0, 0.0, alive=True))])
     pid = host.running(client, "one").pid
+
+    def renews() -> bool:
+        client.send(ContactReported(0.0, time.monotonic()))
+        return True
+
     os.kill(client.pid, signal.SIGSTOP)
     try:
-        holds_for(2.5, lambda: client.heard(0.0, time.monotonic()) is None, "more than its fence")
+        holds_for(2.5, renews, "more than its fence")
     finally:
-        client.heard(0.0, time.monotonic())
+        renews()
         os.kill(client.pid, signal.SIGCONT)
 
     def goes_on() -> bool:
-        client.heard(0.0, time.monotonic())
-        return not any(status.state.ended for status in client.receive(0.05))
+        return renews() and not any(status.state.ended for status in client.receive(0.05))
 
     holds_for(0.7, goes_on, "not fenced")
     assert alive(pid)
