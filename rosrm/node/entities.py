@@ -162,8 +162,7 @@ class TimerOf:
 
     def stop(self) -> None:
         """Stop running until the next start."""
-        if self.period_ns:
-            self.timer.timer_period_ns, self.period_ns = self.period_ns, 0
+        self.back_in_step()
         self.timer.cancel()
 
 
@@ -191,17 +190,14 @@ class ServiceOf:
     """
 
     def __init__(
-        self,
-        create: Callable[[Callable[[Any, Any], Any]], Any],
-        destroy: Callable[[Any], Any],
-        name: str,
-        serve: Callable[[Any, Any], Any],
-    ) -> None:
+        self, create: Callable[[Callable[[Any, Any], Any]], Any], destroy: Callable[[Any], Any],
+        name: str, serve: Callable[[Any, Any], Any],
+    ) -> None:  # fmt: skip
         self._create = create
         self._destroy = destroy
         self._serve = serve
         self._service: Any = None
-        self._send: Callable[[Any, Any], None] = _drop
+        self._send: Callable[[Any, Any], None] = lambda *_: None
         self._held: deque[tuple[Any, DeferredAnswer]] = deque()
         self.srv_name = name
 
@@ -238,10 +234,6 @@ class ServiceOf:
         if self._service is None:
             raise AttributeError(f"{name}: the service {self.srv_name} is not open in a shadow")
         return getattr(self._service, name)
-
-
-def _drop(_answer: Any, _header: Any) -> None:
-    """Drop an answer, because there is no server yet."""
 
 
 class OpeningOf:

@@ -11,7 +11,7 @@ from typing import Any, Final
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.snapshot_assembler import Cut, CutAssembler
-from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
 from rosrm.ros.polling import waiting
@@ -42,12 +42,9 @@ class Destination:
     """
 
     def __init__(
-        self,
-        entities: NodeEntities,
-        parts: list[StateTopic],
-        mark_topic: str,
+        self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str,
         activated: Callable[[], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._entities = entities
         self._parts = parts
         self._mark_topic = mark_topic
@@ -184,15 +181,14 @@ class Destination:
             )
         if self._run and mark.run != self._run:
             return "the source was started again, and its state is a new one"
-        theirs = {part.topic: part.type for part in mark.parts}
-        ours = {part.topic: part.type_name for part in self._parts}
-        for topic in sorted(ours.keys() | theirs.keys()):
-            if theirs.get(topic) != ours.get(topic):
-                return (
-                    f"the state on {topic} is {theirs.get(topic, 'none')} at the source, and "
-                    f"{ours.get(topic, 'none')} here: both must be the same program"
-                )
-        return ""
+        differing = differing_part(self._parts, mark)
+        if differing is None:
+            return ""
+        topic, ours, theirs = differing
+        return (
+            f"the state on {topic} is {theirs} at the source, and {ours} here: both must be the "
+            f"same program"
+        )
 
     # --- following -------------------------------------------------------------------------
 
@@ -218,12 +214,8 @@ class Destination:
             self._end(HandoffReport.FAILED, str(error))
             return False
         self._cut = cut
-        now = time.monotonic()
         for mark in (*cut.passed, cut.mark):
-            for covered in mark.inputs:
-                self._entities.buffer.cover(
-                    covered.topic, covered.covered, single=covered.publishers <= 1, now=now
-                )
+            self._entities.cover(mark.inputs)
         return True
 
     def _review(self) -> None:
@@ -336,12 +328,11 @@ class Destination:
             return
         self._ended = self._active = True
         entities.sequence = self._sequence()
-        for covered in cut.mark.inputs:
-            entities.inherit(covered.topic, covered.covered)
-        passed = time.monotonic() - cut.arrived
-        due = [None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due]
+        entities.inherit(cut.mark.inputs)
         # Buffered messages are served first, because `_unfollow` and `_activated` take time.
-        entities.become_active(due, self._say_active, (self._unfollow, self._activated))
+        entities.become_active(
+            cut.mark.timers_due, cut.arrived, self._say_active, (self._unfollow, self._activated)
+        )
 
     def _say_active(self) -> None:
         if self._channel is not None:

@@ -14,10 +14,10 @@ from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.state_parts import StateError, StateTopic
 from rosrm.node.managed_node import Mode, NodeEntities
-from rosrm.node.snapshots.writer import LARGEST_PART, SnapshotSaver
+from rosrm.node.snapshots.writer import SnapshotSaver
 from rosrm.node.steady_timer import steady_timer
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
+from rosrm_msgs.msg import HandoffReport, MatchedOutput, StateConfig, StateMark
 
 #: Seconds that a silent source waits until its last outputs are acknowledged; by default Fast DDS
 #: sends its readers a heartbeat every 3 s.
@@ -48,7 +48,7 @@ class HandoffSource:
         self._fault = ""
         self._timers_due: list[int] = []
         self._silent_since = 0.0
-        self._look_again: Any = None
+        self._release_timer: Any = None
         plain = entities.plain
         self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
         for part in parts:
@@ -87,7 +87,7 @@ class HandoffSource:
         """
         try:
             for part in self._parts:
-                part.publish(LARGEST_PART)
+                part.publish()
         except StateError as error:
             self._failed(str(error))
             return False
@@ -98,7 +98,7 @@ class HandoffSource:
         for part in self._parts:
             if part.has_reader():
                 try:
-                    part.publish(LARGEST_PART)
+                    part.publish()
                 except StateError as error:
                     self._entities.node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
@@ -116,13 +116,7 @@ class HandoffSource:
         return StateMark(
             protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence, last=last,
             parts=[part.described() for part in self._parts],
-            inputs=[
-                CoveredInput(
-                    topic=one.key, publishers=one.subscription.get_publisher_count(),
-                    covered=array("q", one.covered),
-                )
-                for one in entities.inputs if one.buffered
-            ],
+            inputs=entities.covered_inputs(lambda one: one.subscription.get_publisher_count()),
             outputs=[
                 MatchedOutput(
                     topic=one.topic_name, subscriptions=one.get_subscription_count()
@@ -196,32 +190,35 @@ class HandoffSource:
         self._timers_due = entities.fall_silent()
         self._silent_since = time.monotonic()
         if not self._show(last=True):
-            self._go_on(_nothing)
+            self._reactivate(lambda: None)  # the failure has been reported
             return
         self._channel.say(HandoffReport.SILENT, entities.sequence)
-        self._look_again = steady_timer(entities.plain, _LOOK, self._release_when_heard)
+        self._release_timer = steady_timer(entities.plain, _LOOK, self._release)
 
-    def _release_when_heard(self) -> None:
+    def _release(self) -> None:
         """Report RELEASED when all outputs are acknowledged (a stop loses others) or time is up."""
         with self._entities.turn:
-            heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
-            if heard or time.monotonic() - self._silent_since >= _LAST_WORDS:
-                self._look_no_more()
+            received = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
+            if received or time.monotonic() - self._silent_since >= _LAST_WORDS:
+                self._stop_release()
                 if self._channel is not None:
                     self._channel.say(HandoffReport.RELEASED, self._entities.sequence)
 
-    def _look_no_more(self) -> None:
-        if self._look_again is not None:
-            self._entities.plain.destroy_timer(self._look_again)
-            self._look_again = None
+    def _stop_release(self) -> None:
+        if self._release_timer is not None:
+            self._entities.plain.destroy_timer(self._release_timer)
+            self._release_timer = None
+
+    def _call_off(self) -> None:
+        self._may_switch = self._asked = self._attached = self._finishing = False
+        self._stop_release()
 
     def _resume(self) -> None:
-        self._may_switch = self._asked = self._attached = self._finishing = False
-        self._look_no_more()
+        self._call_off()
         if self._entities.mode is Mode.SILENT:
             # Otherwise the shadow of a later handoff would take the last mark for its own.
             self._marks.publish(self._mark(last=False))
-            self._go_on(self._say_resumed)
+            self._reactivate(self._say_resumed)
         else:
             self._say_resumed()
 
@@ -229,10 +226,8 @@ class HandoffSource:
         if self._channel is not None:
             self._channel.say(HandoffReport.RESUMED, self._entities.sequence)
 
-    def _go_on(self, announce: Callable[[], None]) -> None:
-        passed = time.monotonic() - self._silent_since
-        due = [None if ns < 0 else ns / 1e9 - passed for ns in self._timers_due]
-        self._entities.become_active(due, announce)
+    def _reactivate(self, announce: Callable[[], None]) -> None:
+        self._entities.become_active(self._timers_due, self._silent_since, announce)
 
     def _overflowed(self, topic: str) -> None:
         self._entities.node.get_logger().error(
@@ -243,8 +238,7 @@ class HandoffSource:
     def close(self) -> None:
         """Leave the channel of a finished handoff."""
         self._fault = ""
-        self._look_no_more()
-        self._may_switch = self._asked = self._attached = self._finishing = False
+        self._call_off()
         if self._channel is not None:
             self._channel.close()
             self._channel = None
@@ -253,7 +247,3 @@ class HandoffSource:
         """Store the last snapshot, because the node is destroyed."""
         if self._keeper is not None:
             self._keeper.close()
-
-
-def _nothing() -> None:
-    """Do nothing, because the failure has been reported."""

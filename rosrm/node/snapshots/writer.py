@@ -21,10 +21,8 @@ from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.steady_timer import steady_timer
 from rosrm.snapshots import LARGEST, Block, SlotWriter
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import CoveredInput, StateMark
+from rosrm_msgs.msg import StateMark
 
-#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to serialise 200 MB.
-LARGEST_PART: Final = 256 << 20
 #: Share of a node's time for saving its state; `keep_every` may require a larger one.
 _SHARE: Final = 0.02
 #: Seconds for the last snapshot at the end, first for its lock, then for its writing.
@@ -103,7 +101,7 @@ class SnapshotSaver:
 
     def _blocks(self) -> list[Block]:
         for part in self._parts:
-            part.refresh(LARGEST_PART)
+            part.refresh()
         mark = bytes(serialize_message(self._mark()))
         blocks = [Block(mark, zlib.crc32(mark)), *(part.block() for part in self._parts)]
         size = sum(len(block.data) for block in blocks)
@@ -117,13 +115,7 @@ class SnapshotSaver:
             protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence,
             last=False,
             parts=[part.described() for part in self._parts],
-            inputs=[
-                CoveredInput(
-                    topic=one.key, publishers=self._publishers_of(one),
-                    covered=array("q", one.covered),
-                )
-                for one in entities.inputs if one.buffered
-            ],
+            inputs=entities.covered_inputs(self._publishers_of),
             timers_due=array("q", self._timers_due()),
         )  # fmt: skip
 
