@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import weakref
 from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
@@ -41,12 +43,14 @@ class LauncherContract:
     spec: ClassVar[ProcessSpec] = ProcessSpec("p", command=("sleep", "60"))
 
     def make(self) -> Launcher:
-        """Return a new launcher of a slave with an empty directory."""
+        """Return a new launcher of a slave with an empty directory, removed after the test."""
         hook = hookimpl(specname="register_launchers")(lambda: [self.offer])
         registry = Registry.of(tested=SimpleNamespace(register_launchers=hook))
         if registry.broken:
             raise ContractBroken(registry.broken[0].reason)
-        context = LauncherContext(Path(mkdtemp(prefix="rosrm-")), sys.executable, 1)
+        folder = Path(mkdtemp(prefix="rosrm-"))
+        weakref.finalize(self, shutil.rmtree, folder)
+        context = LauncherContext(folder, sys.executable, 1)
         found = registry.launchers(context)
         if found.absent:
             raise SkipTest(f"{self.offer.name} is absent: {found.absent[self.offer.name]}")

@@ -69,7 +69,7 @@ def test_what_was_processed_is_not_processed_again(stage, tmp_path):
     talker.publish(Int64(data=5))
     first = stage.instance(Busy, 1, keep=tmp_path)
     stage.spin_until(lambda: first.seen == [5], "the message")
-    at = first._rosrm.member.sequence
+    at = first._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, at), "a state that covers it")
     crash(stage, first)
     second = stage.instance(Busy, 1, keep=tmp_path)
@@ -144,7 +144,7 @@ def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
     newest.write_bytes(newest.read_bytes()[: head.size - 3])
     second = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: second.count > 0, "a count")
-    assert second._rosrm.member.sequence <= before.sequence + 1
+    assert second._rosrm.entities.sequence <= before.sequence + 1
     assert second.count > 20
     crash(stage, second)
     for path, _ in snapshots.files(tmp_path):
@@ -173,7 +173,7 @@ def test_what_is_not_kept_at_once_is_kept_though_no_cycle_follows(stage, tmp_pat
         talker.publish(Int64(data=1))
     stage.spin_until(lambda: node.total == 5, "five messages")
     writes = node._rosrm._source._keeper
-    assert writes._kept < node._rosrm.member.sequence
+    assert writes._kept < node._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, 5), "the last state")
 
 
@@ -215,7 +215,7 @@ def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_
     marks = stage.listen(StateMark, "/counter/_rosrm/mark", MARK)
     first = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: marks and first.count >= 5, "five counts that somebody follows")
-    at = first._rosrm.member.sequence
+    at = first._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, at), "a kept state")
 
 

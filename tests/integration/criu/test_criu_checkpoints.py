@@ -14,7 +14,7 @@ import pytest
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
-from rosrm_criu.engine.paths import checkpoint, checkpoint_numbers, checkpoint_ports, incoming
+from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
 from rosrm_criu.executors import artifacts, request
 from rosrm_criu.executors import checkpoint as steps
 from tests.criu_kit import TIMEOUT, eventually
@@ -114,14 +114,14 @@ def checkpointed(slave: Slave, counter: Any) -> list[int]:
 
 
 def nothing_left(slave: Slave) -> None:
-    assert checkpoint_numbers(slave.state) == []
+    assert numbers(slave.state, "kept") == []
     assert not list((slave.state / "images").glob("kept-*"))
 
 
 def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
     """A restored process loses and repeats no number, and its port stays reserved until then."""
     before, port = checkpointed(slave, counter), port_of(counter)
-    assert checkpoint_numbers(slave.state) == [1]
+    assert numbers(slave.state, "kept") == [1]
     assert not is_free(port)
     slave.ask("take", destination=3)
     restored = slave.shim(3)
@@ -228,7 +228,7 @@ def test_an_image_that_changed_on_the_disk_is_not_restored(slave, counter):
         slave.ask("await_kept")
     failed.process.wait(TIMEOUT)
     assert slave.ask("put_back") == {}
-    assert checkpoint_numbers(slave.state) == [1]
+    assert numbers(slave.state, "kept") == [1]
     steps.drop({"numbers": [1], "here": {"state": str(slave.state)}})
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.compatibility import FACTS
-from rosrm_criu.engine.probe import ability, probe
+from rosrm_criu.engine.probe import criu_support, probe
 
 
 def test_one_that_works(criu):
@@ -59,7 +59,7 @@ def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
     monkeypatch.delenv("ROSRM_CRIU", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("rosrm_criu.engine.binary._PLACES", str(tmp_path))
-    able = ability(tmp_path)
+    able = criu_support(tmp_path)
     assert (able.works, able.facts) == (False, {})
     assert able.reason == (
         f"there is no CRIU here (looked for: ROSRM_CRIU (not set), {tmp_path}/bin/criu, `criu` in "

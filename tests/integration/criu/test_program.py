@@ -170,8 +170,8 @@ def test_it_asks_for_all_rights_only_where_it_has_them(tmp_path):
     told = tmp_path / "told"
     program = script(tmp_path / "criu", f'echo "$@" >{told}')
     code = (
-        "import sys; from pathlib import Path; from rosrm_criu.engine.binary import Criu\n"
-        "Criu((sys.argv[1],), '4.2').run(['dump'], timeout=30, log=Path(sys.argv[2]))"
+        "import sys; from pathlib import Path; from rosrm_criu.engine.binary import CriuBinary\n"
+        "CriuBinary((sys.argv[1],), '4.2').run(['dump'], timeout=30, log=Path(sys.argv[2]))"
     )
     words = [sys.executable, "-c", code, program, tmp_path / "log"]
     subprocess.run(words, check=True)

@@ -19,6 +19,7 @@ SIZE = 12_000_000
 _SOURCE = """
 import hashlib, json, os, sys
 from pathlib import Path
+from dataclasses import asdict
 from rosrm_criu.transfer import Sender
 directory = Path(sys.argv[1])
 directory.mkdir()
@@ -27,19 +28,20 @@ content = os.urandom(int(sys.argv[2]))
 with Sender() as sender:
     offer = sender.offer(directory, seconds=120.0, max_rate=3e6, to=sys.argv[3])
     print(json.dumps([offer.as_json(), hashlib.sha256(content).hexdigest()]), flush=True)
-    print(json.dumps(sender.wait(120.0).as_json()), flush=True)
+    print(json.dumps(asdict(sender.wait(120.0))), flush=True)
 """
 _DESTINATION = """
 import hashlib, json, sys
 from pathlib import Path
 from rosrm.errors import TransferError
+from dataclasses import asdict
 from rosrm_criu.transfer import Fetcher, Offer
 target = Path(sys.argv[1])
 fetcher = Fetcher()
 print(json.dumps(fetcher.introduce()), flush=True)
 try:
     offer = Offer.from_json(json.loads(sys.stdin.readline()))
-    fetched = fetcher.fetch(offer, target, timeout=float(sys.argv[2]), reserve=0).as_json()
+    fetched = asdict(fetcher.fetch(offer, target, timeout=float(sys.argv[2]), reserve=0))
     digest = hashlib.sha256((target / "pages").read_bytes()).hexdigest()
 except TransferError as error:
     fetched, digest = {"error": str(error)}, ""

@@ -42,7 +42,7 @@ def test_a_fetch_can_be_stopped(source, target, sender, fetcher):
         going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
         until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
         fetcher.close()
-        with pytest.raises(TransferError, match="stopped before all had come"):
+        with pytest.raises(TransferError, match="stopped before everything was received"):
             going.result(PATIENCE)
     assert nothing_left(target)
 
