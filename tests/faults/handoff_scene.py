@@ -15,7 +15,7 @@ from tests.waiting import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "moving"
-PROGRAMS = "benchmarks.handoff_nodes"
+COUNT = "benchmarks.handoff_nodes"
 RATE = 50.0
 #: Consecutive outputs of one instance after which that instance counts as the active one.
 _ALONE = 10
@@ -40,15 +40,12 @@ class Scene:
 
     Args:
         make: function that creates a cluster.
-        program: program of `benchmarks.handoff_nodes`.
+        module: Python module that runs the program `count` of `benchmarks.handoff_nodes`.
         inputs: inputs per second that the watcher publishes to the process.
-        module: Python module that runs the program.
         options: options of the migration strategy.
     """
 
-    def __init__(
-        self, make, program: str, inputs: float = 0.0, module: str = PROGRAMS, **options
-    ) -> None:
+    def __init__(self, make, module: str = COUNT, *, inputs: float = 0.0, **options) -> None:
         self.cluster: Cluster = make(host("h0"), host("h1"), liveness=LivenessSettings())
         self.watcher = Watcher(self.cluster.domain, inputs)
         self._source = self._pid = 0
@@ -57,7 +54,7 @@ class Scene:
         self.cluster.submit(
             ProcessSpec(
                 NAME, module=module,
-                arguments=(program, "--rate", str(RATE)),
+                arguments=("count", "--rate", str(RATE)),
                 environment={"PYTHONPATH": str(ROOT)}, ros=True, stop=QUICK,
                 restart=RestartPolicy("on-failure", delay=0.2, attempts=100),
                 migration=MigrationPolicy("handoff", options=options),
@@ -179,5 +176,5 @@ class Scene:
         return self.watcher.outputs
 
     def is_gapless(self) -> bool:
-        """Return True if no output is lost or repeated, and the instances did not alternate."""
+        """Return True if no output or input is lost or repeated, and the instances took turns."""
         return is_gapless(self.outputs) and len(blocks(self.outputs)) <= 2
