@@ -275,11 +275,7 @@ class NodeEntities:
         return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
 
     def serve_what_has_come(self, then: Callable[[], None]) -> None:
-        """Serve received messages before falling silent, because a later shadow never got them.
-
-        Args:
-            then: called when they are served.
-        """
+        """Serve received messages, because a later shadow never got them, then call `then`."""
         if not self._replay.is_on:
             self.catch_up()
         if self.buffer:
@@ -331,11 +327,7 @@ class NodeEntities:
             self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
     def covered_inputs(self, publishers: Callable[[Input], int]) -> list[CoveredInput]:
-        """Return the processed messages of each buffered input, for a mark of the state.
-
-        Args:
-            publishers: returns the number of publishers of an input.
-        """
+        """Return the processed messages of each buffered input, for a mark of the state."""
         return [
             CoveredInput(
                 topic=one.key, publishers=publishers(one), covered=array("q", one.covered)

@@ -115,7 +115,6 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """Create a subscription as rclpy's.
 
         Args:
-            msg_type, topic, callback, qos_profile, named: as rclpy has them.
             buffer: in a handoff every message is processed once, by the source or by the
                 destination; False: messages are skipped while the node is not active.
         """

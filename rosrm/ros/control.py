@@ -73,8 +73,7 @@ class RequestGate:
     def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
         """Return the refusal of a request, or None.
 
-        Args:
-            epoch: older epochs than this are refused; None: the sender need not know it.
+        Epochs older than `epoch` are refused; None: the sender need not know it.
         """
         fault = version_refusal(envelope.protocol_version, envelope.sender or "the sender")
         if fault:
@@ -217,7 +216,6 @@ class ControlClient:
         """Send a request.
 
         Args:
-            client: an rclpy service client.
             deadline: monotonic seconds, compared with `expire`'s argument.
             done: called with the response; with None when the deadline has passed, or when its call
                 with the response raised.

@@ -88,14 +88,9 @@ def is_unsure(answer: Any, epoch: int) -> bool:
 def find_master(
     participant: Participant, who: str, timeout: float
 ) -> srv.Handshake.Response | None:
-    """Find a master and shake hands.
+    """Find a master and shake hands; return its description of itself, None: no answer in time.
 
-    Args:
-        who: role and name of the caller.
-        timeout: seconds.
-
-    Returns:
-        The master's description of itself; None: no master answered in time.
+    `who` is the role and name of the caller.
     """
     deadline = time.monotonic() + timeout
     path = names.Names(participant.settings.namespace)(names.HANDSHAKE)
@@ -288,8 +283,6 @@ class MasterClient:
         """Read a part of a log from the slave that holds it.
 
         Args:
-            host: of the slave.
-            process: that wrote the log.
             number: of the instance; 0: the newest on that host.
             offset: of the first byte.
             max_bytes: 0: as many as one answer holds.
@@ -336,9 +329,8 @@ class MasterClient:
         """Return the error for a part that does not answer.
 
         Args:
-            who: the master, or the slave of a host.
-            trouble: why, if that is known.
-            unknown: what became of the request.
+            trouble: its reason, if that is known.
+            unknown: a sentence on the fate of the request.
         """
         settings = self._participant.settings
         check = _to_check(settings) if who == _MASTER else "Is `rosrm slave` running there?"

@@ -87,7 +87,6 @@ class Executors:
         """Run an executor in a thread of its own.
 
         Args:
-            name: of the executor.
             arguments: a JSON object.
             timeout: seconds, after which its strategy counts as failing.
             here: description of this host.

@@ -47,12 +47,7 @@ class HealthWatch:
         self._monitors: dict[tuple[InstanceId, int], HealthMonitor] = {}
 
     def look(self, watched: Mapping[InstanceId, HeldInstance], now: float) -> Iterator[LookedAt]:
-        """Yield the result of one check of each watched instance.
-
-        Args:
-            watched: all watched instances.
-            now: monotonic seconds.
-        """
+        """Yield the result of one check of each watched instance."""
         self.watches = bool(watched)
         runs = {(instance, held.status.pid) for instance, held in watched.items()}
         for run in [run for run in self._monitors if run not in runs]:

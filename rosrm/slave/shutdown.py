@@ -63,13 +63,9 @@ class Shutdown:
         self.endpoint.failure = self.endpoint.failure or fault
 
     def carry_out(self, cause: str) -> int:
-        """Inform the master, then stop the processes or leave them running.
+        """Inform the master, then stop the processes or leave them running; return the exit code.
 
-        Args:
-            cause: a signal or `--stop-all`; "": the endpoint has failed.
-
-        Returns:
-            The exit code of the slave.
+        The cause is a signal or `--stop-all`; "": the endpoint has failed.
         """
         self.has_begun = True
         failure = self.endpoint.failure

@@ -176,11 +176,7 @@ class SupervisorLink:
                 self._take(events.RestartPolicyRecorded(one.instance, one.restart))
 
     def take_over(self) -> int:
-        """Re-adopt the supervisor's instances; instances unknown to the supervisor do not run.
-
-        Returns:
-            Number of instances of the supervisor.
-        """
+        """Re-adopt the supervisor's instances, and return their number; no others run."""
         client = self._client
         for note in client.notes:
             _log.info("%s", note)

@@ -67,11 +67,7 @@ def content_of(path: Path) -> bytes:
 
 
 def newest(directory: Path, up_to: int) -> tuple[Listing | None, list[str]]:
-    """Return the newest complete snapshot of a directory, and the faults of damaged files.
-
-    Args:
-        up_to: highest instance number whose snapshot counts.
-    """
+    """Return the newest complete snapshot of instances `up_to` a number, and faults of files."""
     found = files(directory)
     sound = {path for path, _ in found}
     faults = [

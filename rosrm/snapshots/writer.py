@@ -47,8 +47,7 @@ class SlotWriter:
     def write(self, sequence: int, blocks: Sequence[Block]) -> bool:
         """Write a snapshot over the older one; a kill at any instant leaves the newer one complete.
 
-        Returns:
-            False: a newer instance writes here; nothing was changed.
+        Returns False, with nothing changed, if a newer instance writes here.
 
         Raises:
             OSError: the snapshot cannot be written; the newer one is still complete.

@@ -200,9 +200,8 @@ class InstanceRecord:
     ) -> None:
         """Replace the record by one that holds only the current state, if the disk has room.
 
-        Args:
-            environments: all that launches refer to now or may later; one may be missing, where a
-                line was damaged.
+        The environments are all that launches refer to now or may later; one may be missing, where
+        a line was damaged.
         """
         waiting = self._waiting
         self._waiting = []

@@ -23,11 +23,9 @@ from rosrm.model.orders import (
 
 
 def event_of(order: InstanceOrder, given_at: float | None = None) -> Event:
-    """Return the event of an order.
+    """Return the event of an order; all other orders are for the slave's runtime.
 
-    Args:
-        order: for the core; all other orders are for the slave's runtime.
-        given_at: earliest time of the order, by the slave's clock; None: just now.
+    `given_at` is the earliest time of the order, by the slave's clock; None: just now.
     """
     match order:
         case StartInstance(assignment):

@@ -37,12 +37,9 @@ from rosrm.core.slave.state import SlaveState
 
 
 def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
-    """Handle one event.
+    """Handle one event, and change the state in place.
 
-    Args:
-        state: changed in place.
-        event: what happened.
-        now: seconds by the slave's monotonic clock; never less than before.
+    `now` is the slave's monotonic clock, in seconds; never less than before.
     """
     commands = HANDLERS[type(event)](state, event, now)
     if not state.registered and any(isinstance(command, Report) for command in commands):

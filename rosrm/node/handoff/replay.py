@@ -38,10 +38,9 @@ class InputReplay:
         return self._timer is not None
 
     def begin(self, beside: Iterator[None]) -> None:
-        """Serve all buffered messages, from the executor's next round on.
+        """Serve all buffered messages, in slices, from the executor's next round on.
 
-        Args:
-            beside: further work, advanced by one step after each slice.
+        After each slice `beside`, further work, is advanced by one step.
         """
         self._beside = beside
         self._start()

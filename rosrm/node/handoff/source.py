@@ -82,8 +82,7 @@ class HandoffSource:
     def _show(self, *, last: bool = False) -> bool:
         """Publish the state between two cycles, and the mark that lists the covered inputs.
 
-        Returns:
-            False: the state cannot be published; the master has received the reason.
+        Returns False if that fails; the master has received the reason.
         """
         try:
             for part in self._parts:

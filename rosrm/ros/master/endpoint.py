@@ -109,8 +109,7 @@ class MasterEndpoint:
         """Publish the master's beat, and its load at most once a second.
 
         Args:
-            uptime: seconds.
-            unheard: numbers of the hosts whose messages it does not receive.
+            unheard: numbers of the hosts whose messages the master does not receive.
             journal: sequence of the newest written record.
         """
         identity = self._identity

@@ -149,9 +149,7 @@ class HostLinks:
     ) -> None:
         """Call `send` now, or when the first beat of the slave has come.
 
-        Args:
-            deadline: monotonic seconds.
-            done: called with None when the deadline passes first.
+        If the deadline (monotonic seconds) passes first, `done` is called with None instead.
         """
         if self.reading_stats.beat[link.host_id]:
             send()
@@ -179,11 +177,7 @@ class HostLinks:
             self._with_work.add(link.host_id)
 
     def flush(self, journal: int) -> None:
-        """Answer the open requests of hosts that have assignments.
-
-        Args:
-            journal: sequence of the newest written record.
-        """
+        """Answer the open requests of hosts that have assignments, with the journal's watermark."""
         while self._with_work:
             link = self._links[self._with_work.pop()]
             if not link.outbox or link.poll is None:

@@ -417,12 +417,11 @@ class SlaveEndpoint:
             _log.info("the master did not acknowledge the last statuses within %g s", _LAST_WORDS)
 
     def leave(self, done: Callable[[], None], kept: Sequence[InstanceStatus] = ()) -> None:
-        """Report that this slave stops; `done` is called when the master knows, or is silent.
+        """Report that this slave stops; `done` is called once, when the master knows or is silent.
 
         A master that this slave finds after that is informed as well.
 
         Args:
-            done: called once.
             kept: all instances, if the slave leaves them running; (): it stops them.
         """
         self._leaves = kept

@@ -49,12 +49,7 @@ class HealthMonitor:
         self._state = _StateMonitor(node, watch, now) if watch.services else None
 
     def topic(self, pids: Iterable[int], now: float) -> tuple[int | None, str]:
-        """Return the messages since the last check, or None and why the topic cannot be checked.
-
-        Args:
-            pids: of the instance.
-            now: monotonic seconds.
-        """
+        """Return the messages since the last check, or None and why the topic cannot be checked."""
         return (None, "") if self._topic is None else self._topic.look(pids, now)
 
     def state(self, now: float) -> str | None:

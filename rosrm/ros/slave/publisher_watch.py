@@ -35,13 +35,12 @@ def await_second_publisher(
         topic: absolute name.
         type_name: as "std_msgs/msg/Int64".
         source, destination: names of their nodes, without namespace.
-        timeout: seconds.
 
     Returns:
         The number of messages received, and the seconds that passed.
 
     Raises:
-        TimeoutError: the message says what was received instead.
+        TimeoutError: the message describes the messages received instead.
         ValueError: another node publishes there too, or there is no such type.
     """
     begun = time.monotonic()

@@ -32,12 +32,10 @@ def launch_order(
     """Return the supervisor's order for an assignment, and write its parameters to a file.
 
     Args:
-        assignment: to start.
         base_environment: environment of the slave, with its ROS settings.
         python: the interpreter for modules.
         where: host and cluster of the instance.
         state_directory: of this host's supervisor; the parameters are beside the instance's log.
-        launchers: of this host.
         last_contact: of the master with this host, monotonic seconds; 0.0: now.
 
     Raises:

@@ -67,9 +67,7 @@ def process_environment(
     """Return all variables of an instance; those of its spec take precedence.
 
     Args:
-        assignment: of the instance.
         base: environment of the slave, with its ROS settings (ROS_DOMAIN_ID, ...).
-        where: host and cluster of the instance.
         not_inherited: variables that launchers set, so those of the slave do not count.
     """
     spec = assignment.spec

@@ -83,10 +83,8 @@ class Starter:
         """Apply a command to an instance that still waits for its snapshot.
 
         Stop and fence cancel the start; a restart has no effect, because the start follows anyway.
-
-        Returns:
-            False if the command is another one, or the instance does not wait; then the supervisor
-            has to execute the command.
+        Returns False if the supervisor has to execute the command: it is another one, or the
+        instance does not wait.
         """
         if not isinstance(command, commands.Stop | commands.Fence | commands.Restart):
             return False

@@ -124,12 +124,9 @@ class ReplicationService:
     def _in_thread(
         self, work: Callable[[], Any], then: Callable[[Any], None], otherwise: Any = None
     ) -> None:
-        """Run a call in the thread.
+        """Run `work` in the thread, then `then` in the loop with its result.
 
-        Args:
-            work: called in the thread.
-            then: called in the loop with the result.
-            otherwise: result if `work` raised; the exception is logged.
+        If `work` raises, the exception is logged, and the result is `otherwise`.
         """
 
         def job() -> None:
@@ -313,11 +310,9 @@ class ReplicationService:
     # --- for a start ---------------------------------------------------------------------
 
     def prepare(self, assignment: Assignment, done: Callable[[Assignment], None]) -> bool:
-        """Fetch the newest snapshot before an instance starts.
+        """Fetch the newest snapshot before an instance starts; return True if it may start now.
 
-        Returns:
-            True if the instance may start now. Otherwise `done` is called when the snapshot has
-            arrived, or does not arrive in time.
+        Otherwise `done` is called when the snapshot has arrived, or does not arrive in time.
         """
         if not assignment.has_snapshots:
             return True

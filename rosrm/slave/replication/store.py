@@ -95,14 +95,9 @@ class SnapshotStore:
     # --- incoming snapshots --------------------------------------------------------------
 
     def take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
-        """Write a part of a snapshot; the last part completes the replica.
+        """Write a part of a snapshot; return why it was refused, or None. The last completes it.
 
-        Args:
-            part: of the snapshot.
-            bounded: True for a process of another host, whose replicas are limited by `max_bytes`.
-
-        Returns:
-            The reason of a refusal; None: the part was written.
+        With `bounded` it is of another host's process, and `max_bytes` limits all such replicas.
         """
         if part.offset == 0:
             refusal = self._begin(part, bounded=bounded)
@@ -180,12 +175,7 @@ class SnapshotStore:
     ) -> TransferPart | None:
         """Return a part of a snapshot; None: this host does not hold the snapshot (any more).
 
-        Args:
-            process: name of the process.
-            age: of the requested snapshot; (0, 0): the newest.
-            offset: of the part, bytes.
-            size: of the part, bytes.
-            now: monotonic seconds.
+        The age (0, 0) requests the newest snapshot.
         """
         for name in [name for name, one in self._being_read.items() if now >= one.until]:
             del self._being_read[name]
