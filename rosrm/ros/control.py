@@ -126,8 +126,6 @@ class ControlServer:
     """Offers services behind a gate.
 
     Args:
-        participant: offers the services.
-        gate: admits or refuses every request.
         epoch: returns the current one if older ones are to be refused.
     """
 
@@ -197,7 +195,6 @@ class ControlClient:
     """Sends requests; each ends by its answer or by its deadline.
 
     Attributes:
-        participant: sends the requests.
         sender: role and name, for messages.
     """
 

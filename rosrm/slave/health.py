@@ -23,11 +23,7 @@ _STOPPED: Final = "T"
 class HealthWatch:
     """Health checks of the watched instances, subscribed only to the configured topics.
 
-    Args:
-        participant: creates a node when the first instance needs a topic or a lifecycle state.
-        graph: maps publishers to processes.
-        sessions: process tree of each instance.
-        launchers: of this host.
+    The participant creates a node when the first instance needs a topic or a lifecycle state.
 
     Attributes:
         watches: True if the last call of `look` had instances to check.

@@ -79,10 +79,6 @@ Settled = Callable[[str], None]
 class SlaveRuntime:
     """One slave.
 
-    Args:
-        config: checked settings.
-        registry: the installed plugins.
-
     Raises:
         Refused: another slave runs on this state directory.
         SupervisorError: the supervisor cannot be started or reached.
@@ -248,11 +244,11 @@ class SlaveRuntime:
     def _is_registered(self) -> bool:
         return self._endpoint.link is MasterLink.REGISTERED
 
-    def _serve(self, goes_on: Callable[[], bool]) -> None:
+    def _serve(self, condition: Callable[[], bool]) -> None:
         now = time.monotonic()
         next_sample = next_usage = next_graph = next_health = now
         logged_at = now - _LOG_PERIOD
-        while goes_on():
+        while condition():
             if now >= next_sample:
                 next_sample = max(next_sample + self._config.period, now)
                 self._cycle(now)
@@ -287,7 +283,7 @@ class SlaveRuntime:
 
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
-        self._endpoint.go_on(now)
+        self._endpoint.advance(now)
         self._replication.tick(now)
         sample = self._sampler.latest(now)
         if sample.reports:
@@ -300,7 +296,7 @@ class SlaveRuntime:
             sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),
         )  # fmt: skip
-        self._say_usage()
+        self._publish_usage()
         self._take(TimePassed())
 
     def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
@@ -323,7 +319,7 @@ class SlaveRuntime:
         failing.update(self._executors.failing_plugins())
         self._endpoint.publish_statuses((), complete=False)
 
-    def _say_usage(self) -> None:
+    def _publish_usage(self) -> None:
         seen = self._usage.after_reading()
         if seen:
             self._endpoint.publish_usage(

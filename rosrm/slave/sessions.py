@@ -44,7 +44,6 @@ class SessionTable:
     Args:
         proc: mount point of the process file system.
         session_of: returns the session id of a process; raises `OSError` if it has ended.
-        launchers: of this host.
     """
 
     def __init__(

@@ -32,11 +32,7 @@ class Shutdown:
     """Shutdown of one slave, also without its master or its supervisor.
 
     Attributes:
-        config: of the host.
         state: instances of the slave; read-only here.
-        starter: starts processes.
-        supervisor: stops them.
-        endpoint: informs the master.
         serve: runs the loop of the slave while its argument returns True.
         has_begun: the slave accepts no more work.
         keeps: the slave starts no more processes, because it has reported the running ones to the

@@ -171,10 +171,19 @@ class Status(NamedTuple):
 
 def encode_order(order: Order) -> bytes:
     """Return an order as one line."""
-    return line(_order_fields(order))
+    fields = order._asdict()
+    if isinstance(order, Environment):
+        fields["variables"] = dict(order.variables)
+    elif isinstance(order, Launch):
+        fields = launch_fields(order)
+    elif isinstance(order, Amend):
+        fields = {**order.order._asdict(), "changes": dict(order.changes)}
+    elif isinstance(order, Forget):
+        fields = {"instances": [forgotten.instance for forgotten in order.instances]}
+    return line({"do": _KINDS[type(order)], **fields})
 
 
-_WORDS: Final[Mapping[type, str]] = {
+_KINDS: Final[Mapping[type, str]] = {
     Hello: "hello",
     Environment: "environment",
     Launch: "start",
@@ -190,19 +199,6 @@ _WORDS: Final[Mapping[type, str]] = {
 }
 
 
-def _order_fields(order: Order) -> dict[str, Any]:
-    fields = order._asdict()
-    if isinstance(order, Environment):
-        fields["variables"] = dict(order.variables)
-    elif isinstance(order, Launch):
-        fields = launch_fields(order)
-    elif isinstance(order, Amend):
-        fields = {**order.order._asdict(), "changes": dict(order.changes)}
-    elif isinstance(order, Forget):
-        fields = {"instances": [forgotten.instance for forgotten in order.instances]}
-    return {"do": _WORDS[type(order)], **fields}
-
-
 def launch_fields(launch: Launch) -> dict[str, Any]:
     """Return a launch in values that JSON can hold; the record stores the same form."""
     return {**launch._asdict(), "changes": dict(launch.changes)}
@@ -212,17 +208,13 @@ def decode_order(text: bytes) -> Order:
     """Return the order in one line. Raises ProtocolError."""
     fields = parse(text)
     kind = fields.get("do")
-    try:
-        return _order(kind, fields)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ProtocolError(f"the order {kind!r} cannot be read: {error!r}") from None
-
-
-def _order(kind: object, fields: Mapping[str, Any]) -> Order:
     reader = _READERS.get(kind) if isinstance(kind, str) else None
     if reader is None:
         raise ProtocolError(f"unknown order {kind!r}; known: {', '.join(_READERS)}")
-    return reader(fields)
+    try:
+        return reader(fields)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProtocolError(f"the order {kind!r} cannot be read: {error!r}") from None
 
 
 def read_launch(fields: Mapping[str, Any]) -> Launch:

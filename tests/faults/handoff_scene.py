@@ -9,7 +9,7 @@ from pathlib import Path
 from rosrm.config.settings import LivenessSettings
 from rosrm.model.rows import ProcessRow
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
-from tests.faults.handoff_watcher import Fault, Watcher, blocks, instances, is_gapless
+from tests.faults.handoff_watcher import Fault, Watcher, answered_by, blocks, instances, is_gapless
 from tests.ros.clusters import QUICK, Cluster, host
 from tests.waiting import PATIENCE
 
@@ -92,7 +92,7 @@ class Scene:
         return self.cluster.log_of("master")[-3000:]
 
     def settle(self) -> ProcessRow:
-        """Wait until exactly one instance runs, owns the name and publishes."""
+        """Wait until exactly one instance runs, owns the name, publishes, and answers inputs."""
         self.cluster.wait(NAME, "running")
         # An older output may be from an instance that is silent by now.
         before = len(self.watcher.outputs)
@@ -102,7 +102,7 @@ class Scene:
             last = self.watcher.outputs[before:][-_ALONE:]
             heard = len(last) == _ALONE and {one.instance for one in last} == {row.number}
             alone = instances(self.cluster, NAME).keys() == {row.number}
-            return row.state == "running" and heard and alone
+            return row.state == "running" and heard and alone and bool(answered_by(last))
 
         view = self.cluster.wait_until("one active instance", settled, PATIENCE)
         return next(row for row in view.processes if row.name == NAME)

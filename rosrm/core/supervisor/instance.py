@@ -29,7 +29,6 @@ THEN_RESTART: Final = "restart"
 THEN_POLICY: Final = "policy"
 
 STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-_KILL: Final = len(STEPS) - 1
 #: Seconds between one SIGKILL and the next, for child processes forked in between.
 KILL_AGAIN: Final = 1.0
 #: SIGKILLs after which a shutdown no longer waits (a process stuck in the kernel).

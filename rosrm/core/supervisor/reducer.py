@@ -15,7 +15,7 @@
               FencePassed      Unspawn (one in hand is stopped later)        starting
               FenceOrdered     Unspawn (one in hand is killed later)         starting
               Resumed          Spawn (the supervisor was restarted)          starting
-              AmendOrdered     - (its policy is another from now on)         starting
+              AmendOrdered     - (the new policy holds from now on)          starting
     running   Exited           by policy                                     exited, failed, backoff
                                others of its session live: SIGINT            stopping
               StopOrdered      SIGINT                                        stopping
@@ -25,16 +25,16 @@
               FailOrdered      SIGINT, or SIGKILL at once; then by policy    stopping
               AmendOrdered     -                                             running
     stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
-              Exited           as was meant (end, restart, policy)           exited, starting, ...
+              Exited           as intended (end, restart, policy)            exited, starting, ...
                                others of its session live: -                 stopping
-              SessionEnded     as was meant (end, restart, policy)           exited, starting, ...
-              StopOrdered      now it is meant to end                        stopping
-              FencePassed      now it is meant to end, in the grace          stopping
+              SessionEnded     as intended (end, restart, policy)            exited, starting, ...
+              StopOrdered      from now on to end it                         stopping
+              FencePassed      the same, within the grace                    stopping
               FenceOrdered     the same; SIGKILL                             stopping
-              RestartOrdered   unless it is meant to end: to start again     stopping
+              RestartOrdered   unless it is to end: to start again           stopping
               AmendOrdered     -                                             stopping
     backoff   TimePassed       Spawn                                         starting
-              RestartOrdered   Spawn, the count of restarts afresh           starting
+              RestartOrdered   Spawn, with the restarts at 0                 starting
               StopOrdered      -                                             exited
               FencePassed      -                                             fenced
               FenceOrdered     -                                             fenced
@@ -156,12 +156,12 @@ class SupervisorState:
         elif isinstance(event, _OrderForUnknown):
             yield from self._unknown(event, now)
 
-    def _renew(self, heard: float, alive: float) -> None:
+    def _renew(self, at: float, alive: float) -> None:
         """Renew the fences; instances that are fenced already stay so."""
         for instance in self.instances.values():
             if instance.fence is None or instance.fence_at is None:
                 continue
-            newest = max(heard, alive) if instance.fence.alive else heard
+            newest = max(at, alive) if instance.fence.alive else at
             if instance.heard < newest:
                 instance.heard = newest
                 self._watch_deadline(instance)

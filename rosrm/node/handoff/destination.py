@@ -32,14 +32,7 @@ _REVIEW: Final = 0.1
 
 
 class Destination:
-    """The role of a shadow until it is active.
-
-    Args:
-        entities: the node.
-        parts: of its state.
-        mark_topic: fully qualified.
-        activated: called when the node is active.
-    """
+    """The role of a shadow until it is active; then `activated` is called."""
 
     def __init__(
         self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str,

@@ -22,10 +22,7 @@ _PARAMETERS: Final = "_rosrm/parameters"
 class HandoffSession:
     """The handoffs of one node: first perhaps as a destination, later as a source.
 
-    Args:
-        node: the author's.
-        plain: rclpy's own methods of it.
-        identity: given by rosrm to this process.
+    `plain` has rclpy's own methods of the node.
     """
 
     def __init__(self, node: Any, plain: Any, identity: NodeIdentity) -> None:

@@ -28,13 +28,7 @@ _AT_ONCE: Final = Duration(nanoseconds=0)
 
 
 class HandoffSource:
-    """The role of the active node towards a successor.
-
-    Args:
-        entities: the node.
-        parts: of its state.
-        mark_topic: fully qualified.
-    """
+    """The role of the active node towards a successor."""
 
     def __init__(self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str) -> None:
         self._entities = entities

@@ -22,13 +22,7 @@ class StateError(Exception):
 
 
 class StateTopic:
-    """One topic of a node's state.
-
-    Args:
-        topic: fully qualified.
-        message_type: of the topic.
-        save: returns the message, or None: unchanged since the last time.
-        restore: takes the message, and overwrites the node's state.
+    """One topic of a node's state; the arguments are those of `Migratable.keep_state`.
 
     Attributes:
         retained: the saved message is held after publishing too, because snapshots store it.
@@ -160,12 +154,7 @@ def type_name(message_type: Any) -> str:
 
 
 class ParametersPart(StateTopic):
-    """The parameters of a node, with values set at run time.
-
-    Args:
-        topic: fully qualified.
-        node: rclpy's.
-    """
+    """The parameters of a node, with values set at run time."""
 
     def __init__(self, topic: str, node: Any) -> None:
         super().__init__(topic, ParameterEvent, self._all, self._take_over)

@@ -19,9 +19,7 @@ class HandoffEndpoint:
     """Sends messages to the nodes of a handoff, and receives theirs until it is done.
 
     Args:
-        participant: of the master.
         cluster: the master's name.
-        epoch: of this run of it.
         take: called with each event.
         refuse: called with a refused peer and the reason.
     """

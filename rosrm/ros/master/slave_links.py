@@ -70,9 +70,7 @@ class HostLinks:
     """The links to all slaves that have registered.
 
     Args:
-        participant: sends the orders.
         sender: of the orders, for messages.
-        epoch: of this master.
         order_timeout: seconds beyond an order's own time for its answer.
         handle: receives the events.
     """

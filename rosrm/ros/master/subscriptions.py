@@ -24,11 +24,7 @@ _MOST_REFUSALS: Final = 1000
 
 
 class Refusals:
-    """Records refused peers, but not ten times a second.
-
-    Args:
-        handle: receives the events.
-    """
+    """Records refused peers, but not ten times a second."""
 
     def __init__(self, handle: Callable[[happened.Event], None]) -> None:
         self._handle = handle
@@ -46,12 +42,10 @@ class Refusals:
 
 
 class SlaveSubscriptions:
-    """The subscriptions to the messages of slaves.
+    """The subscriptions to the messages of slaves, as events for `handle`.
 
     Args:
-        participant: creates the subscriptions.
         links: receives the ids of hosts whose readings arrived.
-        handle: receives the events.
         refuse: receives refused peers, and reasons.
     """
 

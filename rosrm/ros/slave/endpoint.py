@@ -66,8 +66,6 @@ class SlaveEndpoint:
     """The slave's publishers, subscriptions and requests to its master.
 
     Args:
-        participant: of this slave.
-        description: of this host.
         state: instances of the slave; read-only here.
         take: takes events for the core.
         kept_states: returns all snapshots on this host.
@@ -151,7 +149,7 @@ class SlaveEndpoint:
 
     # --- finding the master --------------------------------------------------------------
 
-    def go_on(self, now: float) -> None:
+    def advance(self, now: float) -> None:
         """Take the next step towards a registration; called in every cycle."""
         self._control.expire(now)
         if self.link is MasterLink.SEARCHING and self._clients[srv.Handshake].service_is_ready():
@@ -249,7 +247,7 @@ class SlaveEndpoint:
         self.link = MasterLink.SEARCHING
         if self._waits_since is None:
             self._waits_since = now
-            _log.info("the master takes no host in, asking on: %s", why)
+            _log.info("the master is not accepting hosts; retrying: %s", why)
 
     def _turned_down(self, answer: msg.Answer, now: float) -> None:
         """Retry for a while if the name is taken, as a former run of this slave may hold it."""
@@ -287,11 +285,11 @@ class SlaveEndpoint:
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
-        said_at = self._note_beat(beat.beat, now)
+        sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))
         if self.link is MasterLink.REGISTERED and self.host_id not in beat.unheard:
-            self._take(events.ContactConfirmed(said_at))
+            self._take(events.ContactConfirmed(sent_at))
         if self.link is MasterLink.LISTENING:
             self._register_if_known()
 
@@ -303,7 +301,7 @@ class SlaveEndpoint:
         """Store a beat; return the time of its sending by this host's clock."""
         self._master_beat, self._beat_at = beat, now
         self._reporter.note_master(beat)
-        return self._beat_clock.said_at(beat / 1e9, now)
+        return self._beat_clock.sent_at(beat / 1e9, now)
 
     # --- asking for work -----------------------------------------------------------------
 
@@ -342,7 +340,7 @@ class SlaveEndpoint:
         try:
             work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
         except Refused as refusal:
-            _log.info("an assignment that makes no sense was refused: %s", refusal)
+            _log.info("an invalid assignment was refused: %s", refusal)
             return
         given_at = response.slave_beat / 1e9 if response.slave_beat else None
         self._take(events.AssignmentsReceived(work, given_at))
@@ -387,7 +385,7 @@ class SlaveEndpoint:
         readings must already include that load.
         """
         if self.link is MasterLink.REGISTERED:
-            self._reporter.tell()
+            self._reporter.publish()
             self._usages.publish(
                 msg.ProcessUsage(
                     protocol_version=PROTOCOL_VERSION, host_id=self.host_id,

@@ -35,14 +35,7 @@ _MOST_KEPT: Final = 1000
 
 
 class HealthMonitor:
-    """Checks the health of one run of one instance.
-
-    Args:
-        node: outside every executor.
-        graph: finds the process of a publisher.
-        watch: the required health.
-        now: monotonic seconds.
-    """
+    """Checks the health of one run of one instance; the node is outside every executor."""
 
     def __init__(self, node: Node, graph: GraphWatch, watch: Watch, now: float) -> None:
         self._topic = _TopicMonitor(node, graph, watch) if watch.topics else None

@@ -53,12 +53,7 @@ class _Peer:
 
 
 class ReplicationEndpoint:
-    """The replication services of one slave, and its clients.
-
-    Args:
-        participant: creates services and clients.
-        name: of the host.
-    """
+    """The replication services of the slave of one host, and its clients."""
 
     def __init__(self, participant: Participant, name: str) -> None:
         self._participant = participant

@@ -30,7 +30,6 @@ class Reporter:
 
     Args:
         send: publishes a serialised `ResourceInfo`.
-        incarnation: of this run of the slave.
         period: seconds from one cycle to the next.
     """
 
@@ -68,7 +67,7 @@ class Reporter:
         self._facts = facts
         self._unpublished += 1
         if self._unpublished >= self._every or self._has_news(usage, limit):
-            self.tell()
+            self.publish()
 
     def _has_news(self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32]) -> bool:
         """Return True if a decision may differ between this reading and the last published one."""
@@ -80,7 +79,7 @@ class Reporter:
             or (limit != self._published_limit).any()
         )
 
-    def tell(self) -> None:
+    def publish(self) -> None:
         """Send the newest reading, unless it has been sent."""
         if not self._unpublished:
             return

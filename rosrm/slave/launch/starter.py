@@ -34,15 +34,8 @@ class Starter:
     """Conversion of assignments into orders for the supervisor, after their snapshots arrived.
 
     Attributes:
-        config: of the host.
         kept: directory of the snapshots.
         state: instances of the slave; read-only here.
-        supervisor: executes the orders.
-        endpoint: reports to the master.
-        replication: fetches snapshots.
-        graph: shows the nodes of the ROS graph.
-        sessions: process tree of each instance.
-        launchers: of this host.
         take: takes events for the core.
     """
 

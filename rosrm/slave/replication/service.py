@@ -84,9 +84,6 @@ class ReplicationService:
 
     Args:
         root: directory of all snapshots.
-        host: name of this host.
-        settings: limits.
-        endpoint: exchanges messages with other slaves.
         post: schedules a call in the loop; may be called from any thread.
         publish: reports the snapshots to the master; returns False if there is no master.
     """
@@ -183,10 +180,10 @@ class ReplicationService:
         for shipment in list(self._shipments.values()):
             self._begin_due(shipment, now)
         for transfer in list(self._transfers.values()):
-            self._go_on(transfer, now)
+            self._send_part(transfer, now)
         for fetch in list(self._preparing.values()):
             if fetch is not None:
-                fetch.go_on(now)
+                fetch.advance(now)
 
     def states(self) -> tuple[SnapshotReport, ...]:
         """Return the snapshots on this host, as of the last scan."""
@@ -233,9 +230,9 @@ class ReplicationService:
             return
         transfer.head, transfer.content, transfer.digest = found
         transfer.waits = False
-        self._go_on(transfer, time.monotonic())
+        self._send_part(transfer, time.monotonic())
 
-    def _go_on(self, transfer: _Transfer, now: float) -> None:
+    def _send_part(self, transfer: _Transfer, now: float) -> None:
         """Send the next part, as soon as the limit of the sending rate allows it."""
         head = transfer.head
         if transfer.waits or head is None or self._budget <= 0.0:
@@ -264,7 +261,7 @@ class ReplicationService:
             shipment.refusals.pop(host, None)
             self._end(transfer)
         else:
-            self._go_on(transfer, now)
+            self._send_part(transfer, now)
 
     def _not_taken(
         self, shipment: _Shipment, host: str, head: Head, now: float, refusal: NotStored
@@ -354,7 +351,7 @@ class ReplicationService:
             assignment, tuple(name for name in hosts if name != self._host), self._endpoint,
             here=here, take=self._take_fetched, ended=ended,
         )  # fmt: skip
-        fetch.go_on(time.monotonic())
+        fetch.advance(time.monotonic())
 
     def _take_fetched(self, part: TransferPart, then: Callable[[NotStored | None], None]) -> None:
         self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)

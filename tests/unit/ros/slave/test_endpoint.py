@@ -170,7 +170,7 @@ class Slave:
             self.clock.now += PERIOD
             for master in masters:
                 master.beat()
-            self.endpoint.go_on(self.clock.now)
+            self.endpoint.advance(self.clock.now)
             self.endpoint.ask(self.clock.now)
 
     def find(self, master: Master) -> None:

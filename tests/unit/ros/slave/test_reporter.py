@@ -111,8 +111,8 @@ def test_the_newest_reading_can_be_told_before_its_time() -> None:
     slave.usage[0] += 0.5 * RESOLUTION
     slave.cycle()
 
-    slave.reporter.tell()
-    slave.reporter.tell()
+    slave.reporter.publish()
+    slave.reporter.publish()
 
     assert len(slave.sent) == 2
     decoded = decode(slave.sent)
