@@ -60,33 +60,11 @@ class Instance:
     """
 
     __slots__ = (
-        "cpu_time",
-        "deadline",
-        "exit_code",
-        "exit_signal",
-        "fault",
-        "fence",
-        "fenced",
-        "heard",
-        "key",
-        "kill_by",
-        "kills",
-        "message",
-        "peak_memory",
-        "phase",
-        "pid",
-        "recent",
-        "restart",
-        "restarts",
-        "run_time",
-        "started",
-        "step",
-        "stop",
-        "stop_began",
-        "then",
-        "trail",
+        "cpu_time", "deadline", "exit_code", "exit_signal", "fault", "fence", "fenced", "heard",
+        "key", "kill_by", "kills", "message", "peak_memory", "phase", "pid", "recent", "restart",
+        "restarts", "run_time", "started", "step", "stop", "stop_began", "then", "trail",
         "withdrawn",
-    )
+    )  # fmt: skip
 
     def __init__(self, key: Key, restart: RestartRule, stop: StopRule) -> None:
         self.key = key
