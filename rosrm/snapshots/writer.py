@@ -164,7 +164,7 @@ def write_copy(directory: Path, data: bytes) -> None:
     copy.finish()
 
 
-def drop(directory: Path, up_to: int) -> bool:
+def drop_snapshots(directory: Path, up_to: int) -> bool:
     """Delete the snapshots of instances up to a number; return True if none is left."""
     left = False
     for path in paths_of(directory):

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.node.handoff.snapshot_assembler import PartKey, part_key
-from rosrm.snapshots import Block
+from rosrm.snapshots.format import Block
 from rosrm_msgs.msg import StateMark, StatePart
 
 #: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to serialise 200 MB.

@@ -13,7 +13,8 @@ from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_par
 from rosrm.node.identity import NodeIdentity
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
-from rosrm.snapshots import Listing, newest
+from rosrm.snapshots.format import Listing
+from rosrm.snapshots.reader import newest
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 

@@ -19,7 +19,8 @@ from rclpy.serialization import serialize_message
 from rosrm.node.handoff.state_parts import StateError, StateTopic
 from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.steady_timer import steady_timer
-from rosrm.snapshots import LARGEST, Block, SlotWriter
+from rosrm.snapshots.format import LARGEST, Block
+from rosrm.snapshots.writer import SlotWriter
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 

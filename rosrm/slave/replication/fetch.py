@@ -9,7 +9,7 @@ from typing import Final
 
 from rosrm.model.values import Assignment
 from rosrm.ros.slave.replication import NotStored, ReplicationEndpoint
-from rosrm.snapshots import Head, TransferPart
+from rosrm.snapshots.format import Head, TransferPart
 
 #: Seconds for the discovery of a slave, or its answer; then the next host is asked.
 PATIENCE: Final = 3.0

@@ -16,13 +16,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import SnapshotStore
-from rosrm.snapshots import Head, TransferPart
+from rosrm.snapshots.format import Head, TransferPart
+from rosrm.snapshots.reader import newest_head, snapshot_files
+from rosrm.snapshots.writer import drop_snapshots
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -325,10 +326,10 @@ class ReplicationService:
         self._store.make()  # the node creates its own directory below
         directory = self._store.directory(assignment.spec.name)
         if not assignment.shadow and any(
-            head.instance < assignment.kept_from for _, head in snapshots.files(directory)
+            head.instance < assignment.kept_from for _, head in snapshot_files(directory)
         ):
-            snapshots.drop(directory, assignment.kept_from - 1)
-        return snapshots.newest_head(directory)
+            drop_snapshots(directory, assignment.kept_from - 1)
+        return newest_head(directory)
 
     def _looked(
         self, assignment: Assignment, here: Head | None, done: Callable[[Assignment], None]
