@@ -130,23 +130,17 @@ class ControlServer:
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        gate: RequestGate,
+        self, participant: Participant, gate: RequestGate,
         epoch: Callable[[], int | None] = lambda: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant = participant
         self._gate = gate
         self._epoch = epoch
 
     def offer(
-        self,
-        service_type: Any,
-        name: str,
-        handle: Callable[[Any, Callable[[Any], None]], None],
-        *,
+        self, service_type: Any, name: str, handle: Callable[[Any, Callable[[Any], None]], None], *,
         remember: bool = True,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Offer a service.
 
         Args:

@@ -30,12 +30,9 @@ class HealthWatch:
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        graph: GraphWatch,
-        sessions: SessionTable,
+        self, participant: Participant, graph: GraphWatch, sessions: SessionTable,
         launchers: Launchers,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant, self._graph, self._sessions = participant, graph, sessions
         self._launchers = launchers
         self.watches = False

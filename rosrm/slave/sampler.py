@@ -287,12 +287,8 @@ class _Watched:
     """
 
     def __init__(
-        self,
-        made: MadeProbe,
-        first: int,
-        clock: Callable[[], float],
-        progress: threading.Event,
-    ) -> None:
+        self, made: MadeProbe, first: int, clock: Callable[[], float], progress: threading.Event,
+    ) -> None:  # fmt: skip
         self.name = made.name
         self.names = tuple(resource.name for resource in made.resources)
         self.deadline = made.deadline

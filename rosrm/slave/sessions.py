@@ -47,11 +47,9 @@ class SessionTable:
     """
 
     def __init__(
-        self,
-        proc: Path = Path("/proc"),
-        session_of: Callable[[int], int] = os.getsid,
+        self, proc: Path = Path("/proc"), session_of: Callable[[int], int] = os.getsid,
         launchers: Launchers | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._proc = str(proc)
         self._session_of = session_of
         self._launchers = launchers or Launchers()

@@ -89,13 +89,9 @@ class SupervisorClient:
 
     @classmethod
     def connect(
-        cls,
-        state_directory: Path,
-        *,
-        start: bool = True,
-        log: LogLimits = DEFAULT_LOG_LIMITS,
+        cls, state_directory: Path, *, start: bool = True, log: LogLimits = DEFAULT_LOG_LIMITS,
         timeout: float = 5.0,
-    ) -> SupervisorClient:
+    ) -> SupervisorClient:  # fmt: skip
         """Connect to the supervisor of a state directory, and start one where none listens.
 
         Raises:

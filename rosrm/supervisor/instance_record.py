@@ -188,12 +188,9 @@ class InstanceRecord:
         return self._size >= self._compact_at
 
     def rewrite(
-        self,
-        core_state: SupervisorState,
-        launches: Mapping[Key, Launch],
-        environments: Mapping[str, Mapping[str, str]],
-        birth: Callable[[Key], int],
-    ) -> None:
+        self, core_state: SupervisorState, launches: Mapping[Key, Launch],
+        environments: Mapping[str, Mapping[str, str]], birth: Callable[[Key], int],
+    ) -> None:  # fmt: skip
         """Replace the record by one that holds only the current state, if the disk has room.
 
         The environments are all that launches refer to now or may later; one may be missing, where

@@ -315,12 +315,9 @@ def _texts(value: Any) -> dict[str, str]:
 
 
 def encode_welcome(
-    pid: int,
-    notes: Sequence[str],
-    statuses: Sequence[Status],
-    memos: Mapping[Key, str],
+    pid: int, notes: Sequence[str], statuses: Sequence[Status], memos: Mapping[Key, str],
     fenced: Sequence[Key],
-) -> bytes:
+) -> bytes:  # fmt: skip
     """Return the answer to `hello`."""
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}

@@ -37,14 +37,9 @@ class Channel:
     """
 
     def __init__(
-        self,
-        plain: Any,
-        topic: str,
-        destination: int,
-        instance: int,
-        peer: int,
+        self, plain: Any, topic: str, destination: int, instance: int, peer: int,
         take_report: Callable[[HandoffReport], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._plain = plain
         self._destination = destination
         self._instance = instance

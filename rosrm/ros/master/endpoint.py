@@ -43,12 +43,9 @@ class MasterEndpoint:
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        identity: MasterIdentity,
-        queries: Queries,
+        self, participant: Participant, identity: MasterIdentity, queries: Queries,
         control: ControlSettings,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._identity = identity
         self._guard = participant.guard
         self.events: list[happened.Event] = []

@@ -25,13 +25,9 @@ class HandoffEndpoint:
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        cluster: str,
-        epoch: int,
-        take: Callable[[Event], None],
+        self, participant: Participant, cluster: str, epoch: int, take: Callable[[Event], None],
         refuse: Callable[[str, str], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant = participant
         self._names = names.Names(participant.settings.namespace)
         self._cluster = cluster

@@ -76,13 +76,9 @@ class HostLinks:
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        sender: str,
-        epoch: int,
-        order_timeout: float,
+        self, participant: Participant, sender: str, epoch: int, order_timeout: float,
         handle: Callable[[happened.Event], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant = participant
         self._epoch = epoch
         self._order_timeout = order_timeout
@@ -139,12 +135,9 @@ class HostLinks:
                 order.send()
 
     def after_first_reading(
-        self,
-        link: HostLink,
-        send: Callable[[], None],
-        deadline: float = math.inf,
+        self, link: HostLink, send: Callable[[], None], deadline: float = math.inf,
         done: Callable[[None], None] = lambda _: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Call `send` now, or when the first beat of the slave has come.
 
         If the deadline (monotonic seconds) passes first, `done` is called with None instead.

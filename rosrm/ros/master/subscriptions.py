@@ -50,12 +50,9 @@ class SlaveSubscriptions:
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        links: HostLinks,
-        handle: Callable[[happened.Event], None],
+        self, participant: Participant, links: HostLinks, handle: Callable[[happened.Event], None],
         refuse: Callable[[str, str], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._links = links
         self._handle = handle
         self._refuse = refuse

@@ -20,15 +20,9 @@ from rosrm.supervisor.client_values import LaunchOrder
 
 
 def launch_order(
-    assignment: Assignment,
-    base_environment: Mapping[str, str],
-    python: str,
-    *,
-    where: ProcessLocation,
-    state_directory: Path,
-    launchers: Launchers,
-    last_contact: float = 0.0,
-) -> LaunchOrder:
+    assignment: Assignment, base_environment: Mapping[str, str], python: str, *,
+    where: ProcessLocation, state_directory: Path, launchers: Launchers, last_contact: float = 0.0,
+) -> LaunchOrder:  # fmt: skip
     """Return the supervisor's order for an assignment, and write its parameters to a file.
 
     Args:

@@ -59,11 +59,9 @@ def snapshot_directory(kept: Path, process: str) -> Path:
 
 
 def process_environment(
-    assignment: Assignment,
-    base: Mapping[str, str],
-    where: ProcessLocation,
+    assignment: Assignment, base: Mapping[str, str], where: ProcessLocation,
     not_inherited: Sequence[str] = (),
-) -> dict[str, str]:
+) -> dict[str, str]:  # fmt: skip
     """Return all variables of an instance; those of its spec take precedence.
 
     Args:
