@@ -44,7 +44,7 @@ from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
-from rosrm.slave.executors import Done, Executors, Here
+from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
@@ -152,16 +152,14 @@ class SlaveRuntime:
             )  # fmt: skip
             duties = Duties(
                 self._take, self._set_restart, self._replication.keep, self._drop_kept,
-                self._execute,
-                self._read_log,
+                self._execute, self._read_log,
             )  # fmt: skip
             SlaveServices(
                 self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch
             )
             self._starter = Starter(
                 config, kept, self._state, self._supervisor, self._endpoint, self._replication,
-                graph,
-                sessions, launchers, take=self._take,
+                graph, sessions, launchers, take=self._take,
             )  # fmt: skip
             self._ending = Shutdown(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
@@ -426,8 +424,12 @@ class SlaveRuntime:
     def _execute(self, order: RunExecutor, done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""
         held = self._state.held.items()
-        pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
-        here = Here(self._config.host, self._config.state, pids)
+        live = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
+        here = {
+            "host": self._config.host, "state": str(self._config.state), "instances": list(live),
+            # Instances that wait for a start or restart have none.
+            "pids": {one: pid for one, pid in live.items() if pid},
+        }  # fmt: skip
         arguments = dict(order.arguments)
         self._executors.execute(order.executor, arguments, order.timeout, here=here, done=done)
 

@@ -182,17 +182,10 @@ class SupervisorClient:
         }
         changes.update((name, None) for name in base if name not in order.environment)
         return messages.Launch(
-            key_of(order.instance),
-            order.argv,
-            self._base_id,
-            changes,
-            order.working_directory,
-            restart_rule(order.restart),
-            stop_rule(order.stop),
-            order.memo,
-            fence_rule(order.fence),
-            order.last_contact,
-        )
+            key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
+            restart_rule(order.restart), stop_rule(order.stop), order.memo,
+            fence_rule(order.fence), order.last_contact,
+        )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
         """Send an environment as the base: others differ little, and are sent as changes."""

@@ -90,22 +90,16 @@ class SlaveSubscriptions:
             return
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
-            failing = {one: _failing(message, one) for one in ("probe", "migration", "launcher")}
         except Refused as refusal:
             self._refuse(who, str(refusal))
             return
+        failing = (_failing(message, one) for one in ("probe", "migration", "launcher"))
         self._handle(
             happened.StatusesReceived(
-                message.host_id,
-                message.incarnation,
-                message.sequence,
-                message.complete,
-                statuses,
-                failing["probe"],
-                failing["migration"],
-                failing["launcher"],
+                message.host_id, message.incarnation, message.sequence, message.complete, statuses,
+                *failing,
             )
-        )
+        )  # fmt: skip
 
     def _take_usage(self, message: msg.ProcessUsage) -> None:
         sizes = {len(message.numbers), len(message.cpu), len(message.memory)}

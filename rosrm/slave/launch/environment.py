@@ -21,17 +21,9 @@ KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
 #: Variables that identify a process. A slave that was itself started by rosrm passes none of them
 #: on.
 _IDENTITY: Final = (
-    "ROSRM_PROCESS",
-    "ROSRM_INSTANCE",
-    "ROSRM_HOST",
-    "ROSRM_NODE",
-    "ROSRM_STATE_CONFIG",
-    "ROSRM_MASTER",
-    "ROSRM_EPOCH",
-    SHADOW,
-    KEEP,
-    KEEP_EVERY,
-)
+    "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
+    "ROSRM_MASTER", "ROSRM_EPOCH", SHADOW, KEEP, KEEP_EVERY,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
