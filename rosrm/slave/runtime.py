@@ -276,7 +276,7 @@ class SlaveRuntime:
 
     def _stop(self, number: int, _frame: Any) -> None:
         if self._stopping:  # the handler may interrupt a log call: the loop logs instead
-            self._from_threads.append(lambda: self._ending.say_progress())  # noqa: PLW0108 - as above
+            self._from_threads.append(lambda: self._ending.log_progress())  # noqa: PLW0108 - as above
         self._stopping = self._stopping or signal.Signals(number).name
 
     def _cycle(self, now: float) -> None:

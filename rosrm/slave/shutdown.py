@@ -94,7 +94,7 @@ class Shutdown:
         self._inform_master()
         return self._stop_processes(1 if failure else 0, live, cause)
 
-    def say_progress(self) -> None:
+    def log_progress(self) -> None:
         """Log the processes that still stop and the time until SIGKILL, after another signal."""
         left = _live(self._begun())
         if self._kill_at and left:
@@ -123,7 +123,7 @@ class Shutdown:
         if self._supervisor_fault:
             _log.error("%s", self._supervisor_fault)
             return self._fail_without_supervisor()
-        self.endpoint.wait_until_heard()
+        self.endpoint.wait_until_received()
         part = "supervisor" if cause == STOP_ALL else "slave"
         count = counted(live, "process was stopped", "processes were stopped")
         _log.info("%s of %s ended; %s", part, self.config.host, count)

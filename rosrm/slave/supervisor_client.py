@@ -39,7 +39,7 @@ _log = logging.getLogger("rosrm.slave")
 #: Seconds for a new supervisor to be ready, or for a busy one to answer.
 _PATIENCE: Final = 30.0
 #: Seconds for which orders may wait before a message to the user.
-_TOLD_AFTER: Final = 5.0
+_LOGGED_AFTER: Final = 5.0
 
 
 class SupervisorLink:
@@ -96,7 +96,7 @@ class SupervisorLink:
         # The receiving thread detects a killed supervisor and replaces it.
         with contextlib.suppress(SupervisorGone):
             self._client.start(launches)
-        self._say_if_it_waits()
+        self._log_waits()
 
     def carry_out(self, command: commands.Command) -> None:
         """Send a command of the core."""
@@ -104,17 +104,17 @@ class SupervisorLink:
             self._unanswered.pop(command.instance, None)
         with contextlib.suppress(SupervisorGone):
             self._client.send(_order_of(command))
-        self._say_if_it_waits()
+        self._log_waits()
 
-    def _say_if_it_waits(self) -> None:
+    def _log_waits(self) -> None:
         waits = self._client.waits
-        if waits > _TOLD_AFTER and not self._logged_waits:
+        if waits > _LOGGED_AFTER and not self._logged_waits:
             _log.info(
                 "the supervisor (pid %d) has accepted no order for %.0f s: is it stopped? Orders "
                 "wait until it continues",
                 self._client.pid, waits,
             )  # fmt: skip
-        self._logged_waits = waits > _TOLD_AFTER
+        self._logged_waits = waits > _LOGGED_AFTER
 
     def shut_down(self) -> None:
         """Order the supervisor to stop all processes and end."""

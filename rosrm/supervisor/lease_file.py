@@ -39,7 +39,7 @@ class LastContact:
         except OSError as error:
             trouble = error.strerror or str(error)
             if trouble != self._trouble:
-                own_log.say(f"{self._path} cannot be written: {trouble}")
+                own_log.write(f"{self._path} cannot be written: {trouble}")
             self._trouble = trouble
 
 

@@ -126,7 +126,7 @@ class _Log:
             try:
                 rotate(self.path, size, limits)
             except OSError as error:
-                own_log.say(f"{self.path} was truncated, but not rotated: {error}")
+                own_log.write(f"{self.path} was truncated, but not rotated: {error}")
             self.base, self.size = log_index.base(self.path) or 0, 0
         return True
 
@@ -144,7 +144,7 @@ class _Log:
             log_index.add(self.path, Mark(now, self.base + size, pid))
             self._has_index = True
         except OSError as error:
-            own_log.say(f"the time index of {self.path} was not written: {error}")
+            own_log.write(f"the time index of {self.path} was not written: {error}")
 
 
 class LogFolder:

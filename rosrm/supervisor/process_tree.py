@@ -126,7 +126,7 @@ class ProcessTrees:
                 key = self._owner(pid)
                 self._adopted[pid] = key
                 if key is not None and key not in self._sessions:
-                    own_log.say(f"killed {pid}, left over by {mark(key)}")
+                    own_log.write(f"killed {pid}, left over by {mark(key)}")
                     _send(os.kill, pid, signal.SIGKILL, str(pid))
 
     def _owner(self, pid: int) -> Key | None:
@@ -212,4 +212,4 @@ def _send(call: Callable[[int, int], None], target: int, number: int, what: str)
     except ProcessLookupError:
         return
     except PermissionError as error:
-        own_log.say(f"signal {number} to {what}: {error.strerror}")
+        own_log.write(f"signal {number} to {what}: {error.strerror}")

@@ -33,7 +33,7 @@ SPAWNS_A_ROUND: Final = 8
 #: Seconds between attempts to write the record while the disk is full.
 RECORD_AGAIN: Final = 1.0
 #: Seconds that the client has to read the last messages.
-LAST_WORDS: Final = 1.0
+END_PATIENCE: Final = 1.0
 
 
 class Server:
@@ -112,7 +112,7 @@ class Server:
     def _leave(self) -> None:
         os.unlink(os.path.join(self._state, paths.SOCKET))
         if self._client is not None:
-            self._client.finish(messages.encode_ended(), LAST_WORDS)
+            self._client.finish(messages.encode_ended(), END_PATIENCE)
 
     # --- the core's commands ------------------------------------------------------------------
 
@@ -221,7 +221,7 @@ class Server:
         self._environments.update(recorded.environments)
         self._notes = recorded.notes
         for note in recorded.notes:
-            own_log.say(note)
+            own_log.write(note)
         for event in takeover.what_happened(recorded, self._state, self._core, self._trees):
             self._happened(event)
         self._rewrite_record()

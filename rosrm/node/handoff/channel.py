@@ -59,7 +59,7 @@ class Channel:
         if theirs and report.protocol_version == PROTOCOL_VERSION:
             self._take_report(report)
 
-    def say(self, phase: int, sequence: int = 0, message: str = "") -> None:
+    def report(self, phase: int, sequence: int = 0, message: str = "") -> None:
         """Publish a report, unless it repeats the last one."""
         last = self._last
         if last is not None and (last.phase, last.message) == (phase, message):

@@ -73,7 +73,7 @@ class Destination:
             self.close()
         elif self._ended:
             if config.phase == StateConfig.ABORT and not self._active:
-                channel.say(HandoffReport.ABORTED, self._sequence(), self._fault)
+                channel.report(HandoffReport.ABORTED, self._sequence(), self._fault)
         elif config.phase == StateConfig.SWITCH:
             self._may_switch = True
             self._review()
@@ -90,7 +90,7 @@ class Destination:
             config.source, self._take_report,
         )  # fmt: skip
         if self._ended:
-            channel.say(HandoffReport.FAILED, 0, self._fault)
+            channel.report(HandoffReport.FAILED, 0, self._fault)
             return channel
         self._assembler = CutAssembler()
         # Marks first, also in `_catch_up`: they name the parts that are worth keeping.
@@ -221,16 +221,16 @@ class Destination:
         if not self._was_ready:
             missing = self._still_missing()
             if missing:
-                self._channel.say(HandoffReport.SHADOWING, 0, f"waits {missing}")
+                self._channel.report(HandoffReport.SHADOWING, 0, f"waits {missing}")
                 return
             self._was_ready = True
-            self._channel.say(HandoffReport.READY, self._sequence())
+            self._channel.report(HandoffReport.READY, self._sequence())
         if not self._may_switch:
             return
         if self._cut is not None and self._is_last(self._cut):
             self._activate_if_complete()
         else:
-            self._channel.say(HandoffReport.SWITCHING, self._sequence())
+            self._channel.report(HandoffReport.SWITCHING, self._sequence())
 
     def _is_last(self, cut: Cut) -> bool:
         """Return True for this handoff's last state; an earlier handoff's may be latched too."""
@@ -324,19 +324,19 @@ class Destination:
         entities.inherit(cut.mark.inputs)
         # Buffered messages are served first, because `_unfollow` and `_activated` take time.
         entities.become_active(
-            cut.mark.timers_due, cut.arrived, self._say_active, (self._unfollow, self._activated)
+            cut.mark.timers_due, cut.arrived, self._report_active, (self._unfollow, self._activated)
         )
 
-    def _say_active(self) -> None:
+    def _report_active(self) -> None:
         if self._channel is not None:
-            self._channel.say(HandoffReport.ACTIVE, self._sequence())
+            self._channel.report(HandoffReport.ACTIVE, self._sequence())
 
     def _end(self, phase: int, message: str) -> None:
         """Give up for good; this process then runs until its slave stops it."""
         self._ended, self._fault = True, message
         self._entities.node.get_logger().warning(f"will not take over: {message}")
         if self._channel is not None:
-            self._channel.say(phase, self._sequence(), message)
+            self._channel.report(phase, self._sequence(), message)
         self._unfollow()
 
     def _overflowed(self, topic: str) -> None:

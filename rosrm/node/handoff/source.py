@@ -21,7 +21,7 @@ from rosrm_msgs.msg import HandoffReport, MatchedOutput, StateConfig, StateMark
 
 #: Seconds that a silent source waits until its last outputs are acknowledged; by default Fast DDS
 #: sends its readers a heartbeat every 3 s.
-_LAST_WORDS: Final = 4.0
+_ACK_PATIENCE: Final = 4.0
 #: Seconds between two checks for acknowledgements.
 _LOOK: Final = 0.05
 _AT_ONCE: Final = Duration(nanoseconds=0)
@@ -101,7 +101,7 @@ class HandoffSource:
             self._entities.node.get_logger().error(f"{fault}. This node stays where it is")
         self._fault = fault
         if self._channel is not None:
-            self._channel.say(HandoffReport.FAILED, self._entities.sequence, fault)
+            self._channel.report(HandoffReport.FAILED, self._entities.sequence, fault)
 
     def _mark(self, *, last: bool) -> StateMark:
         entities = self._entities
@@ -165,7 +165,7 @@ class HandoffSource:
             return
         self._attached = True
         if self._show():
-            self._channel.say(HandoffReport.ATTACHED, self._entities.sequence)
+            self._channel.report(HandoffReport.ATTACHED, self._entities.sequence)
 
     def _switch(self) -> None:
         """Fall silent, once both the master and the destination have requested it."""
@@ -185,17 +185,17 @@ class HandoffSource:
         if not self._show(last=True):
             self._reactivate(lambda: None)  # the failure has been reported
             return
-        self._channel.say(HandoffReport.SILENT, entities.sequence)
+        self._channel.report(HandoffReport.SILENT, entities.sequence)
         self._release_timer = steady_timer(entities.plain, _LOOK, self._release)
 
     def _release(self) -> None:
         """Report RELEASED when all outputs are acknowledged (a stop loses others) or time is up."""
         with self._entities.turn:
             received = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
-            if received or time.monotonic() - self._silent_since >= _LAST_WORDS:
+            if received or time.monotonic() - self._silent_since >= _ACK_PATIENCE:
                 self._stop_release()
                 if self._channel is not None:
-                    self._channel.say(HandoffReport.RELEASED, self._entities.sequence)
+                    self._channel.report(HandoffReport.RELEASED, self._entities.sequence)
 
     def _stop_release(self) -> None:
         if self._release_timer is not None:
@@ -211,13 +211,13 @@ class HandoffSource:
         if self._entities.mode is Mode.SILENT:
             # Otherwise the shadow of a later handoff would take the last mark for its own.
             self._marks.publish(self._mark(last=False))
-            self._reactivate(self._say_resumed)
+            self._reactivate(self._report_resumed)
         else:
-            self._say_resumed()
+            self._report_resumed()
 
-    def _say_resumed(self) -> None:
+    def _report_resumed(self) -> None:
         if self._channel is not None:
-            self._channel.say(HandoffReport.RESUMED, self._entities.sequence)
+            self._channel.report(HandoffReport.RESUMED, self._entities.sequence)
 
     def _reactivate(self, announce: Callable[[], None]) -> None:
         self._entities.become_active(self._timers_due, self._silent_since, announce)

@@ -117,11 +117,11 @@ class SnapshotRestore:
         entities.cover(mark.inputs)
         entities.inherit(mark.inputs)
         try:
-            entities.become_active(mark.timers_due, time.monotonic(), self._say)
+            entities.become_active(mark.timers_due, time.monotonic(), self._announce)
         finally:
             self._done()
 
-    def _say(self) -> None:
+    def _announce(self) -> None:
         head = self._snapshot.head
         self._entities.node.get_logger().info(
             f"continues from the snapshot of {head.process}#{head.instance}, cycle {head.sequence}"

@@ -27,9 +27,9 @@ from rosrm_msgs.msg import StateMark
 #: Share of a node's time for saving its state; `keep_every` may require a larger one.
 _SHARE: Final = 0.02
 #: Seconds for the last snapshot at the end, first for its lock, then for its writing.
-_LAST_WORDS: Final = 5.0
+_CLOSE_PATIENCE: Final = 5.0
 #: Seconds between two log lines about the same fault.
-_TOLD_EVERY: Final = 60.0
+_LOGGED_EVERY: Final = 60.0
 
 
 class SnapshotSaver:
@@ -92,7 +92,7 @@ class SnapshotSaver:
         except StateError as error:
             self._next = now + self._every
             self._entities.node.get_logger().error(
-                f"no snapshot was written: {error}", throttle_duration_sec=_TOLD_EVERY
+                f"no snapshot was written: {error}", throttle_duration_sec=_LOGGED_EVERY
             )
             return
         self._kept = self._entities.sequence
@@ -141,7 +141,7 @@ class SnapshotSaver:
         self._closed = True
         atexit.unregister(self.close)
         # Another thread of the executor may be stuck in a callback: waiting for it has a limit.
-        if self._entities.turn.acquire(timeout=_LAST_WORDS):
+        if self._entities.turn.acquire(timeout=_CLOSE_PATIENCE):
             try:
                 if self._may_keep():
                     self._keep(time.monotonic())
@@ -178,7 +178,7 @@ class _Writer:
         with self._changed:
             self._ending = True
             self._changed.notify()
-        self._thread.join(_LAST_WORDS)
+        self._thread.join(_CLOSE_PATIENCE)
 
     def _work(self) -> None:
         while True:

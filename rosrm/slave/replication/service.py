@@ -37,7 +37,7 @@ _PART_TIMEOUT: Final = 1.0
 #: Seconds after which a transfer to a host that refused a snapshot is retried.
 _AGAIN: Final = 3.0
 #: Codes of failures of the network alone.
-_LOST_WORDS: Final = frozenset({"timeout", "order"})
+_TRANSIENT: Final = frozenset({"timeout", "order"})
 
 
 #: Answer for a part that could not be written because of an unexpected error.
@@ -271,7 +271,7 @@ class ReplicationService:
         if refusal.code == "newer":  # the acknowledgement of the last part may be lost
             shipment.sent[host] = head.age
             return
-        if refusal.code in _LOST_WORDS:
+        if refusal.code in _TRANSIENT:
             shipment.due[host] = now
         else:
             shipment.due[host] = now + max(_AGAIN, shipment.every)
