@@ -25,7 +25,7 @@ from benchmarks.handoff_nodes import QOS
 from rosrm.errors import Refused
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
-from rosrm.ros.client import MasterClient
+from rosrm.ros.master_connection import MasterClient
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 #: Hz, of the counters.

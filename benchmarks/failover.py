@@ -37,7 +37,6 @@ from benchmarks.handoff import Observer, Output
 from benchmarks.handoff_nodes import QOS
 from benchmarks.machine import isolated_transports, parser, print_report, quantiles, say
 from benchmarks.stopping import run
-from rosrm import snapshots
 from rosrm.config.settings import ClusterConfig, ControlSettings, HostConfig, LivenessSettings
 from rosrm.model.values import (
     HostLossPolicy,
@@ -47,6 +46,7 @@ from rosrm.model.values import (
     StopPolicy,
 )
 from rosrm.ros.names import token
+from rosrm.snapshots import reader
 from rosrm.testing.local_cluster import LocalCluster
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -238,7 +238,7 @@ def _wait_until_calm(cluster: LocalCluster) -> None:
 def _copies(cluster: LocalCluster, own: str, number: int) -> dict[str, int]:
     """Return the other hosts with a replica of an instance's state on disk, and its cycle."""
     heads = {
-        name: snapshots.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
+        name: reader.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
         for name in _HOSTS
         if name != own
     }

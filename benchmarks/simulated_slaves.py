@@ -131,7 +131,7 @@ class SimulatedSlave:
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], now: float
     ) -> None:
         """Do a slave's work of one period of `resource_info`."""
-        self.endpoint.go_on(now)
+        self.endpoint.advance(now)
         accepting = under_limits(usage, limit, _PRESENT, 0)
         self.endpoint.publish_reading(
             usage, limit, _PRESENT, 0, accepting=accepting, processes=self._state.live()

@@ -14,7 +14,7 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.wording import no_such
 
 if TYPE_CHECKING:
-    from rosrm.ros.client import MasterClient
+    from rosrm.ros.master_connection import MasterClient
     from rosrm.ros.participant import Participant
 
 Row = TypeVar("Row")
@@ -58,7 +58,8 @@ def connect(
         RosrmError: ROS 2 cannot be imported.
     """
     try:
-        from rosrm.ros.client import MasterClient  # noqa: PLC0415 - the first import of ROS
+        # The first import of ROS.
+        from rosrm.ros.master_connection import MasterClient  # noqa: PLC0415
     except ImportError as error:
         if (error.name or "").split(".")[0] == "rosrm":
             raise

@@ -18,7 +18,7 @@ from rosrm.wording import duration, listed, no_such, standing, standing_for
 
 if TYPE_CHECKING:
     from rosrm.model.rows import HostRow, Listing, LogPart, ProcessRow
-    from rosrm.ros.client import MasterClient
+    from rosrm.ros.master_connection import MasterClient
 
 _PART: Final = 256 * 1024
 #: Seconds between two polls of logs without new output.

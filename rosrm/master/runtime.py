@@ -49,9 +49,9 @@ from rosrm.master.recorder import Recorder
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
-from rosrm.ros.client import find_master
 from rosrm.ros.master.endpoint import MasterEndpoint
 from rosrm.ros.master.services import MasterIdentity
+from rosrm.ros.master_connection import find_master
 from rosrm.ros.participant import Participant
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one

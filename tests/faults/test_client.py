@@ -8,8 +8,8 @@ import threading
 import pytest
 
 from rosrm.errors import Refused
-from rosrm.ros.client import MasterClient, is_unsure
 from rosrm.ros.control import accepted, refused
+from rosrm.ros.master_connection import MasterClient, is_unsure
 from tests.ros.clusters import host, service
 from tests.waiting import PATIENCE
 

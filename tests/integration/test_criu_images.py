@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.core.supervisor.events import StopOrdered
 from rosrm.errors import CriuError
 from rosrm.model.values import RestartPolicy
+from rosrm.supervisor.client_values import key_of
 from rosrm_criu.engine import dump, image, process_tree, restore, restore_result
 from rosrm_criu.engine.image import MappedFile
 from tests.criu_kit import TIMEOUT, eventually
@@ -452,7 +454,7 @@ def test_a_supervisor_manages_a_restored_process(theatre, counter, host):
     """The supervisor starts a shim like any process: it stops it, and sees its end."""
     client, running = restored_below(host, theatre, theatre.dump(counter))
     assert process_tree.root_of(running.pid) != running.pid
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     ended = host.ended(client, "actor", number=2)
     assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
 
@@ -466,7 +468,7 @@ def test_the_next_supervisor_adopts_it(theatre, counter, host):
     [after] = client.instances
     seen = log.read_text()
     eventually(lambda: len(log.read_text()) > len(seen), "more numbers")
-    client.stop(after.instance)
+    client.send(StopOrdered(key_of(after.instance)))
     host.ended(client, "actor", number=2)
     assert (after.state, after.pid) == (before.state, before.pid)
     assert not process_tree.is_alive(before.pid)
@@ -480,7 +482,7 @@ def test_the_supervisor_kills_a_process_that_does_not_stop(theatre, host):
     actor.counts()
     client, running = restored_below(host, theatre, theatre.dump(actor))
     namespace = pid_namespace(process_tree.root_of(running.pid))
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     ended = host.ended(client, "actor", number=2)
     assert ended.exit_signal == signal.SIGKILL
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
@@ -497,7 +499,7 @@ def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host)
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
     eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     host.ended(client, "actor", number=2)
 
 

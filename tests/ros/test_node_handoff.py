@@ -16,7 +16,7 @@ from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
 
 from rosrm.node import Migratable
-from rosrm.node.handoff import source
+from rosrm.node.handoff import state_parts
 from rosrm_msgs.msg import HandoffReport, StateConfig
 from tests.ros.nodes import (
     ALIAS,
@@ -551,7 +551,7 @@ def test_a_restore_function_that_raises(stage, pair):
 
 def test_a_state_that_is_too_large(stage, pair, monkeypatch):
     """The source refuses to send the state."""
-    monkeypatch.setattr(source, "LARGEST_PART", 4)
+    monkeypatch.setattr(state_parts, "LARGEST_PART", 4)
     fails(stage, pair, "12 bytes, more than the 4 that may travel", of=1)
 
 

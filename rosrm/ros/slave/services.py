@@ -76,9 +76,6 @@ class SlaveServices:
     """The services of one slave.
 
     Args:
-        participant: offers the services.
-        duties: execute the requests.
-        host: name of the host.
         max_age: seconds after which an order is stale.
         epoch: newest known epoch of the master; older orders are refused.
     """

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.core.supervisor.events import AmendOrdered
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor import instance_record, procfs
 from rosrm.supervisor.client import SupervisorClient, log_path
-from rosrm.supervisor.client_values import Amended, LaunchOrder
+from rosrm.supervisor.client_values import Amended, LaunchOrder, key_of, restart_rule
+from rosrm.supervisor.messages import Amend
 from tests.waiting import PATIENCE, command_of, wait_gone
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
@@ -91,7 +93,8 @@ class Host:
     def amend(self, client, name: str, restart: RestartPolicy) -> None:
         """Change the restart policy as the slave does; wait for the supervisor's record."""
         instance, deadline = InstanceId(name, 1), time.monotonic() + PATIENCE
-        client.amend(instance, restart, {"ROSRM_SHADOW": None})
+        order = AmendOrdered(key_of(instance), restart_rule(restart))
+        client.send(Amend(order, {"ROSRM_SHADOW": None}))
         amended = Amended(instance, restart)
         while amended not in client.receive(max(0.0, deadline - time.monotonic())):
             assert time.monotonic() < deadline, f"{amended} was not reported within {PATIENCE} s"

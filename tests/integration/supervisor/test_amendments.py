@@ -6,7 +6,10 @@ import os
 
 import pytest
 
+from rosrm.core.supervisor.events import RestartOrdered, StopOrdered
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
+from rosrm.supervisor.client_values import key_of
+from rosrm.supervisor.messages import Remember
 from tests.waiting import wait_until
 
 from .conftest import kill
@@ -97,7 +100,7 @@ def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
     host.running(client, "copy")
     wait_until(lambda: host.log("copy").read_text(), "it has spoken")
     host.amend(client, "copy", NEVER)
-    client.restart(InstanceId("copy", 1))
+    client.send(RestartOrdered(("copy", 1)))
     host.wait(client, "copy", InstanceState.STARTING)
     said = "shadow: 1\nshadow:\n"
     wait_until(lambda: host.log("copy").read_text() == said, "both runs have spoken")
@@ -111,11 +114,11 @@ def test_memos_outlive_slave_and_supervisor(host, client):
     host.running(client, "other")
     client = host.reconnect(client)
     assert client.memos == {kept: "a"}
-    client.remember(kept, "b")
-    client.remember(other, "c")
-    client.stop(kept)
+    client.send(Remember(key_of(kept), "b"))
+    client.send(Remember(key_of(other), "c"))
+    client.send(StopOrdered(key_of(kept)))
     host.ended(client, "kept")  # by then the supervisor has read the orders
-    client.remember(kept, "too late")
+    client.send(Remember(key_of(kept), "too late"))
     host.amend(client, "other", NEVER)
     client = host.replace_supervisor(client)
     assert client.memos == {other: "c"}

@@ -13,7 +13,10 @@ from pathlib import Path
 import pytest
 
 import rosrm
+from rosrm.core.supervisor.events import ContactReported
 from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
+from rosrm.supervisor.client_values import key_of
+from rosrm.supervisor.messages import Remember
 from tests.waiting import PATIENCE, holds_for, wait_gone, wait_until
 
 from .conftest import kill
@@ -26,6 +29,7 @@ ALWAYS = RestartPolicy("always", delay=0.05)
 SLAVE = """
     import os, sys, time
     from pathlib import Path
+    from rosrm.core.supervisor.events import ContactReported
     from rosrm.model.values import Fence, InstanceId
     from rosrm.supervisor.client_values import LaunchOrder
     from rosrm.supervisor.client import SupervisorClient
@@ -37,7 +41,7 @@ SLAVE = """
     ])
     pids = {}
     while True:
-        client.heard(time.monotonic(), 0.0)
+        client.send(ContactReported(time.monotonic(), 0.0))
         for status in client.receive(0.1):
             if status.pid and status.instance.process not in pids:
                 pids[status.instance.process] = status.pid
@@ -92,7 +96,7 @@ def test_an_alive_fence_is_renewed_by_the_running_slave_alone(host, client):
     until, told = time.monotonic() + 5.0, []
     while time.monotonic() < until:
         alive = time.monotonic()
-        client.heard(0.0, alive)
+        client.send(ContactReported(0.0, alive))
         told += client.receive(0.1)
     assert {status.instance.process for status in told if status.state.ended} == {"two"}
     status = host.ended(client, "one")
@@ -124,9 +128,9 @@ def test_a_killed_supervisor_puts_no_fence_off(host, client):
 def test_the_next_supervisor_knows_the_last_contact(host, client):
     """The next supervisor counts from the last renewal, not from the start of the instance."""
     heard = time.monotonic()
-    pid = host.sleeper(client, "one", fence=Fence(15.0, 0.0), heard=heard - 14.0)
-    client.heard(time.monotonic(), 0.0)
-    client.remember(ONE, "after the word that counts")
+    pid = host.sleeper(client, "one", fence=Fence(15.0, 0.0), last_contact=heard - 14.0)
+    client.send(ContactReported(time.monotonic(), 0.0))
+    client.send(Remember(key_of(ONE), "after the word that counts"))
     client.start([host.order("other", "true")])
     host.ended(client, "other")  # by then the supervisor has read all orders
     wait_until(lambda: time.monotonic() > heard + 1.5, "its start lies back so far")
@@ -200,16 +204,20 @@ def test_a_record_of_an_earlier_version_is_taken_over(host, client):
 def test_a_resumed_supervisor_reads_renewals_before_it_fences(host, client):
     """A resumed supervisor reads its client's renewals before it applies an expired fence."""
     pid = host.sleeper(client, "one", fence=Fence(1.0, 0.0, alive=True))
+
+    def renews() -> bool:
+        client.send(ContactReported(0.0, time.monotonic()))
+        return True
+
     os.kill(client.pid, signal.SIGSTOP)
     try:
-        holds_for(2.5, lambda: client.heard(0.0, time.monotonic()) is None, "more than its fence")
+        holds_for(2.5, renews, "more than its fence")
     finally:
-        client.heard(0.0, time.monotonic())
+        renews()
         os.kill(client.pid, signal.SIGCONT)
 
     def goes_on() -> bool:
-        client.heard(0.0, time.monotonic())
-        return not any(status.state.ended for status in client.receive(0.05))
+        return renews() and not any(status.state.ended for status in client.receive(0.05))
 
     holds_for(0.7, goes_on, "not fenced")
     assert alive(pid)

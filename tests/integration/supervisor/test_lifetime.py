@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 
 import rosrm
+from rosrm.core.supervisor.events import ShutdownOrdered, StatusStored, StopOrdered
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 from rosrm.supervisor import instance_record, messages, procfs
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
+from rosrm.supervisor.messages import Forget
 from tests.waiting import command_of, wait_gone, wait_until
 
 from .conftest import Host, kill
@@ -104,7 +106,7 @@ def test_final_statuses_are_kept_until_forgotten(host, client):
     final = host.run(client, host.order("job", "sh", "-c", "exit 5"))
     client = host.reconnect(client)
     assert client.instances == (final,)
-    client.forget([InstanceId("job", 1)])
+    client.send(Forget((StatusStored(("job", 1)),)))
     client = host.reconnect(client)
     assert client.instances == ()
 
@@ -117,7 +119,7 @@ def test_a_killed_supervisor_is_taken_over(host, client):
     client = host.replace_supervisor(client)
     (status,) = client.instances
     assert (status.state, status.pid) == (InstanceState.RUNNING, before.pid)
-    client.stop(InstanceId("kept", 1))
+    client.send(StopOrdered(("kept", 1)))
     assert host.ended(client, "kept").state is InstanceState.EXITED
     assert host.alive() == []
     assert host.log("kept").read_text() == "ran\n"
@@ -312,7 +314,7 @@ def test_shutdown_ends_everything_and_leaves_nothing(host, client):
     """After the shutdown no process, no socket and no supervisor is left."""
     client.start([host.order("a", "sleep", "1000"), host.order("b", "sleep", "1000")])
     host.running(client, "b")
-    client.shutdown()
+    client.send(ShutdownOrdered())
     with pytest.raises(SupervisorEnded):
         list(iter(lambda: client.receive(10), []))
     wait_gone(client.pid)
@@ -349,7 +351,7 @@ def test_a_supervisor_without_client_ends_with_its_last_process(host):
 def test_a_lost_supervisor_is_reported(host, client):
     """A waiting slave is notified at once of the end of its supervisor."""
     os.kill(client.pid, signal.SIGKILL)
-    with pytest.raises(SupervisorError, match="is gone; its processes go on"):
+    with pytest.raises(SupervisorError, match="is gone; its processes keep running"):
         client.receive(10)
 
 

@@ -127,9 +127,9 @@ def test_delayed_beats_count_with_their_true_age() -> None:
     """After a stop of 30 s the beats of the first second count as 30 s old."""
     clock = BeatClock()
     for tenth in range(10):
-        assert clock.said_at(tenth / 10, 500.0 + tenth / 10) == pytest.approx(500.0 + tenth / 10)
-    assert clock.said_at(1.0, 530.0) == pytest.approx(501.0, abs=0.05)
-    assert clock.said_at(31.0, 531.0) == pytest.approx(531.0, abs=0.05)
+        assert clock.sent_at(tenth / 10, 500.0 + tenth / 10) == pytest.approx(500.0 + tenth / 10)
+    assert clock.sent_at(1.0, 530.0) == pytest.approx(501.0, abs=0.05)
+    assert clock.sent_at(31.0, 531.0) == pytest.approx(531.0, abs=0.05)
 
 
 @given(
@@ -145,7 +145,7 @@ def test_the_age_of_a_beat_errs_by_the_least_delay_at_most(ahead, drift, beats) 
         arrived = max(arrived, said + delay)  # beats arrive in order
         quickest = min(quickest, arrived - said)
         beat = (said + ahead) * (1 + drift)
-        taken = clock.said_at(beat, arrived)
+        taken = clock.sent_at(beat, arrived)
         assert taken <= arrived + 1e-6
         assert taken - said <= quickest + 2e-3 * (arrived - 1000.0) + 1e-6
 
@@ -154,13 +154,13 @@ def test_clock_drift_makes_no_beat_old() -> None:
     """After an hour of beats from a clock that is 100 ppm slow, the newest counts as new."""
     clock = BeatClock()
     for second in range(0, 3600, 5):
-        age = second - clock.said_at(second * (1 - 1e-4), float(second))
+        age = second - clock.sent_at(second * (1 - 1e-4), float(second))
         assert age < 0.01
 
 
 def test_a_new_session_takes_another_clock() -> None:
     """After a sleep of the master's host its beats would otherwise count as an hour old forever."""
     clock = BeatClock()
-    clock.said_at(10.0, 100.0)
+    clock.sent_at(10.0, 100.0)
     clock.restart()
-    assert clock.said_at(11.0, 3700.0) == 3700.0
+    assert clock.sent_at(11.0, 3700.0) == 3700.0

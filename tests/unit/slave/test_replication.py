@@ -13,13 +13,14 @@ from collections.abc import Callable
 
 import pytest
 
-from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.ros.slave.replication import NotStored
 from rosrm.slave.replication import fetch
 from rosrm.slave.replication.service import ReplicationService
-from rosrm.snapshots import Block, SlotWriter, TransferPart
+from rosrm.snapshots import reader
+from rosrm.snapshots.format import Block, TransferPart
+from rosrm.snapshots.writer import SlotWriter
 
 P7 = InstanceId("p", 7)
 PATIENCE = 20.0
@@ -115,7 +116,7 @@ class Net:
         return self.root / host / "p"
 
     def age(self, host: str) -> tuple[int, int] | None:
-        head = snapshots.newest_head(self.directory(host))
+        head = reader.newest_head(self.directory(host))
         return None if head is None else head.age
 
     def until(self, condition: Callable[[], object], what: str, step: float = 0.1) -> None:
@@ -166,9 +167,7 @@ def test_a_snapshot_is_sent_when_it_has_changed(net):
     net.replicate("b")
     net.write("a", 1, 600_000)
     net.until(lambda: net.age("b") == (7, 1), "the first state")
-    assert snapshots.newest_content(net.directory("b")) == snapshots.newest_content(
-        net.directory("a")
-    )
+    assert reader.newest_content(net.directory("b")) == reader.newest_content(net.directory("a"))
     given = len(net.wires["a"].given)
     assert given == 3
     net.pass_times(50)
@@ -255,7 +254,7 @@ def test_a_snapshot_damaged_in_transfer_is_refused(net):
     """No part of the damaged replica is stored or left behind."""
     taker = net.add("b")
     net.write("b", 1, number=6)
-    good = snapshots.newest_content(net.directory("b"))[1]
+    good = reader.newest_content(net.directory("b"))[1]
     answers = []
     part = TransferPart("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
     taker.take_part(part, answers.append)

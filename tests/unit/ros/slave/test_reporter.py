@@ -113,8 +113,8 @@ def test_the_newest_reading_can_be_published_early() -> None:
     slave.usage[0] += 0.5 * RESOLUTION
     slave.cycle()
 
-    slave.reporter.tell()
-    slave.reporter.tell()
+    slave.reporter.publish()
+    slave.reporter.publish()
 
     assert len(slave.sent) == 2
     decoded = decode(slave.sent)
