@@ -1,4 +1,4 @@
-# Everything goes through .venv, which `make setup` makes; every target below sees to it first.
+# Everything goes through .venv, which `make setup` makes; every target below runs that first.
 # Nothing needs to be activated.
 
 PYTHON ?= python3
@@ -17,7 +17,7 @@ unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH ROS_DISTRO RMW_I
 # By default DDS multicasts on every interface: what runs from here stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
-# Where `make setup` puts CRIU, if it can be had.
+# Where `make setup` puts CRIU, if it is available.
 export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
 
 .DEFAULT_GOAL := help
@@ -51,7 +51,7 @@ lint: setup ## ruff, the architecture's contracts, mypy
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 
-format: setup ## mend what ruff can mend
+format: setup ## correct what ruff can correct
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 

@@ -1,15 +1,14 @@
-"""Sixty equal processes submitted at once on three equal hosts: how evenly do they end up?"""
+"""Spread of sixty equal processes, submitted at once, over three equal hosts."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 
 from benchmarks.hosts import three_hosts
-from benchmarks.machine import print_report
+from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
 from rosrm.model.values import ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
@@ -34,9 +33,9 @@ def placed() -> dict[str, int]:
 
 def main() -> None:
     """Measure and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=3)
-    runs = parser.parse_args().runs
+    command_line = parser(__doc__)
+    command_line.add_argument("--runs", type=int, default=3, help="number of clusters")
+    runs = command_line.parse_args().runs
     outcomes = [placed() for _ in range(runs)]
     widest = max(outcomes, key=lambda one: max(one.values()) - min(one.values()))
     print_report(

@@ -1,8 +1,7 @@
-"""From the start of a command to its end, with its CPU: what a person at a terminal waits for."""
+"""Seconds and CPU time of a read-only command, from its start to its end."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import subprocess
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.hosts import three_hosts
-from benchmarks.machine import print_report
+from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
 from rosrm.testing.local_cluster import LocalCluster
 
@@ -39,9 +38,9 @@ def _cpu() -> float:
 
 def main() -> None:
     """Measure and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=10, help="Runs of each command; default: 10.")
-    arguments = parser.parse_args()
+    command_line = parser(__doc__)
+    command_line.add_argument("--runs", type=int, default=10, help="runs of each command")
+    arguments = command_line.parse_args()
     with (
         tempfile.TemporaryDirectory(prefix="rosrm-command-") as folder,
         LocalCluster(Path(folder), hosts=three_hosts()) as cluster,

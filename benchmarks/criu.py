@@ -1,12 +1,13 @@
-"""What an outside observer notices when a node moves with its whole memory, by CRIU.
+"""Outputs of a node that migrates with its whole memory, by CRIU, at an external observer.
 
-A lab of three hosts with addresses of their own: the master and the observer on one, and a counter
-that goes to and fro between the two others (`rosrm_examples.portable_counter`, 50 Hz), with a heap
-of 10, 100 and 500 MB (--heaps). Blackout: from the last count heard before a move to the first one
-after it. After each move the node reads its whole heap at least once. Beside it the same counter,
-of the first heap, started anew by `relaunch`, and one whose state is a number, by `handoff`.
+A lab of three hosts with addresses of their own: master and observer on one, and a counter that
+migrates to and fro between the two others (`rosrm_examples.portable_counter`, 50 Hz), with a heap
+of 10, 100 and 500 MB (--heaps). Blackout: from the last count received before a migration to the
+first one after it. After each migration the node reads its whole heap at least once. For comparison
+the same counter, with the first heap, migrates by `relaunch`, and one whose state is a number by
+`handoff`.
 
-Exit status: 1 where a move failed, a cycle was executed twice, or a heap has changed. Needs root,
+Exit status: 1 if a migration failed, a cycle was executed twice, or a heap has changed. Needs root,
 and a CRIU that works.
 """
 
@@ -25,10 +26,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.machine import percentile, print_report, say
+from benchmarks.machine import parser, print_report, quantiles, say
 from benchmarks.stopping import run
 from rosrm.errors import LabError
-from rosrm_criu.engine.probe import ability
+from rosrm_criu.engine.probe import criu_support
 from rosrm_lab import DATA, GIB, HostPlan, Lab, uniform
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
@@ -39,7 +40,7 @@ _DESK: Final = "desk"
 _DISK: Final = 4 * GIB
 #: Migrations by each of the other strategies.
 _BESIDE: Final = 10
-#: Seconds for a part to shut down, and for the desk.
+#: Seconds for a part to shut down, and for the client.
 _END: Final = 30.0
 
 #: The parts of a migration: executor and name of each one's own seconds.
@@ -78,11 +79,11 @@ class Outcome:
         return len({one for hop in self.hops for one in hop["checksums"]}) == 1
 
     def silences(self) -> list[float]:
-        """Return the seconds without a count, of each migration."""
+        """Return the seconds without a count, for each migration."""
         return [hop["silence"] for hop in self.hops if hop["end"] == "migrated"]
 
     def part(self, name: str) -> list[float]:
-        """Return the seconds of one part, of each migration."""
+        """Return the seconds of one part, for each migration."""
         return [
             sum(hop["parts"][executor][word] for executor, word in _PARTS[name])
             for hop in self.hops
@@ -101,14 +102,6 @@ class Outcome:
         }  # fmt: skip
 
 
-def quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
-    """Return median and 99th percentile; None where there is no value."""
-    return {
-        f"{name}_p{percent}_s": round(percentile(seconds, percent / 100), 3) if seconds else None
-        for percent in (50, 99)
-    }
-
-
 def shared(hops: int, heaps: Sequence[float]) -> list[int]:
     """Return the number of migrations of each heap: most for the first, which is reported most."""
     others = max(1, hops // (len(heaps) + 2))
@@ -120,7 +113,7 @@ def shared(hops: int, heaps: Sequence[float]) -> list[int]:
 
 @contextlib.contextmanager
 def parts(lab: Lab, folder: Path) -> Iterator[None]:
-    """Run the master on the desk, and a slave on each other host."""
+    """Run the master on the host of the client, and a slave on each other host."""
     settings: dict[str, dict[str, Any]] = {
         _DESK: {
             "name": "criu", "state": f"{DATA}/master",
@@ -159,7 +152,7 @@ def parts(lab: Lab, folder: Path) -> Iterator[None]:
 
 
 def play(lab: Lab, asked: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield each hop when the desk has made it; raises `LabError` where the desk fails."""
+    """Yield each migration after its end; raise `LabError` if the client fails."""
     command = [sys.executable, "-m", "benchmarks.criu_desk", *map(json.dumps, asked)]
     process = lab.popen(_DESK, command, cwd=str(_ROOT), stdout=subprocess.PIPE)
     assert process.stdout is not None
@@ -173,7 +166,7 @@ def play(lab: Lab, asked: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any
         process.stdout.close()
         code = process.wait(_END)
     if code:
-        raise LabError(f"the desk ended with {code}: what it said stands above")
+        raise LabError(f"the client ended with exit code {code}; its errors are above")
 
 
 def measure(hops: int, heaps: Sequence[float]) -> list[dict[str, Any]]:
@@ -195,7 +188,7 @@ def measure(hops: int, heaps: Sequence[float]) -> list[dict[str, Any]]:
         try:
             for hop in play(lab, asked):
                 made.append(hop)
-                say(_story(len(made), hop))
+                say(_summary(len(made), hop))
         except LabError:
             for log in sorted(folder.glob("*.log")):
                 say(f"{log.name}:\n{log.read_text(errors='replace')[-2000:]}")
@@ -203,7 +196,7 @@ def measure(hops: int, heaps: Sequence[float]) -> list[dict[str, Any]]:
     return made
 
 
-def _story(number: int, hop: Mapping[str, Any]) -> str:
+def _summary(number: int, hop: Mapping[str, Any]) -> str:
     how = hop["why"] or f"{hop['silence']:.3f} s of silence"
     return f"{number}: {hop['strategy']} of {hop['mb']:g} MB {hop['end']}: {how}"
 
@@ -218,7 +211,7 @@ def beside(hops: Sequence[Mapping[str, Any]], strategy: str) -> dict[str, Any]:
     return {
         "hops": len(own), "failures": sum(hop["end"] != "migrated" for hop in own),
         **quantiles("silence", silences),
-        "state_lost": sum(hop["began_anew"] for hop in own),
+        "state_lost": sum(hop["restarted"] for hop in own),
         "memory": "lost" if strategy == "relaunch" else "not in the state",
     }  # fmt: skip
 
@@ -242,16 +235,16 @@ def table(by_heap: Mapping[str, Mapping[str, Any]], others: Mapping[str, Any]) -
 def main() -> int:
     """Measure and print one JSON object; return the exit status."""
     os.environ.setdefault("ROSRM_CRIU_PREFIX", str(_ROOT / ".venv/criu"))
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--hops", type=int, default=50, help="moves in all")
-    parser.add_argument(
+    command_line = parser(__doc__)
+    command_line.add_argument("--hops", type=int, default=50, help="migrations in all")
+    command_line.add_argument(
         "--heaps", type=_heap, nargs="+", default=[10.0, 100.0, 500.0], metavar="MB",
-        help="the flat figures are of the first one",
+        help="MB of each heap; the figures outside of by_heap_mb are of the first",
     )  # fmt: skip
-    chosen = parser.parse_args()
-    able = ability()
+    chosen = command_line.parse_args()
+    able = criu_support()
     if not able.works:
-        say(f"no CRIU that works here: {able.reason}")
+        say(f"CRIU does not work here: {able.reason}")
         return 2
     hops = measure(max(1, chosen.hops), chosen.heaps)
     moved = [hop for hop in hops if hop["strategy"] == "criu"]

@@ -1,4 +1,4 @@
-"""Observer that migrates a counter to and fro, on the desk of the lab of `benchmarks.criu`.
+"""Observer that migrates a counter to and fro, in the lab of `benchmarks.criu`.
 
     python -m benchmarks.criu_desk '{"strategy": "criu", "mb": 10, "hops": 4}' ...
 
@@ -8,9 +8,9 @@ of the strategy. It prints one line of JSON for each hop: see `Hop`.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -18,16 +18,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from std_msgs.msg import Int64MultiArray
 
-from benchmarks.handoff_nodes import OUTPUT, QOS
+from benchmarks.handoff import Observer
+from benchmarks.handoff_nodes import QOS
 from rosrm.errors import Refused
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
-from rosrm.ros.client import MasterClient
+from rosrm.ros.master_connection import MasterClient
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 #: Hz, of the counters.
@@ -70,7 +68,7 @@ class Hop:
         repeated: counts that were received twice, or out of order.
         missed: counts that were not received.
         checksums: of its memory; more than one: it has changed.
-        began_anew: the successor counts from 1 again.
+        restarted: the successor counts from 1 again.
     """
 
     strategy: str
@@ -83,85 +81,74 @@ class Hop:
     repeated: int = 0
     missed: int = 0
     checksums: tuple[int, ...] = ()
-    began_anew: bool = False
+    restarted: bool = False
 
 
-class CountReceiver:
-    """Receiver of all counts, in a thread of its own."""
+class CountReceiver(Observer):
+    """Receiver of all counts; those of `handoff` come on another topic."""
 
     def __init__(self) -> None:
-        self.heard: list[ReceivedCount] = []
-        rclpy.init()
-        self._node = Node("criu_ear")
-        self._node.create_subscription(Int64MultiArray, "count", self._take, QOS)
-        self._node.create_subscription(Int64MultiArray, OUTPUT, self._take_handed, QOS)
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
-        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
-        self._thread.start()
+        self.received: list[ReceivedCount] = []
+        super().__init__(None)
+        self._node.create_subscription(Int64MultiArray, "count", self._take_count, QOS)
+
+    def _take_count(self, message: Int64MultiArray, info: Any) -> None:
+        self.received.append(ReceivedCount(info["received_timestamp"] / _NS, *message.data))
 
     def _take(self, message: Int64MultiArray, info: Any) -> None:
-        self.heard.append(ReceivedCount(info["received_timestamp"] / _NS, *message.data))
+        self.received.append(ReceivedCount(info["received_timestamp"] / _NS, message.data[1]))
 
-    def _take_handed(self, message: Int64MultiArray, info: Any) -> None:
-        self.heard.append(ReceivedCount(info["received_timestamp"] / _NS, message.data[1]))
-
-    def wait_for(self, counts: int, passes: int = 0) -> None:
+    def wait_for_counts(self, counts: int, passes: int = 0) -> None:
         """Wait for so many more counts, and for so many complete reads of the memory."""
-        begin, deadline = len(self.heard), time.monotonic() + _PATIENCE
+        begin, deadline = len(self.received), time.monotonic() + _PATIENCE
         while not self._has(begin, counts, passes):
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{counts} more counts were not heard in {_PATIENCE:g} s")
+                raise TimeoutError(f"{counts} more counts were not received within {_PATIENCE:g} s")
             time.sleep(0.01)
 
     def _has(self, begin: int, counts: int, passes: int) -> bool:
-        new = self.heard[begin:]
+        new = self.received[begin:]
         return len(new) >= counts and new[-1].passes - new[0].passes >= passes
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self._thread.join(5.0)
-        rclpy.try_shutdown()
 
 
 class MigrationDriver:
     """Driver of the migrations, one process after the other."""
 
-    def __init__(self, ear: CountReceiver, client: MasterClient) -> None:
-        self._ear, self._client = ear, client
+    def __init__(self, receiver: CountReceiver, client: MasterClient) -> None:
+        self._receiver, self._client = receiver, client
 
     def play(self, strategy: str, mb: float, hops: int, options: Mapping[str, Any]) -> None:
         """Start a counter, migrate it to and fro, and end it."""
         self._client.submit([_spec(strategy, mb, options)])
         self._wait("running")
         passes = 2 if strategy == "criu" else 0  # the second one began after the migration
-        self._ear.wait_for(int(RATE * _SETTLE), passes)
+        self._receiver.wait_for_counts(int(RATE * _SETTLE), passes)
         for _ in range(hops):
             hop = self._hop(strategy, mb, passes)
             print(json.dumps(asdict(hop)), flush=True)
         self._client.cancel([_NAME])
         self._wait("cancelled", "finished", "failed")
-        self._ear.heard.clear()
+        self._receiver.received.clear()
 
     def _hop(self, strategy: str, mb: float, passes: int) -> Hop:
         self._wait("running")
         before = self._client.list().last_sequence
-        del self._ear.heard[:-2]  # the last ones before the migration
+        del self._receiver.received[:-2]  # the last ones before the migration
         if refusal := self._ask():
             return Hop(strategy, mb, "refused", refusal)
         end = self._end_after(before)
-        self._ear.wait_for(int(RATE * _SETTLE), passes)
-        heard = list(self._ear.heard)
-        numbers = [one.number for one in heard]
+        self._receiver.wait_for_counts(int(RATE * _SETTLE), passes)
+        received = list(self._receiver.received)
+        numbers = [one.number for one in received]
         steps = [after - one for one, after in pairwise(numbers)]
         return Hop(
             strategy, mb, end.kind, "" if end.kind == "migrated" else end.message,
-            silence=max(after.at - one.at for one, after in pairwise(heard)),
+            silence=max(after.at - one.at for one, after in pairwise(received)),
             seconds=end.facts["seconds"], parts=end.facts.get("parts", {}),
             repeated=sum(step < 1 for step in steps),
             missed=max(numbers) - min(numbers) + 1 - len(set(numbers)),
-            checksums=tuple({one.checksum for one in heard if one.passes}),
-            began_anew=min(numbers) < numbers[0],
+            checksums=tuple({one.checksum for one in received if one.passes}),
+            restarted=min(numbers) < numbers[0],
         )  # fmt: skip
 
     def _ask(self) -> str:
@@ -188,7 +175,7 @@ class MigrationDriver:
                 if event.kind in ("migrated", "stayed"):
                     return event
             self._client.spin(0.02)
-        raise TimeoutError(f"the move did not end in {_PATIENCE:g} s")
+        raise TimeoutError(f"the migration did not end within {_PATIENCE:g} s")
 
     def _wait(self, *states: str) -> None:
         deadline = time.monotonic() + _PATIENCE
@@ -197,7 +184,7 @@ class MigrationDriver:
             if any(row.state in states for row in rows):
                 return
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{_NAME} was not {' or '.join(states)} in {_PATIENCE:g} s")
+                raise TimeoutError(f"{_NAME} was not {' or '.join(states)} within {_PATIENCE:g} s")
             self._client.spin(0.05)
 
 
@@ -215,15 +202,13 @@ def _spec(strategy: str, mb: float, options: Mapping[str, Any]) -> ProcessSpec:
 
 def main() -> None:
     """Carry out the arguments, one after the other."""
-    ear = CountReceiver()
-    try:
-        with MasterClient.connect(RosSettings(), name="criu desk", timeout=_PATIENCE) as client:
-            desk = MigrationDriver(ear, client)
-            for asked in map(json.loads, sys.argv[1:]):
-                options = asked.get("options", {})
-                desk.play(asked["strategy"], asked["mb"], asked["hops"], options)
-    finally:
-        ear.close()
+    with (
+        contextlib.closing(CountReceiver()) as receiver,
+        MasterClient.connect(RosSettings(), name="criu desk", timeout=_PATIENCE) as client,
+    ):
+        driver = MigrationDriver(receiver, client)
+        for asked in map(json.loads, sys.argv[1:]):
+            driver.play(asked["strategy"], asked["mb"], asked["hops"], asked.get("options", {}))
 
 
 if __name__ == "__main__":

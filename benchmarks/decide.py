@@ -4,26 +4,26 @@ Two figures, both through `rosrm.core.master.reducer.step` with the policy `weig
 master's runtime, without the transport and the journal:
 
 - `us_per_host`: one process is submitted right after fresh readings of all hosts, so that every
-  host is judged again: microseconds from SubmissionReceived to the commands, by host. The paper's
-  master took 84 us a slave for its whole cycle. `readings_us_per_host`: the cost of the readings
-  before, beside it.
+  host is evaluated again: microseconds from SubmissionReceived to the commands, per host. The
+  paper's master took 84 us per slave for its whole cycle. `readings_us_per_host`: the cost of these
+  readings.
 - `assignments_per_s`: many processes are submitted at once; from SubmissionReceived to the
   commands, with the queue, the record and the intent of each. `assignments_per_s` is for equal
-  processes, `mixed_assignments_per_s` for ten different demands by turns (a map of pieces, say),
-  where each assignment makes the scores of other demands stale.
+  processes, `mixed_assignments_per_s` for ten different demands by turns (such as the pieces of a
+  map), where each assignment makes the scores of the other demands stale.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
 import sys
 import time
 from collections.abc import Callable, Sequence
+from statistics import median
 
 import numpy as np
 
-from benchmarks.machine import median, print_report, say
+from benchmarks.machine import parser, print_report, say
 from benchmarks.stopping import run
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign
@@ -139,9 +139,9 @@ def mixed(number: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=7)
-    runs = parser.parse_args().runs
+    command_line = parser(__doc__)
+    command_line.add_argument("--runs", type=int, default=7, help="measurements of each figure")
+    runs = command_line.parse_args().runs
     per_host, read, rates, mixed_rates = {}, {}, {}, {}
     for hosts in _HOSTS:
         us, readings = decision(hosts, 20 * runs)

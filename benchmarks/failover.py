@@ -1,26 +1,25 @@
-"""How soon a lost host is noticed, and how soon its processes go on elsewhere.
+"""Time until a lost host is detected and its processes continue elsewhere, and false losses.
 
 Four hosts on one machine, in a network of their own. In each round one is switched off: its slave,
-its supervisor and its processes get SIGKILL at one moment, where all times begin. `detect`: until
-the master has it for lost. `standby`: until an outside observer hears the standby of a stateful
-process. `restart`: until it hears the instance that was started anew, from its kept state, of a
-process without a standby. Then a load on all cores, for minutes: how many hosts are taken for lost
-that were not?
+its supervisor and its processes get SIGKILL at one moment, from which all times count. `detect`:
+until the master declares the host lost. `standby`: until an external observer receives an output of
+the standby of a stateful process. `restart`: the same for a process without a standby, which is
+restarted from its snapshot. Then all cores are under full load for minutes (`--minutes`), and the
+hosts that are declared lost are counted; none has failed.
 
-A cycle speaks, and then publishes its state. `state_lost` counts published states from which a
-standby did not go on; there must be none. `standby_repeated` counts outputs that it said again: one
-where the power went between the output and its state, which nobody can know better, or else as
-many as states were lost. `standby_skipped` counts outputs that nobody heard: of the standby's first
-cycles, before the observer had found it. Of as many as `standbys_of_heard_states` the states were
-heard to the last; of the others it is only known what was published before an output.
-`restart_repeated` is the age of a kept state, in cycles.
+A cycle publishes its output first, and then its state. `state_lost` counts published states that a
+standby did not have; the goal is 0. `standby_repeated` counts outputs that it published again: one
+if the host failed between output and state, else as many as states were lost. `standby_skipped`
+counts outputs of the standby's first cycles that were published before the observer discovered it.
+`standbys_of_heard_states`: rounds in which the observer received the states up to the last one; in
+the others only the state before the last output is known. `restart_repeated_most` is the largest
+age of a restored snapshot, in cycles.
 
-Exit status: 1 where a state or a host was lost that should not have been.
+Exit status: 1 if a state was lost, or a host that had not failed.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import itertools
 import os
@@ -28,7 +27,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,9 +35,8 @@ from std_msgs.msg import Int64MultiArray
 
 from benchmarks.handoff import Observer, Output
 from benchmarks.handoff_nodes import QOS
-from benchmarks.machine import percentile, print_report, say
+from benchmarks.machine import isolated_transports, parser, print_report, quantiles, say
 from benchmarks.stopping import run
-from rosrm import snapshots
 from rosrm.config.settings import ClusterConfig, ControlSettings, HostConfig, LivenessSettings
 from rosrm.model.values import (
     HostLossPolicy,
@@ -48,8 +46,8 @@ from rosrm.model.values import (
     StopPolicy,
 )
 from rosrm.ros.names import token
+from rosrm.snapshots import reader
 from rosrm.testing.local_cluster import LocalCluster
-from rosrm.testing.loopback import enter_private_network
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HOSTS = ("h0", "h1", "h2", "h3")
@@ -64,16 +62,16 @@ _GUARDED, _KEPT = "guarded", "kept"
 
 
 @dataclass(frozen=True)
-class GoneOn:
+class Continuation:
     """The cycle from which a successor continued.
 
     Attributes:
-        said: last cycle of the predecessor with a received output.
+        received: last cycle of the predecessor with a received output.
         published: last cycle of the predecessor with a received state.
         first: cycle of the successor's first output.
     """
 
-    said: int
+    received: int
     published: int
     first: int
 
@@ -83,17 +81,17 @@ class GoneOn:
 
         Before a cycle's output, the state of the cycle before was published, received or not.
         """
-        return max(0, max(self.published, self.said - 1) + 1 - self.first)
+        return max(0, max(self.published, self.received - 1) + 1 - self.first)
 
     @property
     def repeated(self) -> int:
         """Return the number of repeated outputs."""
-        return max(0, self.said + 1 - self.first)
+        return max(0, self.received + 1 - self.first)
 
     @property
     def skipped(self) -> int:
         """Return the number of outputs that were not received, between the last and the first."""
-        return max(0, self.first - self.said - 1)
+        return max(0, self.first - self.received - 1)
 
 
 class Witness(Observer):
@@ -117,10 +115,10 @@ class Witness(Observer):
         number, sequence = message.data
         self.states[number] = max(sequence, self.states.get(number, 0))
 
-    def gone_on(self, former: int, after: Output) -> GoneOn:
+    def continuation_of(self, former: int, after: Output) -> Continuation:
         """Return the cycle from which a successor continued, by its first output."""
-        said = max(one.sequence for one in self.outputs if one.instance == former)
-        return GoneOn(said, self.states.get(former, 0), after.sequence)
+        received = max(one.sequence for one in self.outputs if one.instance == former)
+        return Continuation(received, self.states.get(former, 0), after.sequence)
 
 
 @dataclass
@@ -130,14 +128,14 @@ class Outcome:
     Attributes:
         detect: until the host was lost.
         standby, restart: until the successor's first output.
-        standby_gone_on, restart_gone_on: the cycles from which the successors continued.
+        standby_continuation, restart_continuation: the cycles from which the successors continued.
     """
 
     detect: list[float] = field(default_factory=list)
     standby: list[float] = field(default_factory=list)
     restart: list[float] = field(default_factory=list)
-    standby_gone_on: list[GoneOn] = field(default_factory=list)
-    restart_gone_on: list[GoneOn] = field(default_factory=list)
+    standby_continuation: list[Continuation] = field(default_factory=list)
+    restart_continuation: list[Continuation] = field(default_factory=list)
 
 
 def _process(name: str, rate: float, **fields: object) -> ProcessSpec:
@@ -204,14 +202,14 @@ def _round(cluster: LocalCluster, observer: Witness, name: str, outcome: Outcome
         if row.host != host:
             continue
         after = _wait_for_successor(observer, row.number, _of(cluster, one, row.number))
-        gone_on = observer.gone_on(row.number, after)
+        continuation = observer.continuation_of(row.number, after)
         seconds = after.received / _NS - fault
         if one == _GUARDED:
             outcome.standby.append(seconds)
-            outcome.standby_gone_on.append(gone_on)
+            outcome.standby_continuation.append(continuation)
         else:
             outcome.restart.append(seconds)
-            outcome.restart_gone_on.append(gone_on)
+            outcome.restart_continuation.append(continuation)
     outcome.detect.append(_lost_at(cluster, host, last_event) - fault)
     cluster.start_slave(next(one for one in _hosts() if one.host == host))
 
@@ -233,14 +231,14 @@ def _wait_until_calm(cluster: LocalCluster) -> None:
         for host, sequence in _copies(cluster, row.host, row.number).items()
     ):
         if time.monotonic() >= deadline:
-            raise TimeoutError(f"no other host kept a new state of {_KEPT} in {_PATIENCE:g} s")
+            raise TimeoutError(f"no other host got a new replica of {_KEPT} within {_PATIENCE:g} s")
         cluster.client.spin(0.1)
 
 
 def _copies(cluster: LocalCluster, own: str, number: int) -> dict[str, int]:
     """Return the other hosts with a replica of an instance's state on disk, and its cycle."""
     heads = {
-        name: snapshots.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
+        name: reader.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
         for name in _HOSTS
         if name != own
     }
@@ -265,7 +263,7 @@ def _wait_for_successor(observer: Observer, former: int, number: int) -> Output:
             if output.instance == number:
                 return output
         time.sleep(0.005)
-    raise TimeoutError(f"#{number}, which follows #{former}, was not heard in {_PATIENCE:g} s")
+    raise TimeoutError(f"#{number}, which follows #{former}, had no output within {_PATIENCE:g} s")
 
 
 def _lost_at(cluster: LocalCluster, host: str, after: int) -> float:
@@ -322,47 +320,45 @@ def _load() -> Iterator[None]:
 
 def main() -> int:
     """Measure and print one JSON object; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=40, help="hosts that are switched off")
-    parser.add_argument("--rate", type=float, default=50.0, help="Hz, of the nodes")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of load")
-    chosen = parser.parse_args()
-    alone = enter_private_network()
+    command_line = parser(__doc__)
+    command_line.add_argument(
+        "--rounds",
+        type=int,
+        default=40,
+        help="number of hosts that are switched off, one after the other",
+    )
+    command_line.add_argument(
+        "--rate", type=float, default=50.0, help="cycles a second of the nodes (Hz)"
+    )
+    command_line.add_argument("--minutes", type=float, default=10.0, help="minutes of full load")
+    chosen = command_line.parse_args()
+    transports = isolated_transports()
     outcome = measure(chosen.rounds, chosen.rate)
     losses = false_losses(chosen.minutes)
-    lost = sum(one.lost for one in outcome.standby_gone_on)
+    lost = sum(one.lost for one in outcome.standby_continuation)
     print_report(
         "failover",
         {
             "lease_s": _SHORT[0].lease, "rate_hz": chosen.rate,
-            **_quantiles("detect", outcome.detect), **_quantiles("standby", outcome.standby),
-            **_quantiles("restart", outcome.restart),
+            **quantiles("detect", outcome.detect), **quantiles("standby", outcome.standby),
+            **quantiles("restart", outcome.restart),
             "state_lost": lost,
             "standbys_of_heard_states": sum(
-                one.published >= one.said - 1 for one in outcome.standby_gone_on
+                one.published >= one.received - 1 for one in outcome.standby_continuation
             ),
-            "standby_repeated": sum(one.repeated for one in outcome.standby_gone_on),
-            "standby_skipped": sum(one.skipped for one in outcome.standby_gone_on),
+            "standby_repeated": sum(one.repeated for one in outcome.standby_continuation),
+            "standby_skipped": sum(one.skipped for one in outcome.standby_continuation),
             "restart_repeated_most": max(
-                (one.repeated for one in outcome.restart_gone_on), default=None
+                (one.repeated for one in outcome.restart_continuation), default=None
             ),
             "standbys": len(outcome.standby), "restarts": len(outcome.restart),
             "false_losses": sum(losses.values()), "false_losses_by_lease": losses,
             "load_minutes": chosen.minutes,
-            "transports": "UDPv4, in a network namespace" if alone else "default, LOCALHOST",
+            "transports": transports,
         },
         runs=chosen.rounds,
     )  # fmt: skip
     return 1 if lost or any(losses.values()) else 0
-
-
-def _quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
-    return {
-        f"{name}_p{percent}_s": round(percentile(list(seconds), percent / 100), 3)
-        if seconds
-        else None
-        for percent in (50, 99)
-    }
 
 
 if __name__ == "__main__":

@@ -1,16 +1,15 @@
-"""What an outside observer notices when a node moves, over many moves between two hosts.
+"""Outputs of a node during many migrations between two hosts, at an external observer.
 
-`--strategy handoff` (the default): a stateful node answers the inputs of a driver (or counts by a
-timer of its own: `--driven timer`) while it is moved to and fro. Lost, repeated and out of order
-are counted in its answers; the gap is from the source's last output to the destination's first,
-minus one period. `--strategy relaunch`: a stateless node speaks in each cycle. The gap is the same,
-negative where both were active for a moment; lost are the cycles in which no instance was active,
-repeated those in which both were.
+`--strategy handoff` (the default): a stateful node answers the inputs of a driver, or counts by a
+timer of its own (`--driven timer`), while it migrates to and fro. Lost, repeated and out of order
+are counted in its answers. The gap is the time from the source's last output to the destination's
+first, minus one period. `--strategy relaunch`: a stateless node publishes in each cycle. The gap is
+the same, and negative if both were active for a moment. Lost are the cycles in which no instance
+was active, repeated those in which both were.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import itertools
 import os
@@ -33,12 +32,11 @@ from std_msgs.msg import Int64MultiArray
 
 from benchmarks.handoff_nodes import OUTPUT, QOS
 from benchmarks.hosts import three_hosts
-from benchmarks.machine import percentile, print_report, say
+from benchmarks.machine import isolated_transports, parser, percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm.config.settings import ClusterConfig, MigrationSettings
 from rosrm.model.values import MigrationPolicy, ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
-from rosrm.testing.loopback import enter_private_network
 
 _ROOT = Path(__file__).resolve().parents[1]
 _NS = 1e9
@@ -85,7 +83,7 @@ class Outcome:
 class Observer:
     """Recorder of every output, in a participant and a thread of its own."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int | None) -> None:
         self.outputs: list[Output] = []
         self._context = rclpy.Context()
         rclpy.init(
@@ -103,10 +101,10 @@ class Observer:
 
     def wait_for(self, count: int, timeout: float = _PATIENCE) -> None:
         """Wait for so many more outputs."""
-        wanted, deadline = len(self.outputs) + count, time.monotonic() + timeout
-        while len(self.outputs) < wanted:
+        target, deadline = len(self.outputs) + count, time.monotonic() + timeout
+        while len(self.outputs) < target:
             if time.monotonic() >= deadline:
-                raise TimeoutError(f"{count} more outputs did not come in {timeout:g} s")
+                raise TimeoutError(f"{count} more outputs were not received within {timeout:g} s")
             time.sleep(0.01)
 
     def close(self) -> None:
@@ -160,7 +158,7 @@ def move(cluster: LocalCluster) -> str:
                     say(event.message)
                 return str(event.kind)
         cluster.client.spin(0.05)
-    raise TimeoutError(f"the move to {there} did not end in {_PATIENCE:g} s")
+    raise TimeoutError(f"the migration to {there} did not end within {_PATIENCE:g} s")
 
 
 def gaps_of_handoff(outputs: Sequence[Output], period: float) -> list[float]:
@@ -226,7 +224,7 @@ def measure(strategy: str, driven: str, rate: float, runs: int) -> Outcome:
             ends.append(move(cluster))
             observer.wait_for(max(3, int(rate * _SETTLE)))
             if (run + 1) % 10 == 0:
-                say(f"{run + 1}/{runs} moves at {rate:g} Hz")
+                say(f"{run + 1}/{runs} migrations at {rate:g} Hz")
         outputs = list(observer.outputs)
     if strategy == "relaunch":
         return outcome_of_relaunch(ends, outputs, period)
@@ -235,13 +233,23 @@ def measure(strategy: str, driven: str, rate: float, runs: int) -> Outcome:
 
 def main() -> None:
     """Measure and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rate", type=float, default=10.0, help="Hz")
-    parser.add_argument("--runs", type=int, default=100, help="moves")
-    parser.add_argument("--strategy", choices=["handoff", "relaunch"], default="handoff")
-    parser.add_argument("--driven", choices=["input", "timer"], default="input")
-    chosen = parser.parse_args()
-    alone = enter_private_network()
+    command_line = parser(__doc__)
+    command_line.add_argument("--rate", type=float, default=10.0, help="outputs a second (Hz)")
+    command_line.add_argument("--runs", type=int, default=100, help="number of migrations")
+    command_line.add_argument(
+        "--strategy",
+        choices=["handoff", "relaunch"],
+        default="handoff",
+        help="migration strategy",
+    )
+    command_line.add_argument(
+        "--driven",
+        choices=["input", "timer"],
+        default="input",
+        help="source of the outputs with --strategy handoff",
+    )
+    chosen = command_line.parse_args()
+    transports = isolated_transports()
     outcome = measure(chosen.strategy, chosen.driven, chosen.rate, chosen.runs)
     gaps = outcome.gaps
     print_report(
@@ -254,7 +262,7 @@ def main() -> None:
             "gap_p99_ms": round(percentile(gaps, 0.99) * 1e3, 3) if gaps else None,
             "gap_max_ms": round(max(gaps) * 1e3, 3) if gaps else None,
             "moved": outcome.ends.count("migrated"), "stayed": outcome.ends.count("stayed"),
-            "transports": "UDPv4, in a network namespace" if alone else "default, LOCALHOST",
+            "transports": transports,
         },
         runs=chosen.runs,
     )  # fmt: skip

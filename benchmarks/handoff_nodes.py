@@ -1,7 +1,7 @@
-"""The programs that `benchmarks.handoff` moves, and that which drives them.
+"""Nodes that `benchmarks.handoff` migrates, and the driver that publishes their inputs.
 
-Each output is [instance, sequence, input]: which instance spoke, how many outputs there were before
-and including this one, and the number of the input that it answers.
+Each output is [instance, sequence, input]: the publishing instance, the number of outputs up to
+this one, and the number of the input that it answers.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def drive(rate: float) -> None:
     deadline = time.monotonic() + _MATCH
     while not inputs.get_subscription_count():
         if time.monotonic() >= deadline:
-            raise TimeoutError(f"nobody listened to {INPUT} within {_MATCH:g} s")
+            raise TimeoutError(f"{INPUT} had no subscriber within {_MATCH:g} s")
         rclpy.spin_once(node, timeout_sec=0.05)
     begun, sent = time.monotonic(), 0
     while rclpy.ok():

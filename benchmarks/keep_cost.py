@@ -1,9 +1,9 @@
-"""What keeping its state costs a node, in each cycle: `python -m benchmarks.keep_cost`.
+"""Cost of snapshots for a node, per cycle.
 
-A node with a timer of 10 ms and a state of a given size that changes in every cycle, in a process
-of its own, with and without a directory for its state; interleaved, and the median of the rounds.
-`mean_us`, `p50_us`, `p99_us`: from the author's callback until the node is ready for the next one;
-`cpu_us`: processor time of the whole process, its executor and its writer included, a cycle.
+A node has a timer of 10 ms and a state of a given size, which changes in every cycle. It runs in a
+process of its own, with and without snapshots by turns; the median of the rounds counts. `mean_us`,
+`p50_us`, `p99_us`: from the author's callback until the node is ready for the next one. `cpu_us`:
+CPU time of the whole process per cycle, with its executor and the writer of snapshots.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 import rclpy
 from std_msgs.msg import UInt8MultiArray
 
-from benchmarks.machine import print_report, say
+from benchmarks.machine import parser, percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm.node import Node
 from rosrm.testing.loopback import enter_private_network
@@ -52,9 +52,10 @@ def node(size: int, cycles: int) -> None:
             return UInt8MultiArray(data=array("B", self.state.tobytes()))
 
     changing = Changing()
-    member: Any = changing._rosrm.member  # type: ignore[union-attr]  # noqa: SLF001
-    took: list[float] = []
-    inner = member._cycle  # noqa: SLF001
+    session = changing._rosrm  # noqa: SLF001
+    assert session is not None
+    entities, took = session.entities, list[float]()
+    inner = entities._cycle  # noqa: SLF001
 
     def timed(*arguments: Any) -> Any:
         begun = time.perf_counter()
@@ -62,7 +63,7 @@ def node(size: int, cycles: int) -> None:
         took.append(time.perf_counter() - begun)
         return result
 
-    member._cycle = timed  # noqa: SLF001
+    entities._cycle = timed  # type: ignore[assignment,method-assign]  # noqa: SLF001
     while changing.count < cycles // 10:
         rclpy.spin_once(changing)
     took.clear()
@@ -70,11 +71,10 @@ def node(size: int, cycles: int) -> None:
     while changing.count < cycles + cycles // 10:
         rclpy.spin_once(changing)
     cpu = time.process_time() - cpu
-    took.sort()
     figures = {
         "mean_us": statistics.fmean(took) * 1e6,
-        "p50_us": took[len(took) // 2] * 1e6,
-        "p99_us": took[len(took) * 99 // 100] * 1e6,
+        "p50_us": percentile(took, 0.5) * 1e6,
+        "p99_us": percentile(took, 0.99) * 1e6,
         "cpu_us": cpu / len(took) * 1e6,
     }
     print(json.dumps({name: round(value, 1) for name, value in figures.items()}), flush=True)
@@ -100,11 +100,13 @@ def measured(size: int, cycles: int, *, keep: bool) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--node", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--cycles", type=int, default=1000)
-    parser.add_argument("--rounds", type=int, default=3)
-    options = parser.parse_args()
+    command_line = parser(__doc__)
+    command_line.add_argument("--node", type=int, help=argparse.SUPPRESS)
+    command_line.add_argument("--cycles", type=int, default=1000, help="cycles of each node")
+    command_line.add_argument(
+        "--rounds", type=int, default=3, help="runs with and without snapshots"
+    )
+    options = command_line.parse_args()
     if options.node is not None:
         node(options.node, options.cycles)
         return

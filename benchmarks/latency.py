@@ -1,12 +1,11 @@
-"""From `submit` called to the process running, one process at a time, beside a bare spawn.
+"""Time from the call of `submit` to the running process, compared with a bare spawn.
 
-The process is `date`, which stamps the time itself as its first act; the bare spawn in the same run
-starts the same program with Python's subprocess.
+One process runs at a time: `date`, which prints the time as its first action. The bare spawn starts
+the same program by Python's subprocess, in the same run.
 """
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.hosts import three_hosts
-from benchmarks.machine import print_report
+from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
 from rosrm.errors import Refused
 from rosrm.model.values import Kind, ProcessSpec
@@ -72,10 +71,10 @@ def _stamp_of(cluster: LocalCluster, name: str) -> int:
 
 def main() -> None:
     """Measure and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=300)
-    parser.add_argument("--warm-up", type=int, default=20)
-    arguments = parser.parse_args()
+    command_line = parser(__doc__)
+    command_line.add_argument("--runs", type=int, default=300, help="processes that are measured")
+    command_line.add_argument("--warm-up", type=int, default=20, help="processes before them")
+    arguments = command_line.parse_args()
     with tempfile.TemporaryDirectory(prefix="rosrm-latency-") as folder:
         directory = Path(folder)
         with LocalCluster(directory, hosts=three_hosts()) as cluster:

@@ -1,17 +1,18 @@
-"""Conditions of a measurement: the machine, the versions, the load beside it, the runs."""
+"""Command line and report of a benchmark, with the machine, the versions, the load and the runs."""
 
 from __future__ import annotations
 
+import argparse
 import importlib.metadata
 import json
 import os
 import platform
-import statistics
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rosrm.testing.loopback import enter_private_network
 from rosrm.version import __version__
 
 #: Distributions whose versions may matter, where they are installed.
@@ -28,6 +29,15 @@ _DISTRIBUTIONS = (
     "backports.zstd",
     "cryptography",
 )
+
+
+class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Help with the lines of the description as they are, and the default of each option."""
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a benchmark's command line; `description` is its docstring."""
+    return argparse.ArgumentParser(description=description, formatter_class=_Help)
 
 
 def machine() -> dict[str, Any]:
@@ -74,15 +84,24 @@ def say(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
 
 
-def median(values: Iterable[float]) -> float:
-    """Return the median."""
-    return statistics.median(values)
-
-
 def percentile(values: Sequence[float], fraction: float) -> float:
     """Return the value below which a fraction of the sorted values lies (nearest rank)."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(fraction * len(ordered)))]
+
+
+def quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
+    """Return median and 99th percentile as `NAME_p50_s` and `NAME_p99_s`; None: no values."""
+    return {
+        f"{name}_p{percent}_s": round(percentile(seconds, percent / 100), 3) if seconds else None
+        for percent in (50, 99)
+    }
+
+
+def isolated_transports() -> str:
+    """Enter a network namespace if permitted; return the DDS transports used."""
+    alone = enter_private_network()
+    return "UDPv4, in a network namespace" if alone else "default, LOCALHOST"
 
 
 def _processor() -> str:

@@ -1,11 +1,11 @@
-"""A master with a thousand slaves at 10 Hz: what comes, what is missed, what it costs.
+"""Cost of a master with a thousand slaves at 10 Hz, and the readings that it misses.
 
 The master is the real one, started as by `rosrm master`. The slaves are simulated
 (`benchmarks/simulated_slaves.py`), many in each of a few processes; their messages come from a real
 slave's code. The master publishes its own figures on `master_load`, by its own clock:
 
 - `received_per_s`: slave-cycles that messages account for; `missed`: those without a message, by
-  the slaves' own counting. `offered_per_s`: cycles that the simulated slaves carried out.
+  the slaves' own counts. `offered_per_s`: cycles of the simulated slaves.
 - `us_per_message`: CPU of all threads of the master, by slave-cycle: reception, decoding, decision.
 - `oldest_reading_p99_s`: at each look of the master, the age of the oldest among the newest
   readings of all hosts.
@@ -32,7 +32,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.machine import percentile, print_report, say
+from benchmarks.machine import isolated_transports, parser, percentile, print_report, say
 from benchmarks.simulated_slaves import STEP
 from benchmarks.stopping import run
 from rosrm.errors import RosrmError
@@ -41,7 +41,6 @@ from rosrm.model.values import Kind, ProcessSpec
 from rosrm.ros import names, qos
 from rosrm.ros.participant import Participant
 from rosrm.testing.local_cluster import LocalCluster
-from rosrm.testing.loopback import enter_private_network
 from rosrm_msgs import msg
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -60,19 +59,19 @@ class Loads:
     """Receiver of the master's `master_load`.
 
     Attributes:
-        heard: the content of each message, oldest first.
+        received: the content of each message, oldest first.
     """
 
     def __init__(self, settings: RosSettings) -> None:
         self._participant = Participant(settings, "rosrm_scale")
-        self.heard: list[dict[str, Any]] = []
+        self.received: list[dict[str, Any]] = []
         topic = names.Names(settings.namespace)(names.MASTER_LOAD)
         self._participant.node.create_subscription(
             msg.Event, topic, self._participant.counted(self._take), qos.LOAD
         )
 
-    def _take(self, word: msg.Event) -> None:
-        self.heard.append({**json.loads(word.data), "elapsed": word.elapsed})
+    def _take(self, message: msg.Event) -> None:
+        self.received.append({**json.loads(message.data), "elapsed": message.elapsed})
 
     def wait(self, seconds: float) -> list[dict[str, Any]]:
         """Return the messages of so many seconds, from the next one on.
@@ -80,21 +79,21 @@ class Loads:
         Raises:
             TimeoutError: no further message came.
         """
-        self.heard.clear()
+        self.received.clear()
         deadline = time.monotonic() + seconds + _PATIENCE
-        while len(self.heard) < 2 or _span(self.heard) < seconds:
+        while len(self.received) < 2 or _span(self.received) < seconds:
             if time.monotonic() >= deadline:
-                raise TimeoutError(f"the master said nothing on master_load for {_PATIENCE:g} s")
+                raise TimeoutError(f"no message on master_load for {_PATIENCE:g} s")
             self._participant.spin(0.2)
-        return list(self.heard)
+        return list(self.received)
 
     def close(self) -> None:
         """Leave the ROS graph."""
         self._participant.close()
 
 
-def _span(words: Sequence[dict[str, Any]]) -> float:
-    return float(words[-1]["elapsed"] - words[0]["elapsed"])
+def _span(loads: Sequence[dict[str, Any]]) -> float:
+    return float(loads[-1]["elapsed"] - loads[0]["elapsed"])
 
 
 @dataclass
@@ -129,9 +128,9 @@ class Crowd:
                     start_new_session=True,  # a Ctrl-C is for the parent, which closes their input
                 )
             )  # fmt: skip
-        self.hear()
+        self.reports()
 
-    def hear(self) -> list[dict[str, Any]]:
+    def reports(self) -> list[dict[str, Any]]:
         """Return the next report of each process.
 
         Raises:
@@ -139,7 +138,7 @@ class Crowd:
         """
         return [_next_report(process) for process in self._processes]
 
-    def tell(self) -> None:
+    def toggle(self) -> None:
         """Start the count, or end it.
 
         Raises:
@@ -186,19 +185,19 @@ def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
     Raises:
         RosrmError: there was no reading.
     """
-    crowd.tell()
-    words = loads.wait(seconds)
-    crowd.tell()
-    sent = crowd.hear()
-    first, last, span = words[0], words[-1], _span(words)
+    crowd.toggle()
+    seen = loads.wait(seconds)
+    crowd.toggle()
+    sent = crowd.reports()
+    first, last, span = seen[0], seen[-1], _span(seen)
     cycles = last["cycles"] - first["cycles"]
     cpu = last["cpu_s"] - first["cpu_s"]
-    ages = [age for word in words[1:] for age in word["oldest_reading_s"]]
+    ages = [age for one in seen[1:] for age in one["oldest_reading_s"]]
     offered = sum(one["cycles"] for one in sent)
     if not cycles or not offered:
         raise RosrmError(
-            f"in {span:.1f} s the slaves carried out {offered} cycles, and the master heard of "
-            f"{cycles}: nothing can be said by cycle; a longer --seconds may help"
+            f"in {span:.1f} s the slaves executed {offered} cycles and the master received "
+            f"{cycles}; both must be above 0: increase --seconds"
         )
     return {
         "offered_per_s": sum(one["cycles"] / one["seconds"] for one in sent),
@@ -207,7 +206,7 @@ def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
         "master_cpu": cpu / span,
         "us_per_message": 1e6 * cpu / cycles,
         "oldest_reading_p99_s": percentile(ages, 0.99),
-        "hosts_heard": min(word["hosts"] for word in words),
+        "hosts_heard": min(one["hosts"] for one in seen),
         "messages_per_cycle": sum(one["messages"] for one in sent) / offered,
         "masters_lost": sum(one["lost"] for one in sent),
         "late_cycles": sum(one["late"] for one in sent),
@@ -218,7 +217,7 @@ def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
 
 def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
     """Return the delays from submission to the assignment at the slave, one job at a time."""
-    crowd.tell()
+    crowd.toggle()
     called = {}
     for number in range(_JOBS):
         name = f"job{number}"
@@ -226,11 +225,11 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
         cluster.client.submit([ProcessSpec(name, command=("true",), kind=Kind.JOB)])
         cluster.client.spin(_PAUSE)
     _wait_for_end(cluster, name)
-    crowd.tell()
-    taken = {name: at for one in crowd.hear() for name, at in one["taken"].items()}
+    crowd.toggle()
+    taken = {name: at for one in crowd.reports() for name, at in one["taken"].items()}
     took = [1e3 * (taken[name] - called[name]) for name in called if name in taken]
     if not took:
-        raise RosrmError(f"of {_JOBS} jobs none came to a simulated slave in {_END:g} s")
+        raise RosrmError(f"no simulated slave got one of {_JOBS} jobs within {_END:g} s")
     return {
         "request_process_p50_ms": percentile(took, 0.5),
         "request_process_p99_ms": percentile(took, 0.99),
@@ -278,32 +277,60 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
 
 def main() -> int:
     """Measure and print one JSON object; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--slaves", type=_positive(int), default=1000)
-    parser.add_argument("--hz", type=_positive(float), default=10.0)
-    parser.add_argument("--seconds", type=_positive(float), default=30.0)
-    parser.add_argument("--processes", type=_positive(int), default=2, help="that the slaves share")
-    parser.add_argument(
+    command_line = parser(__doc__)
+    command_line.add_argument(
+        "--slaves",
+        type=_positive(int),
+        default=1000,
+        help="number of simulated slaves",
+    )
+    command_line.add_argument(
+        "--hz",
+        type=_positive(float),
+        default=10.0,
+        help="cycles a second of each slave",
+    )
+    command_line.add_argument(
+        "--seconds",
+        type=_positive(float),
+        default=30.0,
+        help="seconds of the measurement",
+    )
+    command_line.add_argument(
+        "--processes",
+        type=_positive(int),
+        default=2,
+        help="number of processes that the slaves share",
+    )
+    command_line.add_argument(
         "--step", type=float, default=STEP,
-        help="standard deviation of a usage's change in a cycle; 0.1: all go out at once",
+        help="standard deviation of a usage's change per cycle; with 0.1 nearly all cycles send",
     )  # fmt: skip
-    parser.add_argument(
-        "--timeout", type=_positive(float), default=240.0, help="s, for all slaves to register"
+    command_line.add_argument(
+        "--timeout",
+        type=_positive(float),
+        default=240.0,
+        help="seconds for all slaves to register",
     )
-    parser.add_argument(
-        "--settle", type=_positive(float), default=_SETTLE, help="s, between that and the count"
+    command_line.add_argument(
+        "--settle",
+        type=_positive(float),
+        default=_SETTLE,
+        help="seconds from the registration to the measurement",
     )
-    arguments = parser.parse_args()
+    arguments = command_line.parse_args()
     if arguments.processes > arguments.slaves:
-        parser.error(f"{arguments.slaves} slaves cannot share {arguments.processes} processes")
-    alone = enter_private_network()
+        command_line.error(
+            f"{arguments.slaves} slaves cannot share {arguments.processes} processes"
+        )
+    transports = isolated_transports()
     with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
         figures = measure(arguments, Path(folder))
     print_report(
         "scale",
         {
             "slaves": arguments.slaves, "hz": arguments.hz, "step": arguments.step, **figures,
-            "transports": "UDPv4, in a network namespace" if alone else "default, LOCALHOST",
+            "transports": transports,
         },
         runs=1,
     )  # fmt: skip

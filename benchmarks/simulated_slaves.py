@@ -1,17 +1,16 @@
-"""Many slaves in one process: what they say is said by a real slave's own code.
+"""Many slaves in one process, with the code of a real slave except for probes and processes.
 
 Each simulated slave is a real `SlaveEndpoint` (handshake, registration, readings, requests for
-work, statuses) over a real slave's core. Simulated is what it stands on: its readings come from a
-random walk instead of probes, and what it is given to run is said to run, and to end, without a
-process.
+work, statuses) over a real slave's core. Its readings come from a random walk instead of probes,
+and each instance is reported as running and then as ended, without a process.
 
-All slaves of a process share one DDS participant, one node, and what is seldom used: the clients
-by which they shake hands, register and leave, the publishers of statuses and usages, and the reader
-of `master_beat`. Each has its own publisher of readings, its own service for orders and its own
-client of `request_process`: each answer reaches all readers, as it does in a fleet.
+All slaves of a process share one DDS participant, one node, and the entities that are seldom used:
+the clients for handshake, registration and leaving, the publishers of statuses and usages, and the
+reader of `master_beat`. Each has its own publisher of readings, its own service for orders and its
+own client of `request_process`, because each answer reaches all readers, as in a fleet.
 
-Spoken to by lines: it prints one JSON object when all are registered and accepted; a line on its
-standard input begins and the next one ends what is counted; the last line says what was sent.
+The process prints one JSON object when all are registered and accepted. A line on its standard
+input begins a measurement and the next one ends it; then it prints the counts as JSON.
 """
 
 from __future__ import annotations
@@ -132,7 +131,7 @@ class SimulatedSlave:
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], now: float
     ) -> None:
         """Do a slave's work of one period of `resource_info`."""
-        self.endpoint.go_on(now)
+        self.endpoint.advance(now)
         accepting = under_limits(usage, limit, _PRESENT, 0)
         self.endpoint.publish_reading(
             usage, limit, _PRESENT, 0, accepting=accepting, processes=self._state.live()

@@ -1,4 +1,4 @@
-"""How fast `rosrm simulate` is, and what a record costs the master.
+"""Speed of `rosrm simulate`, and the cost of a recording for the master.
 
 - `events_per_s`: events that the simulated master processes in a second of real time, for a
   thousand jobs on fifty hosts in ten minutes; `seconds` for all of it.
@@ -9,15 +9,15 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
-from benchmarks.machine import median, print_report, say
+from benchmarks.machine import parser, print_report, say
 from benchmarks.stopping import run
 from rosrm.core.master.events import ReadingsReceived
 from rosrm.core.master.settings import CoreSettings
@@ -98,9 +98,9 @@ def recorded() -> tuple[float, float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=3)
-    runs = parser.parse_args().runs
+    command_line = parser(__doc__)
+    command_line.add_argument("--runs", type=int, default=3, help="number of simulated workloads")
+    runs = command_line.parse_args().runs
     made = [simulated(seed) for seed in range(runs)]
     seconds, events = median(took for took, _ in made), median(float(count) for _, count in made)
     say(f"{events:.0f} events in {seconds:.1f} s of CPU, {events / seconds:.0f} a second")

@@ -1,20 +1,19 @@
-"""What a move costs the trajectory of live SLAM, at every scan of a drive, by what moves.
+"""Error of live SLAM's trajectory by a migration, at every scan of a drive, for two states.
 
-`full`: a successor that takes the whole state over has to have, after one scan more, exactly the
-state of the original; so it has it after all the others too. `pose`: a successor that takes over
-the pose and the newest scans alone maps the rest of the drive; its worst distance from the original
-is measured. Without ROS between them: the state travels as the messages that it is published as.
+`full`: a successor with the whole state must have, after one more scan, exactly the state of the
+original, and so after all later ones. `pose`: a successor with only the pose and the newest scans
+maps the rest of the drive, and its largest distance from the original counts. No ROS graph is used:
+the state moves as the serialized messages that the node would publish.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
-from benchmarks.machine import percentile, print_report, say
+from benchmarks.machine import parser, percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm_examples.drives import Drive, load_drive
 from rosrm_examples.errors import ExampleError
@@ -97,17 +96,19 @@ def pose_deviations(drive: Drive, every: int) -> list[float]:
 
 def main() -> int:
     """Measure and print the report; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--drive", default="street", help="name or path of the drive")
-    parser.add_argument("--every", type=int, default=1, help="pose: move at each n-th scan")
-    options = parser.parse_args()
+    command_line = parser(__doc__)
+    command_line.add_argument("--drive", default="street", help="name or path of the drive")
+    command_line.add_argument(
+        "--every", type=int, default=1, help="pose: migrate at every n-th scan"
+    )
+    options = command_line.parse_args()
     try:
         drive = load_drive(options.drive)
     except ExampleError as error:
         print(error, file=sys.stderr)
         return 2
     differing = full_differences(drive)
-    say(f"full state: {differing} of {len(drive.times) - 1} moves make a difference")
+    say(f"full state: {differing} of {len(drive.times) - 1} migrations make a difference")
     worst = pose_deviations(drive, options.every)
     print_report(
         "slam_cuts",

@@ -1,13 +1,12 @@
-"""What a slave costs that has nothing to do, beside a bare rclpy node.
+"""CPU and memory of an idle slave, compared with a bare rclpy node.
 
-A registered slave at 10 Hz with no process, its supervisor included, and in the same run a bare
-rclpy node that publishes the same message at 10 Hz from a timer. CPU is that of all threads over
-the measured time; memory is PSS, so that pages shared by several processes count once.
+A registered slave at 10 Hz without processes, with its supervisor, and in the same run a bare rclpy
+node that publishes the same message at 10 Hz from a timer. CPU time covers all threads over the
+measured time. Memory is PSS, so that pages shared by several processes count once.
 """
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.machine import print_report
+from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
 from rosrm.testing.local_cluster import LocalCluster
@@ -59,9 +58,9 @@ def supervisor_of(slave: psutil.Process, directory: Path) -> psutil.Process:
 
 def main() -> None:
     """Measure and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    seconds = parser.parse_args().seconds
+    command_line = parser(__doc__)
+    command_line.add_argument("--seconds", type=float, default=30.0, help="of the measurement")
+    seconds = command_line.parse_args().seconds
     with (
         tempfile.TemporaryDirectory(prefix="rosrm-slave-cost-") as folder,
         LocalCluster(Path(folder), hosts=[HostConfig(host="host0")]) as cluster,

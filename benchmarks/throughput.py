@@ -1,13 +1,12 @@
-"""Many short jobs at once, and how well slots are kept busy.
+"""Rate of many short jobs submitted at once, and how well the slots of the hosts are used.
 
-Two measurements on three hosts: 300 times `true` submitted at once (jobs a second, from `submit`
-called to the last one known as finished), and 150 times `sleep 0.1` with one slot a host (makespan
-over the ideal of 50 sleeps in a row).
+Two measurements on three hosts: 300 times `true` submitted at once (jobs a second, from the call of
+`submit` to the last recorded end), and 150 times `sleep 0.1` with one slot per host (makespan over
+the ideal of 50 sleeps in a row).
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 import tempfile
@@ -16,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.hosts import three_hosts
-from benchmarks.machine import print_report
+from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
 from rosrm.model.values import Kind, ProcessSpec
@@ -69,9 +68,9 @@ def _job(name: str, *command: str) -> ProcessSpec:
 
 def main() -> None:
     """Measure and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=5)
-    runs = parser.parse_args().runs
+    command_line = parser(__doc__)
+    command_line.add_argument("--runs", type=int, default=5, help="clusters for each measurement")
+    runs = command_line.parse_args().runs
     jobs = [_job(f"true{i}", "true") for i in range(_TRUE)]
     sleeps = [_job(f"sleep{i}", "sleep", str(_SLEEP_S)) for i in range(_SLEEPS)]
     ideal = _SLEEPS / 3 * _SLEEP_S

@@ -1,24 +1,24 @@
-"""How long a directory takes from one process to another: `python -m benchmarks.transfer`.
+"""Time to transfer a directory from one process to another.
 
-Files of which half is random and half is empty, as memory often is, over loopback: both ends, TLS,
-compression and checksums share the machine, so a network faster than `mb_per_s` gains nothing. For
-each size, p50 of the rounds: `offer_s` until the source can be fetched from, `fetch_s` from then on
-to the directory being in its place, both by processes that were started ahead; `cold_s` the whole
-with processes that are started for it; `wire_mb` what went over the wire. `peak_mib` is the largest
-memory of any of these processes.
+Half of each file is random and half is empty, like typical memory. Everything is on loopback: both
+ends, TLS, compression and checksums share the machine, so a network faster than `mb_per_s` gains
+nothing. Medians of the rounds for each size: `offer_s` until the source is ready, `fetch_s` from
+then until the directory is in its place, both with processes that were started in advance; `cold_s`
+for everything with processes that are started on demand; `wire_mb`: bytes on the network.
+`peak_mib` is the largest memory of any of these processes.
 """
 
 from __future__ import annotations
 
-import argparse
 import random
 import resource
 import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 
-from benchmarks.machine import median, print_report, say
+from benchmarks.machine import parser, print_report, say
 from benchmarks.stopping import run
 from rosrm_criu.transfer import Fetcher, Sender
 
@@ -82,10 +82,19 @@ def measured(megabytes: int, rounds: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES_MB), metavar="MB")
-    parser.add_argument("--rounds", type=int, default=5)
-    options = parser.parse_args()
+    command_line = parser(__doc__)
+    command_line.add_argument(
+        "--sizes",
+        type=int,
+        nargs="+",
+        default=list(SIZES_MB),
+        metavar="MB",
+        help="MB of each directory",
+    )
+    command_line.add_argument(
+        "--rounds", type=int, default=5, help="transfers of each size and kind"
+    )
+    options = command_line.parse_args()
     table = {}
     for megabytes in options.sizes:
         table[str(megabytes)] = measured(megabytes, options.rounds)

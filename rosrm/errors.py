@@ -1,22 +1,4 @@
-"""Every error that rosrm raises on purpose.
-
-RosrmError                  what a user reads: no traceback is shown for it
-├── ConfigError             a file or option that cannot be accepted: where, what, what is allowed
-├── PluginError             a plugin that does not import, raises, or answers nonsense
-├── Refused                 a request that was understood and turned down
-├── NoMaster                no master answered in time
-├── LaunchError             a process that cannot be started on this host
-├── JournalError            the durable record cannot be read or written
-│   └── JournalBlocked      not just now: it may pass by itself
-├── RecordError             the record of a master's run cannot be read
-├── SupervisorError         the supervisor cannot be started or reached
-├── TransferError           a directory cannot be moved to another host
-├── LabError                a virtual host or its network cannot be made, or is not there
-├── PortableError           a node that cannot leave the ROS graph, or join it again, and why
-└── CriuError               there is no CRIU that works here, or it could not dump or restore
-
-SkipPlugin                  not an error: a plugin says that it is absent here, and why
-"""
+"""Every error that rosrm raises on purpose."""
 
 from __future__ import annotations
 
@@ -28,7 +10,7 @@ _LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy"})
 
 
 class RosrmError(Exception):
-    """Something that a user can understand and mend; its text is the whole message."""
+    """An error for the user: its text is the whole message, and no traceback is shown."""
 
     exit_code = 1
 

@@ -24,7 +24,7 @@ _STANDING: Final = {
 def get_close_matches(
     word: str, possibilities: Iterable[str], n: int = 3, cutoff: float = 0.6
 ) -> list[str]:
-    """As `difflib.get_close_matches`, which is imported only when somebody made a mistake."""
+    """Return the names most similar to a misspelt one, as `difflib.get_close_matches`."""
     import difflib  # noqa: PLC0415 - the runtimes, whose memory is budgeted, seldom need it
 
     return difflib.get_close_matches(word, list(possibilities), n=n, cutoff=cutoff)
@@ -91,9 +91,14 @@ def one_line(reason: str) -> str:
     return reason.replace("\n", "; ")
 
 
+def words(name: str) -> str:
+    """Return the name of a state or kind without underscores."""
+    return name.replace("_", " ")
+
+
 def standing(state: str) -> str:
     """Return the state of a process as a sentence has it: "is in back-off", "has failed"."""
-    return _STANDING.get(state, f"is {state.replace('_', ' ')}")
+    return _STANDING.get(state, f"is {words(state)}")
 
 
 def standing_for(state: str, time: str) -> str:
@@ -112,6 +117,11 @@ def size(amount: float, *, binary: bool = False) -> str:
         amount, exponent = amount / factor, exponent + 1
     digits = 0 if exponent == 0 or abs(amount) >= 99.5 else 1
     return f"{amount:.{digits}f} {units[exponent]}"
+
+
+def percent(fraction: float) -> str:
+    """Return a fraction in whole percent without the sign; "?" if it is unknown."""
+    return f"{fraction * 100:.0f}" if math.isfinite(fraction) else "?"
 
 
 def amount(value: float, unit: str) -> str:

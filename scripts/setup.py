@@ -51,14 +51,14 @@ PROGRESS = re.compile(
 
 
 class SetupError(Exception):
-    """An obstacle, its place, and the way out."""
+    """An error for the user: what is wrong, where, and what to do about it."""
 
 
 def main() -> int:
     """Make or repair the environment, and print each step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--chosen", action="store_true", help="this Python was asked for: remake a .venv of another"
+        "--chosen", action="store_true", help="replace a .venv of another Python version"
     )
     parser.add_argument(
         "--tests", action="store_true", help="install what tests and benchmarks need, too"
@@ -72,7 +72,7 @@ def main() -> int:
             print(f"\nmake setup: {error}", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
-            print("\nmake setup: interrupted; run it again to go on", file=sys.stderr)
+            print("\nmake setup: interrupted; run it again to continue", file=sys.stderr)
             return 130
     return 0
 
@@ -110,7 +110,7 @@ def set_up(*, remake_other_version: bool, tests: bool) -> None:
             "ROS 2 Jazzy, rosrm, its plugins and examples",
             *pip("install", "--no-build-isolation", *editables(extras="ros")),
         )
-        steps.run("do they work together?", PYTHON, "-c", IMPORTS)
+        steps.run("a check that they work together", PYTHON, "-c", IMPORTS)
         stamp(wanted, "packages")
     if "tests" in missing:
         steps.run(
@@ -209,10 +209,10 @@ def venv_usable(*, remake_other_version: bool) -> bool:
     major, minor, prefix = (*answer.stdout.strip().split(" ", 2), "", "", "")[:3]
     where = read_stamp().get("where", prefix)  # its commands contain the folder where it was made
     if answer.returncode != 0 or not Path(prefix) == Path(where) == VENV:
-        print("      .venv was made elsewhere or is broken: it is made anew")
+        print("      .venv was made elsewhere or is broken: it is replaced")
         return False
     if remake_other_version and (major, minor) != tuple(map(str, sys.version_info[:2])):
-        print(f"      .venv has Python {major}.{minor}, asked for is {short_version()}: made anew")
+        print(f"      .venv has Python {major}.{minor}, and not {short_version()}: it is replaced")
         return False
     return True
 
@@ -240,7 +240,7 @@ def write_stamp(done: dict[str, str]) -> None:
 
 
 def check_machine() -> None:
-    """Raise `SetupError`, with the way out, on a machine on which a later step would fail."""
+    """Raise `SetupError`, with the remedy, on a machine on which a later step would fail."""
     if not OLDEST <= sys.version_info[:2] <= NEWEST:
         candidates = [f"python3.{m}" for m in range(NEWEST[1], OLDEST[1] - 1, -1)]
         found = next((name for name in candidates if shutil.which(name)), None)
@@ -365,7 +365,7 @@ def ended_with_us(process: subprocess.Popen[str]) -> Iterator[None]:
 
 
 class ProgressLine:
-    """The progress of a command: updated in place on a terminal, else printed now and then."""
+    """The progress of a command: updated in place on a terminal, else printed every 10 s."""
 
     def __init__(self, began: float) -> None:
         self.began = began

@@ -1,7 +1,7 @@
-"""CRIU for tests, and processes that are dumped and restored; none of them outlives its test.
+"""CRIU for tests, and processes that tests dump and restore; no process outlives its test.
 
-The CRIU is the one that rosrm itself finds: what `make setup` installed (tests/conftest.py), or
-what `ROSRM_CRIU` names. Where it does not work tests are skipped, with why.
+rosrm's own search finds CRIU: that of `make setup` (tests/conftest.py), or that of `ROSRM_CRIU`.
+Where CRIU does not work, tests are skipped with the reason.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +24,14 @@ from rosrm_criu.engine.binary import CriuBinary, find
 from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.probe import CriuSupport, probe
 from rosrm_criu.engine.restore_result import Outcome
+from tests.waiting import wait_until
 
-#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+#: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
 TIMEOUT = 60.0
+#: Wait for a state without an event: `eventually(condition, what)`.
+eventually = functools.partial(wait_until, timeout=TIMEOUT)
 
-#: What a host tells of itself and its CRIU (`rosrm_criu.engine.compatibility.FACTS`).
+#: Facts of a host and its CRIU (`rosrm_criu.engine.compatibility.FACTS`).
 HOST_FACTS = {
     "version": "4.2.1",
     "kernel": "6.18.44",
@@ -45,7 +47,7 @@ HOST_FACTS = {
 
 @functools.cache
 def _found() -> tuple[CriuBinary | None, str]:
-    """The CRIU that works here, or why there is none."""
+    """Return the CRIU that works here, or the reason why there is none."""
     try:
         criu = find()
     except CriuError as error:
@@ -56,7 +58,7 @@ def _found() -> tuple[CriuBinary | None, str]:
 
 @pytest.fixture
 def criu() -> CriuBinary:
-    """The CRIU that works here; the test is skipped where there is none."""
+    """Return the CRIU that works here; skip the test where there is none."""
     working, reason = _found()
     if working is None:
         pytest.skip(f"no CRIU that works here: {reason}")
@@ -65,18 +67,18 @@ def criu() -> CriuBinary:
 
 @pytest.fixture
 def theatre(criu, tmp_path):
-    """Starts, dumps and restores processes for one test."""
+    """Yield what starts, dumps and restores processes for one test."""
     made = Theatre(criu, tmp_path)
     yield made
     made.close()
 
 
 class Theatre:
-    """Starts processes as the supervisor does, dumps and restores them.
+    """Start of processes as by the supervisor, their dumps and restores.
 
     Args:
-        criu: that works.
-        folder: of the test.
+        criu: a CRIU that works.
+        folder: the folder of the test.
     """
 
     def __init__(self, criu: CriuBinary, folder: Path):
@@ -87,7 +89,7 @@ class Theatre:
         self._restored: list[int] = []
 
     def start(self, code: str, *arguments: str, **options: Any) -> Actor:
-        """A Python program without site-packages."""
+        """Start a Python program without site-packages."""
         return self.run([sys.executable, "-I", "-S", "-c", code, *arguments], **options)
 
     def run(
@@ -97,7 +99,7 @@ class Theatre:
         environment: Mapping[str, str] | None = None,
         pass_fds: Sequence[int] = (),
     ) -> Actor:
-        """A session leader whose output is a file of its own."""
+        """Start a session leader that writes its output into its own file."""
         log = self.folder / f"{len(self._processes)}.log"
         with log.open("ab") as output:
             process = subprocess.Popen(
@@ -109,7 +111,7 @@ class Theatre:
         return Actor(process, log)
 
     def dump(self, actor: Actor, name: str = "image", leave: dump.Leave = "killed") -> Path:
-        """The directory of its image."""
+        """Dump a process; return the directory of the image."""
         directory = self.folder / name
         self.manifest: Manifest = dump.dump(
             self.criu, actor.pid, directory, leave=leave, timeout=TIMEOUT, process="actor",
@@ -126,21 +128,21 @@ class Theatre:
         remove: bool = False,
         environment: Mapping[str, str] | None = None,
     ) -> Actor:
-        """The program that restores an image, just started."""
+        """Start the shim that restores an image."""
         command = [*self.shim_command(directory, remove=remove), *options]
         return self.run(command, environment=environment)
 
     def shim_command(
         self, directory: Path, *, remove: bool = False, then: Sequence[str] = ()
     ) -> tuple[str, ...]:
-        """Its command line."""
+        """Return the command line of the shim."""
         program = Path(self.criu.command[0])
         return restore_result.command(
             sys.executable, directory, criu=program, remove=remove, timeout=TIMEOUT, then=then
         )
 
     def restore(self, directory: Path, *options: str, **named: Any) -> Actor:
-        """The program that holds a restored process."""
+        """Restore an image; return the shim once the process is restored."""
         actor = self.shim(directory, *options, **named)
         actor.outcome = restore_result.wait(
             directory, timeout=TIMEOUT, ended=lambda: actor.process.poll() is not None
@@ -149,7 +151,7 @@ class Theatre:
         return actor
 
     def close(self) -> None:
-        """End them all."""
+        """End all processes."""
         for process in self._processes:
             if process.poll() is None:
                 members = process_tree.tree(process.pid)
@@ -162,11 +164,11 @@ class Theatre:
 
 
 class Actor:
-    """A process, and what it wrote.
+    """Process with its output.
 
     Args:
-        process: or the program that holds it.
-        log: its standard output and error.
+        process: the process, or the shim of a restored one.
+        log: file with standard output and error.
     """
 
     outcome: Outcome
@@ -176,28 +178,19 @@ class Actor:
         self.pid = process.pid
 
     def lines(self) -> list[str]:
-        """The whole lines that it wrote so far."""
+        """Return the complete lines of output so far."""
         return [line for line in self.log.read_text().splitlines(True) if line.endswith("\n")]
 
     def numbers(self) -> list[int]:
-        """Those among its lines that are numbers."""
+        """Return the numbers among the lines."""
         return [int(line) for line in self.lines() if line.strip().isdigit()]
 
     def says(self, line: str) -> None:
-        """Wait for a line."""
+        """Wait until the process has written a line."""
         eventually(lambda: f"{line}\n" in self.lines(), f"a line {line!r} in {self.log.name}")
 
     def counts(self) -> int:
-        """Wait until it has written two numbers more; returns the last."""
+        """Wait until the process has written two more numbers; return the last."""
         seen = len(self.numbers())
         eventually(lambda: len(self.numbers()) > seen + 1, f"numbers in {self.log.name}")
         return self.numbers()[-1]
-
-
-def eventually(condition: Callable[[], object], what: str) -> None:
-    """Wait for something that nothing tells of."""
-    end = time.monotonic() + TIMEOUT
-    while not condition():
-        if time.monotonic() > end:
-            pytest.fail(f"waited {TIMEOUT} s for {what}")
-        time.sleep(0.01)

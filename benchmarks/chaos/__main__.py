@@ -1,4 +1,4 @@
-"""Random faults on virtual hosts: `python -m benchmarks.chaos --minutes M --seed S`.
+"""Random faults on virtual hosts, judged by observation alone.
 
 Exit status: 0 without a violation, 1 with one, 2 when something is missing, 128 + signal number
 when a signal stopped it. Needs root. The last line is one JSON object.
@@ -22,7 +22,7 @@ from benchmarks.chaos.cluster import HOSTS, LEASE_S, Cluster
 from benchmarks.chaos.event_log import EventLog
 from benchmarks.chaos.faults import Round, draw
 from benchmarks.chaos.trial import Stuck, Tally, Trial
-from benchmarks.machine import percentile, print_report, say
+from benchmarks.machine import parser, percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm_lab import needs
 
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     needs.check_rights()
     needs.check_commands()
     if clocks.library() is None:
-        say(f"no clock is set back: {_NO_CLOCKS}")
+        say(f"faults of clocks are left out: {_NO_CLOCKS}")
     tally, began = Tally(), time.monotonic()
     try:
         out = options.out or Path(tempfile.mkdtemp(prefix="rosrm-chaos-"))
@@ -50,13 +50,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.chaos", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=5.0, help="no new fault after them")
-    parser.add_argument("--seed", type=int, default=1, help="of the faults")
-    parser.add_argument("--faults", type=int, default=500, help="no more than so many, about")
-    parser.add_argument("--out", type=Path, help="folder for settings, logs and violations")
-    parser.add_argument("--lab", default="chaos", help="what the lab is called")
-    return parser.parse_args(arguments)
+    command_line = parser(__doc__)
+    command_line.add_argument(
+        "--minutes", type=float, default=5.0, help="minutes after which no new fault begins"
+    )
+    command_line.add_argument("--seed", type=int, default=1, help="seed of the faults")
+    command_line.add_argument(
+        "--faults", type=int, default=500, help="approximate maximum number of faults"
+    )
+    command_line.add_argument(
+        "--out", type=Path, help="folder for settings, logs and violations, else a temporary one"
+    )
+    command_line.add_argument("--lab", default="chaos", help="name of the lab")
+    return command_line.parse_args(arguments)
 
 
 def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> None:
@@ -74,13 +80,13 @@ def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> 
         try:
             with (
                 Cluster(
-                    options.lab, folder, lambda text: event_log.tell(text, aloud=True)
+                    options.lab, folder, lambda text: event_log.add(text, aloud=True)
                 ) as cluster,
-                ClientLoad(cluster.lab, folder / "desk.log", event_log.tell) as client_load,
+                ClientLoad(cluster.lab, folder / "desk.log", event_log.add) as client_load,
             ):
                 trial = Trial(cluster, client_load, lines, out, event_log, tally)
                 trial.begin()
-                say(f"all is well: {len(names)} services on {len(HOSTS)} hosts")
+                say(f"no deviations: {len(names)} services on {len(HOSTS)} hosts")
                 for drawn in _while(rounds, options.faults, deadline, tally):
                     trial.round(drawn)
                 trial.end()

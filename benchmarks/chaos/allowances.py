@@ -1,4 +1,4 @@
-"""Promises to a process, and allowances: the harm that explains a deviation from them.
+"""Guarantees for a process, and allowances: disturbances that explain a deviation from them.
 
 Pure; imports nothing from rosrm.
 """
@@ -32,7 +32,7 @@ _ENDING: Final = 0.5
 _YOUNG: Final = 6.0
 #: Kinds that the benchmark requests, and that end or silence no process by force.
 MOVES: Final = ("move", "overlap")
-#: The kind of harm that other programs on the machine do.
+#: Kind of the disturbance by other programs on the machine.
 OVERLOAD: Final = "overload"
 #: Cycles a second.
 _RATE: Final = 10.0
@@ -48,7 +48,7 @@ class Guarantees:
         standby: it has a second instance, silent.
         elsewhere: it is restarted on another host when its own is lost.
         isolated: its host stops it when it is cut off.
-        kept: its snapshot is on the disk of its own host.
+        kept: its own host has its snapshot on disk.
         copied: cycles by which a replica on another host may be behind; 0: there is none.
     """
 
@@ -162,10 +162,10 @@ def most_behind(
     if following.host == one.host and guarantees.kept:
         return _LAST_SECOND
     # For a migration the standby makes room. Where the migration fails, the replica is left.
-    asked = any(
+    requested = any(
         disturbance.kind in MOVES and disturbance.process == name for disturbance in disturbances
     )
-    second = asked or _is_struck_twice(guarantees, one, disturbances, name)
+    second = requested or _is_struck_twice(guarantees, one, disturbances, name)
     if guarantees.standby and not (second and guarantees.copied):
         return LAST_CYCLES + _unseen(one, disturbances, one.host)
     # The replica of a young instance may be its predecessor's, as young or in transit then.
@@ -178,7 +178,8 @@ def _is_struck_twice(
 ) -> bool:
     """Return True if one fault hit its host, and another one the host of a replica or a standby.
 
-    The host that holds it is not known here, so any other one counts. An overload does not count.
+    The host of the replica or standby is not known here, so any other one counts. An overload does
+    not count.
 
     Args:
         name: of the process, where a fault to itself counts too: its standby has the same name.

@@ -51,7 +51,7 @@ class ClientRequest:
 
 
 class ClientLoad:
-    """A client on the desk (the master's host) of a lab, and its thread."""
+    """A client on the master's host of a lab, and its thread."""
 
     def __init__(self, lab: Lab, log: Path, tell: Callable[[str], None]) -> None:
         self._tell = tell
@@ -61,11 +61,11 @@ class ClientLoad:
         self._leaving = False
         self._lab = lab
         self._log = log
-        self._desk = self._start_desk()
-        self._thread = threading.Thread(target=self._serve, name="errands", daemon=True)
+        self._client = self._start_client()
+        self._thread = threading.Thread(target=self._serve, name="client load", daemon=True)
         self._thread.start()
 
-    def _start_desk(self) -> subprocess.Popen[bytes]:
+    def _start_client(self) -> subprocess.Popen[bytes]:
         with self._log.open("ab") as sink:
             return self._lab.popen(
                 DESK, [sys.executable, "-m", "benchmarks.chaos.client_process"], cwd=str(ROOT),
@@ -83,9 +83,9 @@ class ClientLoad:
     ) -> None:
         self._leaving = True
         self._queue.put(None)
-        self._desk.kill()
+        self._client.kill()
         self._thread.join(10.0)
-        self._desk.communicate()
+        self._client.communicate()
 
     def send(self, client_request: ClientRequest) -> ClientRequest:
         """Queue a request behind those sent before."""
@@ -112,14 +112,14 @@ class ClientLoad:
             client_request.answer = self._ask(client_request.request)
             if not client_request.persistent or _accepted(client_request):
                 return
-            client_request.unsure = client_request.unsure or _may_have_been_taken(
+            client_request.unsure = client_request.unsure or _may_have_been_accepted(
                 client_request.answer
             )
-            self._tell(f"{client_request.request['do']} is asked again: {client_request.answer}")
-            time.sleep(_PAUSE)  # no master, or no room at the master: the client asks again
+            self._tell(f"{client_request.request['do']} is retried: {client_request.answer}")
+            time.sleep(_PAUSE)  # no master, or no room at the master: the client retries
 
     def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        to, source = self._desk.stdin, self._desk.stdout
+        to, source = self._client.stdin, self._client.stdout
         assert to is not None
         assert source is not None
         try:
@@ -136,14 +136,14 @@ class ClientLoad:
 
     def _ended(self) -> dict[str, Any]:
         """Start another client where this one has ended, unless this object is being closed."""
-        ended = self._desk
+        ended = self._client
         ended.communicate()
         if not self._leaving:
-            self._desk = self._start_desk()
+            self._client = self._start_client()
         return {"no_master": f"the client ended with {ended.returncode}, see {self._log}"}
 
 
-def _may_have_been_taken(answer: Mapping[str, Any]) -> bool:
+def _may_have_been_accepted(answer: Mapping[str, Any]) -> bool:
     """Return True if the master may have accepted a request whose answer was lost.
 
     The client retries such a request, and the retry may come too late.

@@ -1,8 +1,8 @@
 """A client of the master, on its host, driven by lines: `{"do": ...}` in, one line out for each.
 
 `submit` takes the path of a work file, `cancel` names, `migrate` a process and a host. `look`
-returns the states of hosts and processes (for the story; no judgement uses them). The client ends
-when its input ends.
+returns the states of hosts and processes, for the log of a violation; no judgement uses them. The
+client ends when its input ends.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Part:
 
 
 class Cluster:
-    """A lab with a master on the desk and a slave on each host; removed at exit.
+    """A lab with a master on a host of its own and a slave on each other one; removed at exit.
 
     Args:
         name: of the lab.
@@ -221,4 +221,4 @@ def _slave_settings(host: str) -> dict[str, object]:
 
 def _last_line(log: Path) -> str:
     lines = log.read_text(errors="replace").strip().splitlines()
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "no output"

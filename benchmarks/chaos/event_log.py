@@ -1,4 +1,4 @@
-"""Story of a run: on standard error, and as files beside each violation."""
+"""Log of a run: on standard error, and as files beside each violation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Final
 from benchmarks.chaos.cluster import DESK, HOSTS, Cluster
 from benchmarks.machine import say
 
-#: Number of lines that a story keeps.
+#: Number of lines that the log keeps.
 _LENGTH: Final = 400
 #: Files of each host that help to find the cause.
 _KEPT: Final = {
@@ -29,7 +29,7 @@ class EventLog:
         self._seed = seed
         self._lines: list[str] = []
 
-    def tell(self, text: str, *, aloud: bool = False) -> None:
+    def add(self, text: str, *, aloud: bool = False) -> None:
         """Add a line."""
         self._lines.append(f"{time.monotonic():.2f} {time.strftime('%H:%M:%S')} {text}")
         del self._lines[:-_LENGTH]
@@ -42,8 +42,8 @@ class EventLog:
     ) -> None:  # fmt: skip
         """Write a violation with everything that may explain it."""
         folder.mkdir(parents=True, exist_ok=True)
-        told = {"seed": self._seed, "violations": violations, "story": self._lines, "seen": seen}
-        (folder / "violation.json").write_text(json.dumps(told, indent=1))
+        report = {"seed": self._seed, "violations": violations, "log": self._lines, "seen": seen}
+        (folder / "violation.json").write_text(json.dumps(report, indent=1))
         for part in cluster.parts.values():
             with contextlib.suppress(OSError):
                 shutil.copy(part.log, folder)

@@ -6,10 +6,11 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, ClassVar, Final
 
 from benchmarks.chaos import clocks
 from benchmarks.chaos.allowances import Disturbance
@@ -23,7 +24,10 @@ _FILLER: Final = "filler"
 #: Bytes of the smallest piece with which a file system is filled.
 _LEAST: Final = 4096
 
-Undo = Callable[[], bool]
+#: Undoes a fault; False: another attempt is necessary.
+Undo = Callable[[], object]
+#: A fault that was done: what it may explain, and its undo.
+Done = tuple[Disturbance, Undo]
 
 
 class FaultInjector:
@@ -32,13 +36,12 @@ class FaultInjector:
     def __init__(self, cluster: Cluster) -> None:
         self._cluster = cluster
         self._lab = cluster.lab
-        self._undos: dict[int, tuple[Disturbance, Undo]] = {}
+        self._undos: dict[int, Done] = {}
         self.done: list[Disturbance] = []
 
     def begin(self, fault: Fault) -> str:
         """Do a fault; return the reason why it was skipped, "" where it was done."""
-        do: Callable[[Fault], tuple[Disturbance, Undo] | str] = getattr(self, f"_{fault.kind}")
-        outcome = do(fault)
+        outcome = self.ACTIONS[fault.kind](self, fault)
         if isinstance(outcome, str):
             return outcome
         if fault.lasts:
@@ -52,193 +55,140 @@ class FaultInjector:
         if fault.number not in self._undos:
             return True
         disturbance, undo = self._undos[fault.number]
-        if not undo():
+        if undo() is False:
             return False
         del self._undos[fault.number]
         self.done.append(replace(disturbance, ended=time.monotonic()))
         return True
 
     def take_done(self) -> list[Disturbance]:
-        """Return the harm that was done and undone since the last call."""
+        """Return the disturbances that ended since the last call."""
         done, self.done = self.done, []
         return done
 
     # --- master and slaves --------------------------------------------------------------------
 
-    def _master_kill(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._kill_part(fault, MASTER, _ALL)
-
-    def _slave_kill(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._kill_part(fault, fault.target, frozenset({fault.target}))
-
-    def _kill_part(
-        self, fault: Fault, part: str, hosts: frozenset[str]
-    ) -> tuple[Disturbance, Undo] | str:
-        begun = time.monotonic()
-        if not self._cluster.kill(part):
+    def _kill_part(self, fault: Fault) -> Done | str:
+        disturbance = _of_part(fault, restarts=True)
+        if not self._cluster.kill(fault.target):
             return "it does not run"
+        return disturbance, partial(self._cluster.start, fault.target)
 
-        def start() -> bool:
-            self._cluster.start(part)
-            return True
-
-        deafens = part != MASTER  # fences wait for a slave that works
-        disturbance = Disturbance(
-            fault.kind, begun, begun, hosts, hides=True, restarts=True, deafens=deafens
-        )
-        return disturbance, start
-
-    def _master_stop(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._stop_part(fault, MASTER, _ALL)
-
-    def _slave_stop(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._stop_part(fault, fault.target, frozenset({fault.target}))
-
-    def _stop_part(
-        self, fault: Fault, part: str, hosts: frozenset[str]
-    ) -> tuple[Disturbance, Undo] | str:
-        pid = self._cluster.parts[part].pid
+    def _stop_part(self, fault: Fault) -> Done | str:
+        pid = self._cluster.parts[fault.target].pid
         if not pid:
             return "it does not run"
         os.kill(pid, signal.SIGSTOP)
-        deafens = part != MASTER
-        disturbance = Disturbance(
-            fault.kind, time.monotonic(), 0.0, hosts, hides=True, deafens=deafens
-        )
-        return disturbance, lambda: self._cluster.proceed(part)
+        return _of_part(fault), partial(self._cluster.proceed, fault.target)
 
-    def _master_clock(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._set_clock(fault, MASTER)
-
-    def _host_clock(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._set_clock(fault, fault.target)
-
-    def _set_clock(self, fault: Fault, part: str) -> tuple[Disturbance, Undo] | str:
+    def _set_clock(self, fault: Fault) -> Done | str:
         if clocks.library() is None:
             return "libfaketime is not here"
-        clocks.set_back(self._cluster.folder, part, fault.amount)
-
-        def set_right() -> bool:
-            clocks.set_back(self._cluster.folder, part, 0.0)
-            return True
-
-        return Disturbance(fault.kind, time.monotonic(), 0.0), set_right
+        set_back = partial(clocks.set_back, self._cluster.folder, fault.target)
+        set_back(fault.amount)
+        return _disturbance(fault), partial(set_back, 0.0)
 
     # --- supervisors and processes ------------------------------------------------------------
 
-    def _supervisor_kill(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._signal_supervisor(fault, signal.SIGKILL)
-
-    def _supervisor_stop(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._signal_supervisor(fault, signal.SIGSTOP)
-
-    def _signal_supervisor(self, fault: Fault, number: int) -> tuple[Disturbance, Undo] | str:
-        pid = self._cluster.supervisor(fault.target)
-        outcome = self._signal(fault, pid, number, frozenset({fault.target}))
-        if isinstance(outcome, str):
-            return outcome
-        disturbance, undo = outcome
+    def _signal_supervisor(self, fault: Fault, number: int) -> Done | str:
         # A new supervisor continues from the last recorded contact, and ends nothing.
         killed = number == signal.SIGKILL
-        return replace(disturbance, forgets=killed, deafens=not killed), undo
+        disturbance = _disturbance(fault, fault.target, forgets=killed, deafens=not killed)
+        return _signalled(self._cluster.supervisor(fault.target), number, disturbance)
 
-    def _process_kill(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._signal_process(fault, signal.SIGKILL)
-
-    def _process_stop(self, fault: Fault) -> tuple[Disturbance, Undo] | str:
-        return self._signal_process(fault, signal.SIGSTOP)
-
-    def _signal_process(self, fault: Fault, number: int) -> tuple[Disturbance, Undo] | str:
+    def _signal_process(self, fault: Fault, number: int) -> Done | str:
         """Signal the first process of the oldest instance."""
         those = [one for one in members(self._lab.name) if one.process == fault.target]
         pid = min((one.pid for one in those), default=0)
-        return self._signal(fault, pid, number, frozenset(), fault.target)
-
-    def _signal(
-        self, fault: Fault, pid: int, number: int, hosts: frozenset[str], process: str = ""
-    ) -> tuple[Disturbance, Undo] | str:
-        begun = time.monotonic()
-        try:
-            os.kill(pid, number) if pid else None
-        except ProcessLookupError:
-            pid = 0
-        if not pid:
-            return "it does not run"
-
-        def proceed() -> bool:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGCONT)
-            return True
-
-        return Disturbance(fault.kind, begun, begun, hosts, process), proceed
+        return _signalled(pid, number, _disturbance(fault, process=fault.target))
 
     # --- hosts --------------------------------------------------------------------------------
 
-    def _master_cut(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        return self._cut(fault, DESK, "both", _ALL)
-
-    def _host_cut(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        return self._cut(fault, fault.target, "both")
-
-    def _host_cut_in(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        return self._cut(fault, fault.target, "in")
-
-    def _host_cut_out(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        return self._cut(fault, fault.target, "out")
-
-    def _cut(
-        self, fault: Fault, host: str, direction: Direction, hosts: frozenset[str] = frozenset()
-    ) -> tuple[Disturbance, Undo]:
-        begun = time.monotonic()
+    def _cut(self, fault: Fault, direction: Direction = "both") -> Done:
+        host = DESK if fault.target == MASTER else fault.target
+        disturbance = _disturbance(fault, fault.target, hides=True)
         self._lab.cut(host, direction)
-        return self._hidden(fault, begun, hosts or frozenset({host})), lambda: self._heal(host)
+        return disturbance, partial(self._lab.heal, host)
 
-    def _host_loss(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        begun, host = time.monotonic(), fault.target
-        self._lab.loss(host, fault.amount)
-        return self._hidden(fault, begun, frozenset({host})), lambda: self._heal(host)
+    def _lose_packets(self, fault: Fault) -> Done:
+        disturbance = _disturbance(fault, fault.target, hides=True)
+        self._lab.loss(fault.target, fault.amount)
+        return disturbance, partial(self._lab.heal, fault.target)
 
-    def _hidden(self, fault: Fault, begun: float, hosts: frozenset[str]) -> Disturbance:
-        return Disturbance(fault.kind, begun, begun, hosts, hides=True)
-
-    def _heal(self, host: str) -> bool:
-        self._lab.heal(host)
-        return True
-
-    def _host_off(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        host, begun = fault.target, time.monotonic()
+    def _switch_off(self, fault: Fault) -> Done:
+        host = fault.target
+        disturbance = _disturbance(fault, host, kills=True, hides=True, restarts=True)
         self._cluster.hold(host)
         self._lab.kill(host)
 
-        def boot() -> bool:
+        def boot() -> None:
             self._lab.boot(host)
             self._cluster.start(host)
-            return True
 
-        hosts = frozenset({host})
-        return Disturbance(
-            fault.kind, begun, begun, hosts, kills=True, hides=True, restarts=True
-        ), boot
+        return disturbance, boot
 
     # --- disks --------------------------------------------------------------------------------
 
-    def _disk_full(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        return self._fill(fault, fault.target), lambda: self._free(fault.target)
+    def _fill_disk(self, fault: Fault) -> Done:
+        """Fill a disk; the master may end and is restarted, and no snapshot is on its disk."""
+        master = fault.target == MASTER
+        disturbance = _disturbance(
+            fault, fault.target, hides=master, restarts=master, fills=not master
+        )
+        filler = partial(self._lab.outside, DESK if master else fault.target, _FILLER)
+        _fill(filler())
+        return disturbance, lambda: filler().unlink(missing_ok=True)
 
-    def _master_disk_full(self, fault: Fault) -> tuple[Disturbance, Undo]:
-        """Fill the master's disk: the master may end and is restarted; snapshots are elsewhere."""
-        disturbance = self._fill(fault, DESK)
-        disturbance = replace(disturbance, hosts=_ALL, hides=True, restarts=True, fills=False)
-        return disturbance, lambda: self._free(DESK)
+    #: How each kind of fault is done.
+    ACTIONS: ClassVar[Mapping[str, Callable[..., Done | str]]] = {
+        "master_kill": _kill_part,
+        "slave_kill": _kill_part,
+        "master_stop": _stop_part,
+        "slave_stop": _stop_part,
+        "master_clock": _set_clock,
+        "host_clock": _set_clock,
+        "supervisor_kill": partial(_signal_supervisor, number=signal.SIGKILL),
+        "supervisor_stop": partial(_signal_supervisor, number=signal.SIGSTOP),
+        "process_kill": partial(_signal_process, number=signal.SIGKILL),
+        "process_stop": partial(_signal_process, number=signal.SIGSTOP),
+        "master_cut": _cut,
+        "host_cut": _cut,
+        "host_cut_in": partial(_cut, direction="in"),
+        "host_cut_out": partial(_cut, direction="out"),
+        "host_loss": _lose_packets,
+        "host_off": _switch_off,
+        "disk_full": _fill_disk,
+        "master_disk_full": _fill_disk,
+    }
 
-    def _fill(self, fault: Fault, host: str) -> Disturbance:
-        begun = time.monotonic()
-        _fill(self._lab.outside(host, _FILLER))
-        return Disturbance(fault.kind, begun, begun, frozenset({host}), fills=True)
 
-    def _free(self, host: str) -> bool:
-        self._lab.outside(host, _FILLER).unlink(missing_ok=True)
-        return True
+def _disturbance(fault: Fault, target: str = "", **effects: Any) -> Disturbance:
+    """Return the disturbance by a fault from now on; a fault of the master concerns all hosts."""
+    hosts = {"": frozenset[str](), MASTER: _ALL}.get(target, frozenset({target}))
+    now = time.monotonic()
+    return Disturbance(fault.kind, now, now, hosts, **effects)
+
+
+def _of_part(fault: Fault, **effects: Any) -> Disturbance:
+    """Return the disturbance by a silent part; a fence waits for a slave that works."""
+    deafens = fault.target != MASTER
+    return _disturbance(fault, fault.target, hides=True, deafens=deafens, **effects)
+
+
+def _signalled(pid: int, number: int, disturbance: Disturbance) -> Done | str:
+    """Send a signal to a process; its undo continues the process."""
+    try:
+        os.kill(pid, number) if pid else None
+    except ProcessLookupError:
+        pid = 0
+    if not pid:
+        return "it does not run"
+
+    def proceed() -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+
+    return disturbance, proceed
 
 
 def _fill(path: Path) -> None:

@@ -131,7 +131,7 @@ def draw(
         seed: of the random numbers.
         hosts: that may be struck.
         processes: that may be struck.
-        movable: processes that may be asked to migrate.
+        movable: processes that may be migrated.
     """
     chance = random.Random(seed)  # noqa: S311 - repeatable on purpose
     drawn, number = 0, 0

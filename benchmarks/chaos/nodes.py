@@ -35,7 +35,7 @@ class Speaker(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
     def tick(self) -> None:
         self.count += 1
         self.output.publish(Int64(data=self.count))
-        self._lines.say("active", self.count)
+        self._lines.write("active", self.count)
 
 
 class Counter(Node):
@@ -52,7 +52,7 @@ class Counter(Node):
     def tick(self) -> None:
         self.count += 1
         self.output.publish(Int64(data=self.count))
-        self._lines.say("active", self.count)
+        self._lines.write("active", self.count)
 
     def save(self) -> Int64:
         return Int64(data=self.count)
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str]) -> None:
         rclpy.spin(Counter(lines) if kind == "counter" else Speaker(lines))
     except (KeyboardInterrupt, ExternalShutdownException):
         rclpy.try_shutdown()
-    lines.say("stopped")
+    lines.write("stopped")
 
 
 if __name__ == "__main__":

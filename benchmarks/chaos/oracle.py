@@ -28,10 +28,10 @@ class AcceptedRequests:
     """The accepted requests.
 
     Attributes:
-        services: promises by name.
-        jobs: that are to be done; by name, the moment in which they were accepted.
-        line: jobs that wait for one another, in the order in which they were submitted.
-        canaries: by host, the job that only it can take, submitted after all faults were undone.
+        services: guarantees by name.
+        jobs: by name, the time of their acceptance.
+        line: jobs that run one after the other, in the order of submission.
+        canaries: by host, the job that only it can run, submitted after all faults were undone.
     """
 
     services: dict[str, Guarantees] = field(default_factory=dict)
@@ -55,16 +55,16 @@ class Oracle:
     Args:
         lab: its name.
         folder: of the lines.
-        wanted: the accepted requests; the caller changes them.
+        accepted: the accepted requests; the caller changes them.
 
     Attributes:
         counts: number of live processes, at each look.
     """
 
-    def __init__(self, lab: str, folder: Path, wanted: AcceptedRequests) -> None:
+    def __init__(self, lab: str, folder: Path, accepted: AcceptedRequests) -> None:
         self._lab = lab
         self._outputs = Outputs(folder)
-        self._accepted = wanted
+        self._accepted = accepted
         self._done: set[str] = set()
         self.counts: list[int] = []
 
@@ -77,7 +77,7 @@ class Oracle:
     # --- at this moment -----------------------------------------------------------------------
 
     def deviations(self) -> list[Deviation]:
-        """Return the deviations at this moment; empty: all is well."""
+        """Return the deviations at this moment; empty: there is none."""
         now = time.monotonic()
         there: dict[str, list[Member]] = {}
         for member in self.look():
@@ -88,7 +88,7 @@ class Oracle:
         for name in self._accepted.jobs:
             found += self._about_job(name, there.pop(name, []))
         found += [
-            Deviation("orphans", name, f"{name} is not wanted, and runs: {_told(left)}")
+            Deviation("orphans", name, f"{name} was not requested, and runs: {_listed(left)}")
             for name, left in there.items()
         ]
         return found
@@ -99,7 +99,7 @@ class Oracle:
         runs = [run for run in self._outputs.read(name) if run.last > now - FRESH]
         owners = {run.instance for run in runs}
         if not runs:
-            yield Deviation("lost", name, f"{name}: nobody is active; there: {_told(there)}")
+            yield Deviation("lost", name, f"{name}: no instance is active; there: {_listed(there)}")
         elif len(runs) > 1:
             active = "; ".join(map(str, runs))
             yield Deviation("doubled", name, f"{name}: more than one is active: {active}")
@@ -107,22 +107,26 @@ class Oracle:
         extra = {instance for instance in sizes if instance not in owners}
         allowed = int(guarantees.standby)
         if len(extra) > allowed:
-            yield Deviation("orphans", name, f"{name}: not its owner, and there: {_told(there)}")
+            yield Deviation(
+                "orphans", name, f"{name}: instances beside its owner: {_listed(there)}"
+            )
         elif len(extra) < allowed:
-            yield Deviation("standby", name, f"{name} has no standby: {_told(there)}")
+            yield Deviation("standby", name, f"{name} has no standby: {_listed(there)}")
         elif guarantees.standby and len({one.host for one in there}) < 2:
             yield Deviation("standby", name, f"{name}: its standby is on the same host")
         if any(size != guarantees.members for size in sizes.values()):
-            text = f"{name}: an instance has {guarantees.members} processes; there: {_told(there)}"
+            text = (
+                f"{name}: an instance has {guarantees.members} processes; there: {_listed(there)}"
+            )
             yield Deviation("orphans", name, text)
 
     def _about_job(self, name: str, there: list[Member]) -> Iterator[Deviation]:
-        if name not in self._done and any(run.told == "done" for run in self._outputs.read(name)):
+        if name not in self._done and any(run.word == "done" for run in self._outputs.read(name)):
             self._done.add(name)
         if name not in self._done:
-            yield Deviation("lost", name, f"the job {name} is not done; there: {_told(there)}")
+            yield Deviation("lost", name, f"the job {name} is not done; there: {_listed(there)}")
         elif there:
-            yield Deviation("orphans", name, f"the job {name} is done, and runs: {_told(there)}")
+            yield Deviation("orphans", name, f"the job {name} is done, and runs: {_listed(there)}")
 
     def left(self) -> list[Deviation]:
         """Return the processes that still run after everything was ended."""
@@ -130,17 +134,17 @@ class Oracle:
         for member in members(self._lab):
             found.setdefault(member.process, []).append(member)
         return [
-            Deviation("orphans", name, f"{name} runs on after the end: {_told(those)}")
+            Deviation("orphans", name, f"{name} runs on after the end: {_listed(those)}")
             for name, those in found.items()
         ]
 
     # --- since the last time ------------------------------------------------------------------
 
     def history(self, disturbances: list[Disturbance]) -> Judgement:
-        """Judge the time since the last call; to be called when all is well.
+        """Judge the time since the last call; to be called while there is no deviation.
 
         Args:
-            harms: that were done to the lab in that time.
+            disturbances: of the lab in that time.
         """
         judged = Judgement()
         reached = {
@@ -152,7 +156,7 @@ class Oracle:
             chain = rules.chain(self._outputs.read(name))
             judged.add(rules.judge_service(name, guarantees, chain, disturbances, reached))
             if chain:
-                self._outputs.forget(name, before=chain[-1].told_at)
+                self._outputs.forget(name, before=chain[-1].word_at)
         for name, accepted in self._accepted.jobs.items():
             judged.add(rules.judge_job(name, accepted, self._outputs.read(name), disturbances))
         judged.violations += rules.judge_line(
@@ -167,12 +171,12 @@ class Oracle:
         self._accepted.line.clear()
         self._accepted.canaries.clear()
 
-    def told(self, names: list[str]) -> Mapping[str, list[str]]:
-        """Return the newest runs of some processes as text, for a story."""
+    def newest_runs(self, names: list[str]) -> Mapping[str, list[str]]:
+        """Return the newest runs of some processes as text."""
         return {name: [str(run) for run in self._outputs.read(name)[-6:]] for name in names}
 
 
-def _told(there: list[Member]) -> str:
+def _listed(there: list[Member]) -> str:
     return ", ".join(f"{one.instance} ({one.pid} on {one.host}, {one.state})" for one in there) or (
         "no process"
     )

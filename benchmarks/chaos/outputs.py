@@ -17,7 +17,7 @@ class Run:
         instance, host, pid, born: the identity; the pid is the one in its host.
         first, last: monotonic time of the first and last "active"; 0: there was none.
         first_number, last_number: the numbers in those lines.
-        told, told_at: word and time of its last line.
+        word, word_at: word and time of its last line.
         backwards: how often a number did not exceed the one before.
     """
 
@@ -29,13 +29,13 @@ class Run:
     last: float = 0.0
     first_number: int = 0
     last_number: int = 0
-    told: str = ""
-    told_at: float = 0.0
+    word: str = ""
+    word_at: float = 0.0
     backwards: int = 0
 
     def take(self, time: float, word: str, number: int) -> None:
         """Add a line."""
-        self.told, self.told_at = word, time
+        self.word, self.word_at = word, time
         if word != "active":
             return
         if not self.first:
@@ -47,7 +47,7 @@ class Run:
     def __str__(self) -> str:
         active = f"active {self.first:.2f}..{self.last:.2f}" if self.first else "never active"
         numbers = f"numbers {self.first_number}..{self.last_number}"
-        return f"{self.instance} pid {self.pid} on {self.host} ({active}, {numbers}, {self.told})"
+        return f"{self.instance} pid {self.pid} on {self.host} ({active}, {numbers}, {self.word})"
 
 
 @dataclass
@@ -92,4 +92,4 @@ class Outputs:
         """Drop the judged runs, whose last line is older than a time."""
         known = self._files.get(process)
         if known is not None:
-            known.runs = {key: run for key, run in known.runs.items() if run.told_at >= before}
+            known.runs = {key: run for key, run in known.runs.items() if run.word_at >= before}

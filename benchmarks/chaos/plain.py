@@ -1,7 +1,7 @@
-"""Plain programs of the workload, and the lines in which the whole workload reports.
+"""Plain programs of the workload, and the lines that the whole workload writes.
 
 Run by its path, with the standard library alone. `service`: writes "active" ten times a second
-until it is stopped. `family`: the same, with a child that only waits. `job SECONDS`: writes
+until it is stopped. `tree`: the same, with a child that only waits. `job SECONDS`: writes
 "active" for so long, then "done".
 """
 
@@ -29,9 +29,9 @@ class Lines:
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
         instance, born = os.environ["ROSRM_INSTANCE"], time.monotonic()
         self._head = f"{instance} {socket.gethostname()} {os.getpid()} {born:.4f}"
-        self.say("born")
+        self.write("born")
 
-    def say(self, word: str, number: int = 0) -> None:
+    def write(self, word: str, number: int = 0) -> None:
         """Write one line, in one system call."""
         os.write(self._file, f"{time.monotonic():.4f} {self._head} {word} {number}\n".encode())
 
@@ -49,7 +49,7 @@ def serve(lines: Lines, seconds: float) -> None:
     begun, count = time.monotonic(), 0
     while time.monotonic() < begun + seconds:
         count += 1
-        lines.say("active", count)
+        lines.write("active", count)
         time.sleep(max(0.0, begun + count / RATE - time.monotonic()))
 
 
@@ -68,12 +68,12 @@ def main() -> None:
         signal.signal(number, stop)
     lines = Lines()
     try:
-        if kind == "family":
+        if kind == "tree":
             have_child()
         serve(lines, float(sys.argv[2]) if kind == "job" else float("inf"))
-        lines.say("done")
+        lines.write("done")
     except Stopped:
-        lines.say("stopped")
+        lines.write("stopped")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Rules for the runs of a process, with allowances by harm. Pure; imports nothing from rosrm."""
+"""Rules for the runs of a process, with their allowances. Pure; imports nothing from rosrm."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CROSSING: Final = 0.05
 
 @dataclass(frozen=True)
 class Violation:
-    """A promise that was not kept."""
+    """A guarantee that was not kept."""
 
     kind: str
     name: str
@@ -44,7 +44,7 @@ class Judgement:
     """The result of judging the past.
 
     Attributes:
-        violations: broken promises.
+        violations: broken guarantees.
         allowed: how often each allowance applied, by title.
         parted: seconds for which a former owner was active after the partition was healed.
     """
@@ -73,9 +73,9 @@ def judge_service(
 
     Args:
         name: of the service.
-        promise: that was given.
+        guarantees: of the service.
         chained: its runs, as returned by `chain`.
-        harms: that were done in that time.
+        disturbances: in that time.
         reached: by host, the time at which it had received an order from the master again.
     """
     judged = Judgement(
@@ -124,7 +124,7 @@ def _judge_overlap(
         disturbance.ended + _OVERLAP + (STARTING if disturbance.restarts else MEETING)
         for disturbance in parting
     ]
-    # On a busy machine a restarted part comes up late; the first order that it received tells when.
+    # On a busy machine a restarted part comes up late; its first received order shows when.
     until += [reached[host] + _OVERLAP for host in (one.host, other.host) if host in reached]
     parted = guarantees.elsewhere and not guarantees.isolated
     if parted and parting and one.last <= max(until):

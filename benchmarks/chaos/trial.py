@@ -1,4 +1,4 @@
-"""The loop: do a round of faults, undo them, wait until all is well, judge the round."""
+"""The loop: do a round of faults, undo them, wait for recovery, judge the round."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Tally:
         by_kind: faults that were done.
         missed: skipped faults (no target to strike), by kind and reason.
         violations: by kind.
-        allowed: deviations within the promises, by title.
+        allowed: deviations within the guarantees, by title.
         parted: seconds for which a former owner was active after the partition was healed.
         recovery: seconds from the undoing of the last fault of a round until all was well, by kind
             of the fault, or "burst" for rounds of several kinds.
@@ -112,14 +112,14 @@ class Trial:
     def begin(self) -> None:
         """Submit the services, and wait until all is well."""
         entries = [one.entry(self._lines) for one in self._services.values()]
-        promises = {name: guarantees_of(service) for name, service in self._services.items()}
-        self._submit(entries, lambda _: self._accepted.services.update(promises))
+        guarantees = {name: guarantees_of(service) for name, service in self._services.items()}
+        self._submit(entries, lambda _: self._accepted.services.update(guarantees))
         self._await_well(0, "the beginning", _BEGIN_S)
         self._oracle.history([])
         self._oracle.counts = self._tally.counts
 
     def end(self) -> None:
-        """Cancel everything, stop the slaves, and look for orphans."""
+        """Cancel everything, stop the slaves, and check for orphans."""
         names = list(self._accepted.services)
         self._accepted.services.clear()
         self._oracle.counts = []
@@ -164,11 +164,11 @@ class Trial:
             word = kinds[0] if len(set(kinds)) == 1 else "burst"
             self._tally.recovery.setdefault(word, []).append(well - healed)
             self._tally.whole.setdefault(word, []).append(well - begun)
-            told = f"well after {well - healed:.1f} s"
-            say(f"{self._tally.faults} faults; {', '.join(kinds)}: {told}")
+            took = well - healed
+            say(f"{self._tally.faults} faults; {', '.join(kinds)}: recovered after {took:.1f} s")
 
     def _note_load(self, begun: float) -> None:
-        """Record the load; an overload by other programs counts as harm, like a cut."""
+        """Record the load; an overload by other programs counts as a disturbance, like a cut."""
         load = os.getloadavg()[0]
         self._tally.loads.append(load)
         if load > _OVERLOAD * len(os.sched_getaffinity(0)):
@@ -184,7 +184,7 @@ class Trial:
 
         def begin(fault: Fault) -> None:
             why_not = self._fault_injector.begin(fault)
-            self._event_log.tell(f"{fault}{': not done, ' + why_not if why_not else ''}")
+            self._event_log.add(f"{fault}{': not done, ' + why_not if why_not else ''}")
             if why_not:
                 self._tally.missed[f"{fault.kind}: {why_not}"] += 1
                 return
@@ -194,7 +194,7 @@ class Trial:
 
         def end(fault: Fault) -> None:
             if self._fault_injector.end(fault):
-                self._event_log.tell(f"fault {fault.number} was undone")
+                self._event_log.add(f"fault {fault.number} was undone")
             else:
                 due.append((time.monotonic() + _LOOK, lambda: end(fault)))
 
@@ -234,7 +234,7 @@ class Trial:
             time.sleep(_LOOK_AT_ALL)
         return since
 
-    # --- what is asked for ----------------------------------------------------------------
+    # --- requests -------------------------------------------------------------------------
 
     def _submit(
         self, entries: list[dict[str, Any]], accepted: Callable[[ClientRequest], None]
@@ -272,7 +272,7 @@ class Trial:
         """Cancel the guest, and submit the next one."""
         if self._guests:
             old = work.guest(self._guests).name
-            self._event_log.tell(f"{old} is cancelled")
+            self._event_log.add(f"{old} is cancelled")
 
             def cancelled(_: ClientRequest) -> None:
                 self._accepted.services.pop(old)
@@ -308,15 +308,15 @@ class Trial:
         kind = "overlap" if sort.strategy == "relaunch" else "move"
         now = time.monotonic()
         self._disturbances.append(Disturbance(kind, now, now, process=move.process))
-        self._event_log.tell(f"{move.process} is asked to move to {move.host}")
+        self._event_log.add(f"{move.process} is requested to migrate to {move.host}")
 
-        def told(client_request: ClientRequest) -> None:
-            self._event_log.tell(f"of the move of {move.process}: {client_request.answer}")
+        def answered(client_request: ClientRequest) -> None:
+            self._event_log.add(f"migration of {move.process}: {client_request.answer}")
 
         request = {"do": "migrate", "process": move.process, "host": move.host}
-        self._client_load.send(ClientRequest(request, persistent=False, done=told))
+        self._client_load.send(ClientRequest(request, persistent=False, done=answered))
 
-    # --- what went wrong ------------------------------------------------------------------
+    # --- violations -----------------------------------------------------------------------
 
     def _stuck(
         self, number: int, what: str, timeout: float, deviations: list[Deviation], *, answered: bool
@@ -326,26 +326,26 @@ class Trial:
             Violation(one.kind, one.name, f"{one.text} ({words})") for one in deviations
         ] or [Violation("lost", "", f"the master has not answered every request, {words}")]
         if answered or deviations:
-            self._event_log.tell(f"stuck: {words}")
+            self._event_log.add(f"stuck: {words}")
         self._violated(number, violations)
         raise Stuck(words)
 
     def _violated(self, number: int, violations: list[Violation]) -> None:
         for one in violations:
             self._tally.violations[one.kind] += 1
-            self._event_log.tell(f"VIOLATION ({one.kind}): {one.text}", aloud=True)
+            self._event_log.add(f"VIOLATION ({one.kind}): {one.text}", aloud=True)
         folder = self._out / f"violation-{number}-{self._tally.violations.total()}"
         names = list({one.name for one in violations if one.name})
         seen: Mapping[str, Any] = {
-            "runs": self._oracle.told(names),
-            "harms": [_plain(disturbance) for disturbance in self._disturbances],
+            "runs": self._oracle.newest_runs(names),
+            "disturbances": [_plain(disturbance) for disturbance in self._disturbances],
             "master": self._ask_master(),
         }  # fmt: skip
         self._event_log.keep(folder, self._cluster, [asdict(one) for one in violations], seen)
-        say(f"the story is in {folder}")
+        say(f"logs: {folder}")
 
     def _ask_master(self) -> dict[str, Any]:
-        """Return the master's view, for the story alone."""
+        """Return the master's view, for the log alone."""
         answers: list[ClientRequest] = []
         self._client_load.send(ClientRequest({"do": "look"}, persistent=False, done=answers.append))
         deadline = time.monotonic() + 20.0
@@ -356,7 +356,7 @@ class Trial:
 
 
 def guarantees_of(service: work.Service) -> Guarantees:
-    """Return the promises by which the oracle judges a service."""
+    """Return the guarantees by which the oracle judges a service."""
     sort = service.sort
     return Guarantees(
         sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated,

@@ -14,10 +14,10 @@ from typing import Any, Final
 ROOT: Final = Path(__file__).resolve().parents[2]
 _PLAIN: Final = str(Path(__file__).with_name("plain.py"))
 
-#: Numbers of services, chosen such that thirty processes live: these, a child of each family,
+#: Numbers of services, chosen such that thirty processes live: these, a child of each tree,
 #: standbys, and a guest. Jobs come on top.
 PLAIN: Final = 12
-FAMILIES: Final = 2
+TREES: Final = 2
 SPEAKERS: Final = 4
 COUNTERS: Final = 5
 #: Counters with a standby on another host.
@@ -98,7 +98,7 @@ class Service:
 
 _SORTS: Final = {
     "plain": (Sort("service"), PLAIN),
-    "family": (Sort("family", members=2), FAMILIES),
+    "tree": (Sort("tree", members=2), TREES),
     "speaker": (Sort("speaker", ros=True, strategy="relaunch"), SPEAKERS),
     "counter": (Sort("counter", ros=True, strategy="handoff", stateful=True), COUNTERS),
     "guarded": (
@@ -119,7 +119,7 @@ def services() -> Iterator[Service]:
 
 def guest(number: int) -> Service:
     """Return a guest: a service that is cancelled when the next guest is submitted."""
-    sort = (_SORTS["plain"], _SORTS["counter"], _SORTS["family"])[number % 3][0]
+    sort = (_SORTS["plain"], _SORTS["counter"], _SORTS["tree"])[number % 3][0]
     return Service(f"guest{number}", sort, elsewhere=bool(number % 2))
 
 

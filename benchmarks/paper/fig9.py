@@ -177,17 +177,17 @@ def judge(
 
 def not_kept_up(one: dict[str, Any]) -> list[str]:
     """Return the deviations from the intended rates, as sentences."""
-    slaves, wanted = one["slaves"], one["slaves"] * RATE_HZ
+    slaves, intended = one["slaves"], one["slaves"] * RATE_HZ
     wrong = []
     if one["missed"] > _MOST_MISSED * one["cycles"]:
         wrong.append(f"of {slaves} slaves {one['missed']} of {one['cycles']} readings were missed")
     wrong += [
-        f"{slaves} slaves: {one[rate]:.1f} cycles a second instead of {wanted:g} were {what}"
-        for rate, what in (("offered_per_s", "carried out"), ("received_per_s", "heard"))
-        if one[rate] < (1 - _MOST_WANTING) * wanted
+        f"{slaves} slaves: {one[rate]:.1f} cycles a second instead of {intended:g} were {what}"
+        for rate, what in (("offered_per_s", "carried out"), ("received_per_s", "received"))
+        if one[rate] < (1 - _MOST_WANTING) * intended
     ]
     if one["hosts_heard"] != slaves:
-        wrong.append(f"of {slaves} slaves {one['hosts_heard']} were heard")
+        wrong.append(f"of {slaves} slaves {one['hosts_heard']} sent readings")
     if one["masters_lost"]:
         wrong.append(f"of {slaves} slaves {one['masters_lost']} took the master for lost")
     return wrong

@@ -1,4 +1,4 @@
-"""A cluster on the hosts of a lab: master, slaves and a desk, started as users start them."""
+"""A cluster on the hosts of a lab: master, slaves and a client, started as users start them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Part:
     def last_words(self) -> Failed:
         """Return an error with its exit code and the last lines of its output."""
         words = self.log.read_text(errors="replace").strip().splitlines()[-5:]
-        said = "\n  ".join(words) or "it said nothing"
+        said = "\n  ".join(words) or "no output"
         return Failed(f"{self.name} ended with exit code {self.process.returncode}:\n  {said}")
 
 
@@ -214,7 +214,9 @@ class LabCluster:
                 f"{event.elapsed - self.trace.start:.1f} s: {event.message}"
                 for event in self.trace.events[-_TOLD:]
             )
-            raise Failed(f"on the cluster {'; '.join(wrong[:3])}; last the master said\n  {told}")
+            raise Failed(
+                f"on the cluster {'; '.join(wrong[:3])}; last events of the master:\n  {told}"
+            )
         return look
 
     def begin(self) -> None:
@@ -300,7 +302,7 @@ def _shown(look: Look) -> bool:
 
 
 class LabClient:
-    """The program on the desk that is a client of the master.
+    """The client of the master in the lab.
 
     Args:
         start: starts it, with pipes to and from it.
@@ -365,5 +367,5 @@ class LabClient:
         try:
             self._part.process.wait(_END)
         except subprocess.TimeoutExpired:
-            return Failed(f"{self._part.name} has closed its pipes, and goes on")
+            return Failed(f"{self._part.name} has closed its pipes, and still runs")
         return self._part.last_words()

@@ -153,13 +153,13 @@ def _carry_out(live: LiveDrive, record: Record, directory: Path, stage: Stage) -
 
         screen = screen_for(stage.console, script.progress, line)
         Demo(cluster, record, screen, stage.signals).carry_out(script)
-        heard = list(observer.heard)
+        received = list(observer.received)
     sent = int(json.loads(live.report.read_text())["scans_sent"])
     try:
         parts = load_parts(live.out)
     except PieceError as error:
         raise DemoFailed(f"{error}; see the logs in {directory}") from error
-    return LiveRun(live.drive, sent, heard, parts, live.period)
+    return LiveRun(live.drive, sent, received, parts, live.period)
 
 
 # --- results -----------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +15,8 @@ from rosrm import EventRow, Listing, ProcessRow
 SAMPLES_FILE: Final = "samples.json"
 EVENTS_FILE: Final = "events.jsonl"
 
-_ENDS: Final = ("finished", "failed", "cancelled")
+#: States in which a process has ended.
+ENDED: Final = ("finished", "failed", "cancelled")
 RUNNING: Final = ("starting", "running", "migrating", "stopping")
 
 
@@ -187,7 +188,7 @@ def summarise(
 
 
 def _last_end(record: Record, prefix: str = "") -> float:
-    ends = (e.elapsed for e in record.of_kind(*_ENDS) if e.process.startswith(prefix))
+    ends = (e.elapsed for e in record.of_kind(*ENDED) if e.process.startswith(prefix))
     return max(ends, default=record.start)
 
 
@@ -197,13 +198,5 @@ def _peak_percent(record: Record, host: str) -> float:
 
 
 def _plain_event(event: EventRow) -> dict[str, Any]:
-    return {
-        "sequence": event.sequence,
-        "wall_time": event.wall_time,
-        "elapsed": event.elapsed,
-        "kind": event.kind,
-        "process": event.process,
-        "host": event.host,
-        "message": event.message,
-        "facts": dict(event.facts),
-    }
+    plain = {one.name: getattr(event, one.name) for one in fields(event)}
+    return {**plain, "facts": dict(event.facts)}

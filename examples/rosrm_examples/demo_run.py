@@ -15,7 +15,7 @@ from rosrm import Client, InstanceId, Listing, ProcessRow, RosrmError
 from rosrm.supervisor.client import log_path
 from rosrm.testing.local_cluster import LocalCluster, Part
 from rosrm_examples.demo_job import Arrival
-from rosrm_examples.demo_record import Record
+from rosrm_examples.demo_record import ENDED, Record
 from rosrm_examples.demo_screen import Screen
 
 _START_S: Final = 30.0
@@ -23,7 +23,6 @@ _START_S: Final = 30.0
 _LONGEST_S: Final = 150.0
 _SAMPLE_S: Final = 0.2
 _SPIN_S: Final = 0.05
-OVER: Final = frozenset({"finished", "failed", "cancelled"})
 _WRONG: Final = frozenset({"failed", "cancelled", "set_aside", "stuck"})
 
 
@@ -83,7 +82,7 @@ class Arrivals:
 
     def is_over(self, view: Listing) -> bool:
         """Return True if all processes have been submitted and have ended."""
-        return not self._left and all(row.state in OVER for row in view.processes)
+        return not self._left and all(row.state in ENDED for row in view.processes)
 
 
 class Demo:
@@ -183,7 +182,7 @@ class Demo:
         return f"{row.name} {row.state} on {host}: {reason}; see {log}{_last_words(log)}"
 
     def _too_long(self, rows: Sequence[ProcessRow]) -> DemoFailed:
-        late = [f"{row.name} is {row.state}" for row in rows if row.state not in OVER]
+        late = [f"{row.name} is {row.state}" for row in rows if row.state not in ENDED]
         more = f" and {len(late) - 5} more" if len(late) > 5 else ""
         return DemoFailed(
             f"not done after {_LONGEST_S:.0f} s: {', '.join(late[:5])}{more}; "

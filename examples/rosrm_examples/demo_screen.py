@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.live import Live
 
 from rosrm import EventRow, Listing, ProcessRow
-from rosrm.cli.output.top import render
+from rosrm.cli.output.top import TopView
 from rosrm_examples.demo_job import count_by_kind
 from rosrm_examples.demo_record import RUNNING, sample_of
 
@@ -62,7 +62,7 @@ class LiveScreen:
         self._events.extend(view.events)
         rows = max(_FEWEST_ROWS, self._console.height - _OTHER_LINES)
         shown = replace(view, events=list(self._events))
-        table = render(shown, rows=rows, events=_EVENTS, note=self._note(view))
+        table = TopView(shown, rows=rows, events=_EVENTS, note=self._note(view))
         self._live.start()
         self._live.update(table, refresh=True)
 

@@ -128,7 +128,8 @@ def _kitti_folders() -> list[Path]:
     named = os.environ.get(KITTI_VARIABLE)
     if named:
         return [Path(named)]
-    return [Path(__file__).resolve().parents[2] / _SHARED_KITTI, Path.cwd() / _SHARED_KITTI]
+    roots = (Path(__file__).resolve().parents[2], Path.cwd())
+    return [root / _SHARED_KITTI for root in dict.fromkeys(roots)]
 
 
 def _find_kitti(name: str) -> Path | None:

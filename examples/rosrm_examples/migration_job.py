@@ -16,6 +16,7 @@ import numpy as np
 from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessRow, ProcessSpec
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
 from rosrm_examples.demo_job import MEMORY_LIMIT
+from rosrm_examples.demo_record import ENDED
 from rosrm_examples.drives import Drive
 from rosrm_examples.observer import Observer
 
@@ -42,7 +43,6 @@ _SHORTEST_S: Final = 20.0
 _RECORDER_AT: Final = 0.15
 #: Seconds without a pose after which nothing more is expected.
 _QUIET_S: Final = 10.0
-_OVER: Final = ("finished", "failed", "cancelled")
 
 
 @dataclass(frozen=True)
@@ -163,15 +163,15 @@ class MigrationScript:
         self._rows: dict[str, ProcessRow] = {}
         self._submitted: set[str] = set()
         self._quiet_since = 0.0
-        self._heard = 0
+        self._mapped = 0
         self._elapsed = 0.0
 
     def act(self, client: Client, elapsed: float) -> None:
         """Submit the processes that are due."""
         self._elapsed = elapsed
-        heard = len(self._observer.heard)
-        if heard > self._heard:
-            self._heard, self._quiet_since = heard, elapsed
+        mapped = len(self._observer.received)
+        if mapped > self._mapped:
+            self._mapped, self._quiet_since = mapped, elapsed
         for spec in self._due():
             client.submit([spec])
             self._submitted.add(spec.name)
@@ -182,7 +182,7 @@ class MigrationScript:
             return [slam_spec(self._live)]
         if PLAYER not in self._submitted:
             return [player_spec(self._live)] if self._slam_listens() else []
-        if RECORDER not in self._submitted and self._heard >= _RECORDER_AT * len(self._live.drive):
+        if RECORDER not in self._submitted and self._mapped >= _RECORDER_AT * len(self._live.drive):
             return [recorder_spec()]
         return []
 
@@ -194,10 +194,10 @@ class MigrationScript:
         """Return True if the player has ended, and all poses were received or no more come."""
         self._rows = {row.name: row for row in view.processes}
         player = self._rows.get(PLAYER)
-        if player is None or player.state not in _OVER or self._rows[SLAM].state == "migrating":
+        if player is None or player.state not in ENDED or self._rows[SLAM].state == "migrating":
             return False
         quiet = self._elapsed - self._quiet_since
-        return self._heard >= len(self._live.drive) or quiet >= _QUIET_S
+        return self._mapped >= len(self._live.drive) or quiet >= _QUIET_S
 
     def progress(self, view: Listing) -> str:
         """Return the progress of the drive, and the host that maps it."""
@@ -206,4 +206,4 @@ class MigrationScript:
             return "the SLAM is to start"
         where = f"on {slam.host}" if slam.host else "on no host yet"
         moving = ", it moves" if slam.state == "migrating" else ""
-        return f"{self._heard:4} of {len(self._live.drive)} scans mapped, {where}{moving}"
+        return f"{self._mapped:4} of {len(self._live.drive)} scans mapped, {where}{moving}"

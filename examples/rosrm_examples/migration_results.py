@@ -28,14 +28,14 @@ class LiveRun:
     Attributes:
         drive: that was played.
         sent: scans that the player sent.
-        heard: every received pose, in order of arrival.
+        received: poses, in order of arrival.
         parts: the part of each instance of the SLAM, in the order in which they were active.
         period: seconds between two scans, as played.
     """
 
     drive: Drive
     sent: int
-    heard: Sequence[ReceivedPose]
+    received: Sequence[ReceivedPose]
     parts: Sequence[MapPart]
     period: float
 
@@ -51,7 +51,7 @@ class LiveRun:
     def by_stamp(self) -> dict[int, ReceivedPose]:
         """Return the first received pose of each scan."""
         first: dict[int, ReceivedPose] = {}
-        for one in self.heard:
+        for one in self.received:
             first.setdefault(one.stamp, one)
         return first
 
@@ -94,8 +94,8 @@ def summarise(run: LiveRun, unmigrated: Floats, migrations: int) -> dict[str, An
         "scans_sent": run.sent,
         "scans_processed": len(first),
         "scans_lost": run.sent - len(first),
-        "scans_repeated": len(run.heard) - len(first) + refused,
-        "out_of_order": sum(b.stamp < a.stamp for a, b in pairwise(run.heard)),
+        "scans_repeated": len(run.received) - len(first) + refused,
+        "out_of_order": sum(b.stamp < a.stamp for a, b in pairwise(run.received)),
         "period_ms": round(1e3 * run.period, 3),
         "gap_ms": round(1e3 * max(gaps), 3) if gaps else None,
         "max_deviation_m": _max_deviation(run, unmigrated),
@@ -111,17 +111,17 @@ def summarise(run: LiveRun, unmigrated: Floats, migrations: int) -> dict[str, An
 def differences(summary: dict[str, Any], state: str, migrations: int) -> list[str]:
     """Return the deviations from a correct run, a line each; empty: there are none."""
     # The order of two writers' messages does not count: DDS may resend some of them late.
-    wanted = {"scans_lost": 0, "scans_repeated": 0, "migrations": migrations}
+    expected = {"scans_lost": 0, "scans_repeated": 0, "migrations": migrations}
     wrong = [
         f"{name} is {summary[name]}, not {value}"
-        for name, value in wanted.items()
+        for name, value in expected.items()
         if summary[name] != value
     ]
     mapped = sum(part["scans"] for part in summary["parts"])
     if mapped != summary["scans_sent"]:
         wrong.append(f"the instances mapped {mapped} scans of {summary['scans_sent']}")
     if migrations and summary["gap_ms"] is None:
-        wrong.append("no successor was heard right after its source")
+        wrong.append("no successor has an output right after its source")
     deviation, largest = summary["max_deviation_m"], LARGEST_DEVIATION_M[state]
     if deviation is None or deviation > largest:
         wrong.append(f"max_deviation_m is {deviation}, more than {largest:g}")

@@ -43,13 +43,13 @@ class Observer:
     DDS notes the time of arrival in a thread of its own, so a busy process does not distort it.
 
     Attributes:
-        heard: In order of arrival.
+        received: In order of arrival.
     """
 
     def __init__(self, ros: RosSettings) -> None:
         """Subscribe."""
         os.environ.update(ros.environment())
-        self.heard: list[ReceivedPose] = []
+        self.received: list[ReceivedPose] = []
         self._context = rclpy.Context()
         rclpy.init(
             context=self._context,
@@ -78,7 +78,7 @@ class Observer:
     def _take(self, message: Odometry, information: dict[str, Any]) -> None:
         arrived = information["received_timestamp"] / 1e9
         stamp = nanoseconds_of(message.header.stamp)
-        self.heard.append(ReceivedPose(arrived, stamp, pose_of(message)))
+        self.received.append(ReceivedPose(arrived, stamp, pose_of(message)))
 
     def close(self) -> None:
         """Unsubscribe, and end the thread."""

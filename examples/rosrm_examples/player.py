@@ -101,7 +101,7 @@ def schedule(times: Floats, rate: float, hz: float | None) -> Floats:
 def _play(drive: Drive, node: Node, options: argparse.Namespace, stop: StopSignals) -> int:
     """Publish the scans; return their number."""
     publisher = node.create_publisher(PointCloud2, "points", SCANS_QOS)
-    if not _heard(publisher, options.subscribers, options.wait, stop):
+    if not _has_subscribers(publisher, options.subscribers, options.wait, stop):
         return 0
     started = time.monotonic()
     sent = 0
@@ -119,7 +119,7 @@ def _play(drive: Drive, node: Node, options: argparse.Namespace, stop: StopSigna
     return sent
 
 
-def _heard(publisher: Any, subscribers: int, longest: float, stop: StopSignals) -> bool:
+def _has_subscribers(publisher: Any, subscribers: int, longest: float, stop: StopSignals) -> bool:
     """Wait for so many subscribers; report where they do not come."""
     deadline = time.monotonic() + longest
     while publisher.get_subscription_count() < subscribers:

@@ -18,7 +18,7 @@ from rosrm.model.ros_settings import RosSettings
 if TYPE_CHECKING:
     from rosrm.client.client import Client
     from rosrm.model.rows import Listing
-    from rosrm.ros.client import MasterClient
+    from rosrm.ros.master_connection import MasterClient
 
 #: Seconds from the start of the command until the message that there is no master: less than 3,
 #: because leaving ROS takes time too.

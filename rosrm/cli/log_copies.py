@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from rosrm.cli.options import seconds_of
 from rosrm.cli.output.log_lines import LogStream, Piece, show
 from rosrm.client.logs import PERIOD, LogReader, LogSelection
-from rosrm.errors import ConfigError, RosrmError
-from rosrm.extensions.units import Quantity
+from rosrm.errors import RosrmError
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
@@ -22,11 +22,8 @@ if TYPE_CHECKING:
 
 def since_of(text: str) -> float:
     """Return the option --since as unix time, 0.0 if it is not given; raises `ConfigError`."""
-    try:
-        ago = Quantity("duration", above=True).parse(text) if text else 0.0
-    except ValueError as error:
-        raise ConfigError(f"--since: {error}. Give a time span up to now, e.g. 10min") from None
-    return time.time() - ago if ago else 0.0
+    hint = ". Give a time span up to now, e.g. 10min"
+    return time.time() - seconds_of("--since", text, hint=hint) if text else 0.0
 
 
 def copy_logs(client: Client, streams: Sequence[LogStream], selection: LogSelection) -> None:

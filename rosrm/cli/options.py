@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from rosrm.errors import ConfigError
+from rosrm.extensions.units import Quantity
 from rosrm.model.ros_settings import HIGHEST_DOMAIN
 
 
@@ -33,3 +35,13 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a ta
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a process.")]
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of processes.")]
 Host = Annotated[str, typer.Argument(metavar="HOST", help="Name of a host.")]
+
+
+def seconds_of(
+    option: str, text: str, *, low: float = 0.0, above: bool = True, hint: str = ""
+) -> float:
+    """Return the time span of an option in seconds; raises `ConfigError`, with the hint."""
+    try:
+        return Quantity("duration", low=low, above=above).parse(text)
+    except ValueError as error:
+        raise ConfigError(f"{option}: {error}{hint}") from None

@@ -9,21 +9,18 @@ from typing import Final
 
 import typer
 
+from rosrm.cli.options import seconds_of
 from rosrm.client.waiting import UNTIL_ASKED, WaitResult
-from rosrm.errors import ConfigError, NoMaster
-from rosrm.extensions.units import Quantity
+from rosrm.errors import NoMaster
 from rosrm.model.rows import ProcessRow
-from rosrm.wording import listed, standing
+from rosrm.wording import listed, standing, words
 
 _NOTEWORTHY: Final = UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
 
 
 def longest(text: str) -> float | None:
-    """Return a time-out of the command line in seconds; None for "". Raises `ConfigError`."""
-    try:
-        return Quantity("duration", above=True).parse(text) if text else None
-    except ValueError as error:
-        raise ConfigError(f"--timeout: {error}") from None
+    """Return the option --timeout in seconds, None for ""; raises `ConfigError`."""
+    return seconds_of("--timeout", text) if text else None
 
 
 @contextmanager
@@ -47,7 +44,7 @@ def show_change(row: ProcessRow) -> None:
 
 def show_processes(result: WaitResult) -> None:
     """Print the result of a wait for processes; exit with 1 if they are not done."""
-    counts = Counter(row.state.replace("_", " ") for row in result.processes)
+    counts = Counter(words(row.state) for row in result.processes)
     summary = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
     typer.echo(summary or "all processes were removed")
     states = {row.name: row.state for row in result.processes}

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rosrm.client.logs import LogChunk, LogReader, LogSelection
     from rosrm.client.waiting import OnChange, Until, WaitResult
     from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
-    from rosrm.ros.client import MasterClient
+    from rosrm.ros.master_connection import MasterClient
 
 #: A work file by its path, a process as a work file has it, or a spec.
 Work = Union[str, "os.PathLike[str]", Mapping[str, Any], ProcessSpec]

@@ -14,7 +14,7 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.wording import no_such
 
 if TYPE_CHECKING:
-    from rosrm.ros.client import MasterClient
+    from rosrm.ros.master_connection import MasterClient
     from rosrm.ros.participant import Participant
 
 Row = TypeVar("Row")
@@ -24,19 +24,17 @@ CLUSTER_VARIABLE: Final = "ROSRM_CLUSTER"
 
 
 def ros_settings(
-    domain: int | None = None, cluster: str | os.PathLike[str] | None = None,
-    environment: Mapping[str, str] = os.environ,
-) -> RosSettings:  # fmt: skip
+    domain: int | None = None, cluster: str | os.PathLike[str] | None = None
+) -> RosSettings:
     """Return the settings with which to join ROS.
 
     Args:
         domain: replaces the domain of the file and ROS_DOMAIN_ID.
         cluster: a cluster.yaml, whose `ros` section is read; None: that of ROSRM_CLUSTER.
-        environment: of this process.
     """
     settings = RosSettings()
-    if path := cluster or environment.get(CLUSTER_VARIABLE):
-        from rosrm.config import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
+    if path := cluster or os.environ.get(CLUSTER_VARIABLE):
+        from rosrm.config.cluster import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
 
         settings = load_cluster(os.fspath(path)).ros
     return settings if domain is None else replace(settings, domain=domain)
@@ -60,7 +58,8 @@ def connect(
         RosrmError: ROS 2 cannot be imported.
     """
     try:
-        from rosrm.ros.client import MasterClient  # noqa: PLC0415 - the first import of ROS
+        # The first import of ROS.
+        from rosrm.ros.master_connection import MasterClient  # noqa: PLC0415
     except ImportError as error:
         if (error.name or "").split(".")[0] == "rosrm":
             raise

@@ -18,7 +18,7 @@ from rosrm.wording import duration, listed, no_such, standing, standing_for
 
 if TYPE_CHECKING:
     from rosrm.model.rows import HostRow, Listing, LogPart, ProcessRow
-    from rosrm.ros.client import MasterClient
+    from rosrm.ros.master_connection import MasterClient
 
 _PART: Final = 256 * 1024
 #: Seconds between two polls of logs without new output.
@@ -157,18 +157,17 @@ class LogReader:
         return first, end, lines + (last != b"\n")
 
     def _read(
-        self, host: str, number: int, offset: int, most: int = 0, *, tail: int = 0,
+        self, host: str, number: int, offset: int, most: int = _PART, *, tail: int = 0,
         since: float = 0.0,
     ) -> LogPart:  # fmt: skip
-        name, most = self.process, most or _PART
         if host not in self.silent:
             try:
                 return self.master.read_log(
-                    host, name, number, offset, most, tail=tail, since=since
+                    host, self.process, number, offset, most, tail=tail, since=since
                 )
             except NoMaster as error:
                 self.silent[host] = str(error)
-        raise NoMaster(f"{name}: {self.silent[host]}")
+        raise NoMaster(f"{self.process}: {self.silent[host]}")
 
     def _take(self, host: str, part: LogPart) -> LogChunk:
         """Continue behind a part, and return it as a chunk."""
@@ -186,7 +185,7 @@ class LogReader:
 
     def _find(self) -> list[tuple[str, int]]:
         """Return host and number of every instance within reach, the oldest first."""
-        name, row, hosts, events = self._ask()
+        row, hosts, events = self._ask()
         check_name("host", self.selection.host, hosts)
         if self.selection.host:
             names = [self.selection.host]
@@ -195,7 +194,9 @@ class LogReader:
             names = list(dict.fromkeys([*here, *(host for host in events if host)]))
         if not names and row is None:
             known = self.master.list(processes=True).processes
-            raise Refused(no_such("process", [name], [row.name for row in known]), "unknown")
+            raise Refused(
+                no_such("process", [self.process], [row.name for row in known]), "unknown"
+            )
         owner = row.host if row is not None and not self.selection.host else self.selection.host
         self._hosts = names
         self._away = {host: away for host in names if (away := _why_away(hosts.get(host), host))}
@@ -206,7 +207,7 @@ class LogReader:
             if host not in self._away:
                 found += [(host, number) for number in self._numbers(host, owner)]
         for away in self._away.values():
-            self.notify(f"{name}: part of its log cannot be read: {away}")
+            self.notify(f"{self.process}: part of its log cannot be read: {away}")
         return sorted(found, key=lambda one: one[1])
 
     def _numbers(self, host: str, owner: str) -> Sequence[int]:
@@ -224,14 +225,14 @@ class LogReader:
             return ()
         return part.numbers or (part.number,)
 
-    def _ask(self) -> tuple[str, ProcessRow | None, dict[str, HostRow], list[str]]:
-        name = self.process
+    def _ask(self) -> tuple[ProcessRow | None, dict[str, HostRow], list[str]]:
+        """Return the row of the process, the hosts by name, and the names of its former hosts."""
         listed: Listing = self.master.list(
-            hosts=True, processes=True, events=True, process=name, newest=_EVENTS
+            hosts=True, processes=True, events=True, process=self.process, newest=_EVENTS
         )
-        row = next((row for row in listed.processes if row.name == name), None)
+        row = next((row for row in listed.processes if row.name == self.process), None)
         hosts = {row.description.name: row for row in listed.hosts}
-        return name, row, hosts, _hosts_of(listed)
+        return row, hosts, _hosts_of(listed)
 
     def _refuse(self, row: ProcessRow | None, host: str) -> None:
         """Say at once that the newest part is out of reach, with what the master knows."""
@@ -251,7 +252,7 @@ class LogReader:
 
     def _explain_nothing(self, found: Sequence[tuple[str, int]]) -> None:
         """Say why nothing is shown; raises `Refused` where no program was started."""
-        name, row, _, _ = self._ask()
+        name, (row, _, _) = self.process, self._ask()
         if self.selection.follow and row is not None and row.state not in ENDED:
             return
         where = f" on {self.selection.host}" if self.selection.host else ""
@@ -266,7 +267,7 @@ class LogReader:
 
     def _find_next(self) -> LogChunk | None:
         """Return the beginning of the next instance; None if there is none, or none yet."""
-        _, row, _, _ = self._ask()
+        row, _, _ = self._ask()
         if row is None or row.state in ENDED or self.selection.host:
             self.at_end = True
             return None

@@ -13,7 +13,7 @@ from rosrm.model.rows import EventRow, ProcessRow
 from rosrm.wording import standing
 
 if TYPE_CHECKING:
-    from rosrm.ros.client import MasterClient
+    from rosrm.ros.master_connection import MasterClient
 
 #: Seconds for which a process is set aside before it counts as waiting for a host that may never
 #: come: just after the start of a cluster its hosts are still registering.

@@ -59,14 +59,8 @@ def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> 
 def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -> None:
     check_name(root.get("name"), "cluster", problems)
     check_amounts(root.get("defaults", "needs"), "defaults.needs", problems)
-    if config is not None and config.liveness.suspect >= config.liveness.lease:
-        problems.add(
-            root.deepest(("liveness", "suspect")).place,
-            f"liveness.suspect ({config.liveness.suspect:g} s) must be less than "
-            f"liveness.lease ({config.liveness.lease:g} s)",
-        )
     if config is not None:
-        _check_beats(root, config, problems)
+        _check_times(root, config, problems)
     options = root.get("checkpoint", "options")
     named = root.get("checkpoint", "policy")
     if options is not None and options.items and named is not None and named.value is None:
@@ -75,8 +69,14 @@ def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -
         )
 
 
-def _check_beats(root: Node, config: ClusterConfig, problems: Problems) -> None:
-    suspect, period = config.liveness.suspect, config.control.beat_period
+def _check_times(root: Node, config: ClusterConfig, problems: Problems) -> None:
+    suspect, lease = config.liveness.suspect, config.liveness.lease
+    if suspect >= lease:
+        problems.add(
+            root.deepest(("liveness", "suspect")).place,
+            f"liveness.suspect ({suspect:g} s) must be less than liveness.lease ({lease:g} s)",
+        )
+    period = config.control.beat_period
     if suspect >= _BEATS * period - _ROUNDING:
         return
     keys = ("control", "beat_period")

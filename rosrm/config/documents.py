@@ -111,11 +111,11 @@ class Problems:
 
 def _allowed_once(lines: Iterable[str]) -> Iterator[str]:
     """Yield the lines; print each list of allowed values only with its first line."""
-    said = set()
+    shown = set()
     for line in lines:
         fault, mark, allowed = line.partition(" Allowed: ")
-        yield fault if allowed in said else line
-        said.update([allowed] if mark else [])
+        yield fault if allowed in shown else line
+        shown.update([allowed] if mark else [])
 
 
 def read(path: str | Path) -> Node:

@@ -34,14 +34,12 @@ def load_host(path: str | Path, registry: Registry | None = None) -> HostConfig:
     probes = plugins.by_name("probe", chosen)
     given = chosen is not None and chosen.value is not None
     if registry is not None:
+        measured = probes if given else registry.default_probes()
         for key in ("limits", "budget"):
-            measured = probes if given else registry.default_probes()
             plugins.check_resources(root.get(key), key, measured)
     problems.raise_any()
     assert config is not None  # else there was a problem
-    if chosen is None or chosen.value is None:
-        return replace(config, state=settled(config.state, path))
-    return replace(config, state=settled(config.state, path), probes=probes)
+    return replace(config, state=settled(config.state, path), probes=probes if given else None)
 
 
 def _check_rules(root: Node, problems: Problems) -> None:

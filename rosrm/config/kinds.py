@@ -52,18 +52,18 @@ def kind_of(root: Node) -> str:
     if named is not None and (named in best or not best):
         return named
     if not isinstance(root.value, Mapping):
-        said = "it is no mapping; in a work file the list is under `processes:`"
-        raise ConfigError(f"{root.place}: {said}")
+        fault = "it is no mapping; in a work file the list is under `processes:`"
+        raise ConfigError(f"{root.place}: {fault}")
     if best:
-        said = f"its keys fit a {' and a '.join(best)} file alike"
+        fault = f"its keys fit a {' and a '.join(best)} file alike"
     else:
-        said = "it has no key of a cluster, host, work or simulation file"
+        fault = "it has no key of a cluster, host, work or simulation file"
         known = [key for keys in _KEYS.values() for key in keys]
         for key in root.items:
             if close := get_close_matches(key, known, 1):
                 hint = f"{key!r}: did you mean {close[0]!r}? Choose one with --kind"
-                raise ConfigError(f"{root.place}: {said}, and {hint}")
-    raise ConfigError(f"{root.place}: {said}; choose one with --kind")
+                raise ConfigError(f"{root.place}: {fault}, and {hint}")
+    raise ConfigError(f"{root.place}: {fault}; choose one with --kind")
 
 
 def check_kind(root: Node, wanted: str) -> None:

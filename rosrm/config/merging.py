@@ -26,7 +26,7 @@ def merged(defaults: Node, entry: Node) -> Node:
     if any(name in entry.items for name in _PROGRAM):
         under = {name: node for name, node in under.items() if name not in _PROGRAM}
     if entry.get("migration", "strategy") is not None and "migration" in under:
-        under["migration"] = _without(under["migration"], "options")
+        under["migration"] = _without_options(under["migration"])
     return in_depth(Node(under, entry.place), entry)
 
 
@@ -40,8 +40,8 @@ def in_depth(under: Node, over: Node) -> Node:
     return Node(members, over.place, over.key_place)
 
 
-def _without(node: Node, name: str) -> Node:
-    members = {key: item for key, item in node.items.items() if key != name}
+def _without_options(node: Node) -> Node:
+    members = {key: item for key, item in node.items.items() if key != "options"}
     return Node(members, node.place, node.key_place) if node.items else node
 
 

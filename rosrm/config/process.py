@@ -14,12 +14,16 @@ from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Sec
 from rosrm.model.values import (
     EMPTY,
     Health,
+    HostLossAction,
     HostLossPolicy,
+    IsolationAction,
     IsolationPolicy,
     Kind,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
+    ReadinessKind,
+    RestartCondition,
     RestartPolicy,
     StandbyPolicy,
     StopPolicy,
@@ -40,7 +44,7 @@ ListOfWords = Annotated[tuple[Text, ...], Words()]
 class RestartInFile:
     """Policy for restarts of an ended process on its host; `kind` gives the default of `when`."""
 
-    when: Literal["never", "on-failure", "always"] | None = None
+    when: RestartCondition | None = None
     delay: Seconds = _RESTART.delay
     max_delay: Seconds = _RESTART.max_delay
     factor: Annotated[float, Quantity(low=1.0, high=100.0)] = _RESTART.factor
@@ -61,7 +65,7 @@ class MigrationInFile:
 class ReadinessInFile:
     """Condition for an instance to count as ready."""
 
-    kind: Literal["auto", "graph", "running"] = "auto"
+    kind: ReadinessKind = "auto"
     timeout: PositiveSeconds = _READINESS.timeout
 
 
@@ -77,7 +81,7 @@ class StopInFile:
 class HostLossInFile:
     """Reaction of the master when the host of a process is lost."""
 
-    then: Literal["wait", "elsewhere", "stop"] = "wait"
+    then: HostLossAction = "wait"
     delay: Seconds = 0.0
 
 
@@ -85,7 +89,7 @@ class HostLossInFile:
 class IsolationInFile:
     """Reaction of a host that cannot reach the master; 0 s: before the process runs elsewhere."""
 
-    then: Literal["keep", "stop"] = "keep"
+    then: IsolationAction = "keep"
     after: Seconds = 0.0
 
 
@@ -145,30 +149,19 @@ class ProcessInFile:
     standby: StandbyInFile = field(default_factory=lambda: StandbyInFile(wanted=False))
     health: HealthInFile | None = None
 
-    @property
-    def is_ros(self) -> bool:
-        """Return True for a ROS node: as given by `ros`, else for programs of a ROS package."""
-        return self.package is not None if self.ros is None else self.ros
-
-    @property
-    def restart_policy(self) -> RestartPolicy:
-        """Return the restart policy.
+    def spec(self) -> ProcessSpec:
+        """Return the process as the spec that the core uses.
 
         By default a service restarts on failure, as after a power cut. A job never restarts,
         because it may not be repeatable.
         """
         when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
-        return _same(RestartPolicy, self.restart, when=when)
-
-    def spec(self) -> ProcessSpec:
-        """Return the process as the spec that the core uses."""
         return _same(
             ProcessSpec,
             self,
             parameters=dict(flattened(self.parameters)),
-            ros=self.is_ros,
             kind=Kind(self.kind),
-            restart=self.restart_policy,
+            restart=_same(RestartPolicy, self.restart, when=when),
             required_labels=self.labels.required,
             preferred_labels=self.labels.preferred,
             avoided_labels=self.labels.avoided,
@@ -214,47 +207,43 @@ class Complaint:
     text: str
 
 
-def complaints(
-    process: ProcessInFile, wrong: AbstractSet[str] = frozenset()
-) -> Iterator[Complaint]:
-    """Yield every violation of a rule by a process.
+def complaints(spec: ProcessSpec, wrong: AbstractSet[str]) -> Iterator[Complaint]:
+    """Yield every violation of a rule by the spec of an entry.
 
     Args:
-        process: the entry; unreadable values have their defaults.
+        spec: unreadable values have their defaults.
         wrong: keys whose values could not be read; rules that read them are skipped.
     """
     for rule, keys in _RULES:
         if wrong.isdisjoint(keys):
-            yield from rule(process)
+            yield from rule(spec)
 
 
-def _about_ros(process: ProcessInFile) -> Iterator[Complaint]:
-    yield from _about_node(process) if process.is_ros else _about_others(process)
+def _about_ros(spec: ProcessSpec) -> Iterator[Complaint]:
+    yield from _about_node(spec) if spec.ros else _about_others(spec)
 
 
-def _about_restarts(process: ProcessInFile) -> Iterator[Complaint]:
-    if process.restart.max_delay < process.restart.delay:
+def _about_restarts(spec: ProcessSpec) -> Iterator[Complaint]:
+    if spec.restart.max_delay < spec.restart.delay:
         text = "restart.max_delay must not be less than restart.delay"
         yield Complaint(("restart", "max_delay"), text)
 
 
-def _about_faults(process: ProcessInFile) -> Iterator[Complaint]:
-    standby = process.standby
-    if standby.wanted and process.kind == "job":
+def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
+    standby = spec.standby
+    if standby.wanted and spec.kind == "job":
         yield Complaint(("standby",), "a job runs to completion; only a service has a standby")
     if standby.apart_by and not standby.wanted:
         yield Complaint(("standby", "apart_by"), "standby.apart_by goes with `wanted: true`")
-    if process.isolation.after and process.isolation.then == "keep":
+    if spec.isolation.after and spec.isolation.then == "keep":
         yield Complaint(("isolation", "after"), "isolation.after goes with `then: stop`")
-    if process.host_loss.delay and process.host_loss.then == "wait":
+    if spec.host_loss.delay and spec.host_loss.then == "wait":
         text = "host_loss.delay goes with `then: elsewhere` or `stop`"
         yield Complaint(("host_loss", "delay"), text)
 
 
-def _about_health(process: ProcessInFile) -> Iterator[Complaint]:
-    health = process.health
-    if health is None:
-        return
+def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
+    health = spec.health
     if bool(health.topic) != bool(health.rate):
         text = "health.topic and health.rate (Hz, above 0) go together"
         yield Complaint(("health",), text)
@@ -264,60 +253,60 @@ def _about_health(process: ProcessInFile) -> Iterator[Complaint]:
     if health.lifecycle and health.lifecycle not in _LIFECYCLE:
         text = f"health.lifecycle {health.lifecycle!r}; allowed: {', '.join(_LIFECYCLE)}"
         yield Complaint(("health", "lifecycle"), text)
-    if (health.topic or health.lifecycle) and not process.is_ros:
+    if (health.topic or health.lifecycle) and not spec.ros:
         text = "health: only a ROS node has topics and a lifecycle; set `ros: true` if this is one"
         yield Complaint(("health",), text)
 
 
-def _about_program(process: ProcessInFile) -> Iterator[Complaint]:
+def _about_program(spec: ProcessSpec) -> Iterator[Complaint]:
     programs = {
-        "package + executable": process.package or process.executable,
-        "module": process.module,
-        "command": process.command,
+        "package + executable": spec.package or spec.executable,
+        "module": spec.module,
+        "command": spec.command,
     }
     given = [name for name, value in programs.items() if value]
     if len(given) != 1:
-        said = f"{listed(given)} are given" if given else "no program is given"
-        yield Complaint((), f"{said}; give one of package + executable, module or command")
-    elif process.package and not process.executable:
-        text = f"package {process.package!r} is given without an executable"
+        fault = f"{listed(given)} are given" if given else "no program is given"
+        yield Complaint((), f"{fault}; give one of package + executable, module or command")
+    elif spec.package and not spec.executable:
+        text = f"package {spec.package!r} is given without an executable"
         yield Complaint(("package",), text)
-    elif process.executable and not process.package:
-        text = f"executable {process.executable!r} is given without a package"
+    elif spec.executable and not spec.package:
+        text = f"executable {spec.executable!r} is given without a package"
         advice = "a program that is in no ROS package goes under `command`"
         yield Complaint(("executable",), f"{text}; {advice}")
 
 
-def _about_others(process: ProcessInFile) -> Iterator[Complaint]:
+def _about_others(spec: ProcessSpec) -> Iterator[Complaint]:
     for name in _ROS_ONLY:
-        if getattr(process, name):
+        if getattr(spec, name):
             text = f"{name}: only a ROS node has one; set `ros: true` if this is one"
             yield Complaint((name,), text)
-    if process.readiness.kind == "graph":
+    if spec.readiness.kind == "graph":
         text = "readiness: only a ROS node is seen in the graph"
         yield Complaint(("readiness", "kind"), text)
 
 
-def _about_node(process: ProcessInFile) -> Iterator[Complaint]:
-    if not _NODE_NAME.fullmatch(process.name):
+def _about_node(spec: ProcessSpec) -> Iterator[Complaint]:
+    if not _NODE_NAME.fullmatch(spec.name):
         allowed = "at most 200 letters, digits and '_', the first of them not a digit"
-        text = f"{process.name!r} cannot be the name of a ROS node. Allowed: {allowed}"
+        text = f"{spec.name!r} cannot be the name of a ROS node. Allowed: {allowed}"
         yield Complaint(("name",), text)
-    if process.namespace and not _NAMESPACE.fullmatch(process.namespace):
-        text = f"{process.namespace!r} is not an absolute namespace such as '/robot1'"
+    if spec.namespace and not _NAMESPACE.fullmatch(spec.namespace):
+        text = f"{spec.namespace!r} is not an absolute namespace such as '/robot1'"
         yield Complaint(("namespace",), text)
-    for name, value in flattened(process.parameters):
+    for name, value in spec.parameters.items():
         fault = _fault_of_parameter(value)
         if fault:
             yield Complaint(("parameters", *name.split(".")), f"parameters.{name}: {fault}")
 
 
-def _about_surroundings(process: ProcessInFile) -> Iterator[Complaint]:
-    directory = process.working_directory
+def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
+    directory = spec.working_directory
     if directory == "":
         text = 'working_directory: "" is no directory; leave it out for one of the process\'s own'
         yield Complaint(("working_directory",), text)
-    for name, value in process.environment.items():
+    for name, value in spec.environment.items():
         if not name or "=" in name or "\0" in name + value:
             yield Complaint(("environment", name), f"environment: {name!r} cannot be a variable")
 
@@ -334,7 +323,7 @@ def _fault_of_parameter(value: Any) -> str:
     return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
 
 
-_Rule = Callable[[ProcessInFile], Iterator[Complaint]]
+_Rule = Callable[[ProcessSpec], Iterator[Complaint]]
 _PROGRAM: Final = ("package", "executable", "module", "command")
 #: Each rule with the keys that it reads.
 _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (

@@ -1,13 +1,14 @@
-"""Rules on names and amounts of a file, and resolution of paths relative to the file."""
+"""Rules on names and amounts in a file, and resolution of paths relative to the file."""
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from rosrm.config.documents import Node, Problems
+from rosrm.config.documents import Node, Place, Problems
 from rosrm.extensions.units import ANY_AMOUNT, amount_of
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
@@ -22,6 +23,30 @@ def check_name(node: Node | None, what: str, problems: Problems) -> None:
         f"{node.value!r} cannot be the name of a {what}. Allowed: at most 200 letters, digits, "
         "'_', '-' and '.', the first of them a letter, digit or '_'",
     )
+
+
+def refuse_namesakes(nodes: Sequence[Node], what: str, problems: Problems) -> None:
+    """Note every duplicate name in a list of entries.
+
+    Args:
+        nodes: the entries.
+        what: kind of the entries, for messages.
+        problems: receives every problem.
+    """
+    first: dict[str, Place] = {}
+    for node in nodes:
+        name = node.get("name")
+        if name is None or not isinstance(name.value, str):
+            continue
+        before = first.get(name.value)
+        if before is None:
+            first[name.value] = name.place
+        elif before == name.place:
+            text = f"foreach gives every {what} the name {name.value!r}; put one of its names in"
+            problems.add(name.place, text)
+        else:
+            where = f"first given at line {before.line}, column {before.column}"
+            problems.add(name.place, f"duplicate {what} name {name.value!r}, {where}")
 
 
 def check_amounts(

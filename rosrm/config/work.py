@@ -12,10 +12,9 @@ from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import expanded
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
-from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, complaints
-from rosrm.config.rules import check_amounts, check_name, settled_on_host
+from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, settled_on_host
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
@@ -107,12 +106,12 @@ def _process(
     process, wrong = salvaged(ProcessInFile, node, problems)
     if process is None:
         return None
-    for complaint in complaints(process, wrong):
-        problems.add(node.deepest(complaint.path).place, complaint.text)
-    process = _on_host(process, path)
-    if options is not None:
-        process = replace(process, migration=replace(process.migration, options=options))
     spec = process.spec()
+    for complaint in complaints(spec, wrong):
+        problems.add(node.deepest(complaint.path).place, complaint.text)
+    spec = _on_host(spec, path)
+    if options is not None:
+        spec = replace(spec, migration=replace(spec.migration, options=options))
     fault = plugins.standby_fault(spec) if wrong.isdisjoint(("standby", "migration")) else ""
     if fault:
         problems.add(node.deepest(("standby",)).place, fault)
@@ -128,17 +127,17 @@ def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] 
     strategy, given = node.get("migration", "strategy"), node.get("migration", "options")
     if strategy is None or not isinstance(strategy.value, str):
         return None
-    said = given.items if given is not None else {}
-    options = given if said else None
+    own = given.items if given is not None else {}
+    options = given if own else None
     checked = plugins.choice("migration", strategy.value, strategy, options, own=True)
-    return {name: value for name, value in checked.items() if name in said}
+    return {name: value for name, value in checked.items() if name in own}
 
 
-def _on_host(process: ProcessInFile, path: str | Path) -> ProcessInFile:
-    """Return the process with its program and directory as `settled_on_host` writes them."""
-    directory, command = process.working_directory, process.command
+def _on_host(spec: ProcessSpec, path: str | Path) -> ProcessSpec:
+    """Return the spec with its program and directory as `settled_on_host` writes them."""
+    directory, command = spec.working_directory, spec.command
     if directory:
-        process = replace(process, working_directory=settled_on_host(directory, path))
+        spec = replace(spec, working_directory=settled_on_host(directory, path))
     if command and "/" in command[0]:
-        process = replace(process, command=(settled_on_host(command[0], path), *command[1:]))
-    return process
+        spec = replace(spec, command=(settled_on_host(command[0], path), *command[1:]))
+    return spec

@@ -4,6 +4,7 @@ hookspecs.py         every hook, in one list
 contracts.py         Protocols of probes, policies, strategies and ports, and their offers
 options.py           the options of a process, merged over those of the cluster
 units.py             numbers with units in options
+installed.py         the installed plugins, as entry points
 discovery.py         loads the installed plugins, and calls their hooks
 registry.py          selects plugins by name, and checks their options
 declared_fields.py   the fields of a process that an offer declares to read

@@ -103,4 +103,4 @@ class Declared:
 
     def has_snapshots(self, spec: ProcessSpec) -> bool:
         """Return True if the node of a process publishes a state of which snapshots are kept."""
-        return spec.ros_node and self.capabilities_of(spec).state == "topics"
+        return bool(spec.ros) and self.capabilities_of(spec).state == "topics"

@@ -214,21 +214,18 @@ class Registry:
 
     def resources(self) -> tuple[str, ...]:
         """Return the names of all resources that the installed probes may read."""
-        offers = [cast(ProbeOffer, self.offer("probe", name)) for name in self.names("probe")]
-        return tuple(sorted({name for offer in offers for name in offer.resources}))
+        return tuple(sorted({name for offer in self._probe_offers() for name in offer.resources}))
 
     def probes_of(self, resource: str) -> tuple[str, ...]:
         """Return the names of the probes that may read a resource."""
-        return tuple(
-            name
-            for name in self.names("probe")
-            if resource in cast(ProbeOffer, self.offer("probe", name)).resources
-        )
+        return tuple(offer.name for offer in self._probe_offers() if resource in offer.resources)
+
+    def _probe_offers(self) -> list[ProbeOffer]:
+        return [cast(ProbeOffer, self.offer("probe", name)) for name in self.names("probe")]
 
     def default_probes(self) -> NameToOptions:
         """Return the default probes of a host without configured ones, without options."""
-        offers = [self.offer("probe", name) for name in self.names("probe")]
-        chosen = {o.name: EMPTY for o in offers if isinstance(o, ProbeOffer) and o.default}
+        chosen = {offer.name: EMPTY for offer in self._probe_offers() if offer.default}
         if not chosen:
             raise ConfigError(
                 "no probe is installed, so this host could not be measured. "
@@ -295,15 +292,14 @@ class Registry:
 
     def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
         """Return the declarations in the offers of a scoring policy and of migration strategies."""
-        offers = {name: self._strategy(name) for name in chosen}
         return Declared(
             reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),
             options_of=self._options(chosen),
             capabilities_of=self.capabilities_of(chosen),
             capabilities=self.capabilities(chosen),
-            executors={name: frozenset(offer.executors) for name, offer in offers.items()},
+            executors={name: frozenset(self._strategy(name).executors) for name in chosen},
             brought_by={
-                name: self._offers["migration", name].source.distribution for name in offers
+                name: self._offers["migration", name].source.distribution for name in chosen
             },
         )
 
@@ -379,7 +375,7 @@ class Registry:
         return {
             executor: OfferedExecutor(name, function)
             for name in self.names("migration")
-            for executor, function in self._executors_of(name).items()
+            for executor, function in self._strategy(name).executors.items()
         }
 
     def broken_strategies(self) -> dict[str, str]:
@@ -389,9 +385,6 @@ class Registry:
             for broken in self._broken
             if broken.kind == "migration"
         }
-
-    def _executors_of(self, name: str) -> Mapping[str, Executor]:
-        return self._strategy(name).executors
 
     def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
         """Make the probes of a host, the default ones for None.
@@ -522,16 +515,16 @@ class Registry:
         """
         owners: dict[str, list[str]] = {}
         for name in self.names("migration"):
-            for executor in self._executors_of(name):
+            for executor in self._strategy(name).executors:
                 owners.setdefault(executor, []).append(name)
         found: dict[str, str] = {}
         for executor, names in owners.items():
             for name in names:
-                function = self._executors_of(name)[executor]
+                function = self._strategy(name).executors[executor]
                 others = [
                     f"{other!r} of {self._offers['migration', other].source}"
                     for other in names
-                    if self._executors_of(other)[executor] is not function
+                    if self._strategy(other).executors[executor] is not function
                 ]
                 if others:
                     reason = f"its executor {executor!r} has the name of one of "

@@ -185,8 +185,8 @@ class SqliteJournal:
         self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
     ) -> Sequence[StoredRecord]:
         """Return the newest matching records after a sequence, oldest first."""
-        where, values = ["sequence > ?"], [after]
-        matched: list[Any] = list(values)
+        where = ["sequence > ?"]
+        matched: list[Any] = [after]
         if process:
             where.append("process = ?")
             matched.append(process)
@@ -201,13 +201,8 @@ class SqliteJournal:
             ).fetchall()
         )
         return [
-            StoredRecord(
-                row[0],
-                row[1],
-                row[2],
-                Record(EventKind.read(row[3]), row[4], row[5], row[6], _facts(row[7])),
-            )
-            for row in reversed(rows)
+            StoredRecord(n, wall, at, Record(EventKind.read(kind), name, on, text, _facts(facts)))
+            for n, wall, at, kind, name, on, text, facts in reversed(rows)
         ]
 
     def _value(self, text: str) -> Any:

@@ -103,8 +103,8 @@ class MasterQueries:
 
     def explain(self, name: str) -> str | None:
         """Return the explanation of a process as JSON; None if the process is unknown."""
-        story = listing.explanation(self._state, name, self._core_now())
-        return None if story is None else json.dumps(story, default=dict)
+        explanation = listing.explanation(self._state, name, self._core_now())
+        return None if explanation is None else json.dumps(explanation, default=dict)
 
 
 def _failing_rows(host: Host) -> list[PluginRow]:

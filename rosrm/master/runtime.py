@@ -49,9 +49,9 @@ from rosrm.master.recorder import Recorder
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
-from rosrm.ros.client import find_master
 from rosrm.ros.master.endpoint import MasterEndpoint
 from rosrm.ros.master.services import MasterIdentity
+from rosrm.ros.master_connection import find_master
 from rosrm.ros.participant import Participant
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
@@ -100,11 +100,11 @@ class MasterRuntime:
         config: ClusterConfig,
         policy: ScoringPolicy,
         strategies: dict[str, MigrationStrategy],
-        plugins: Sequence[PluginRow] = (),
-        fallback: tuple[str, ScoringPolicy] | None = None,
-        checkpoint: CheckpointPolicy | None = None,
+        plugins: Sequence[PluginRow],
+        fallback: tuple[str, ScoringPolicy] | None,
+        checkpoint: CheckpointPolicy | None,
         *,
-        declared: Declared | None = None,
+        declared: Declared,
     ) -> None:
         self._config = config
         self._fallback = fallback
@@ -250,9 +250,8 @@ class MasterRuntime:
 
     def _say_stopped(self) -> None:
         try:
-            self._write(
-                [Record(EventKind.MASTER_STOPPED, message=f"master stopped: {self._stopping}")], []
-            )
+            message = f"master stopped: {self._stopping}"
+            self._write([Record(EventKind.MASTER_STOPPED, message=message)])
         except JournalBlocked as fault:
             _log.warning("%s; the last decisions were neither written nor executed", fault)
         _log.info(
@@ -318,10 +317,8 @@ class MasterRuntime:
             self._behind += blocked
 
     def _carry_out(self, commands: Sequence[Command], now: float) -> None:
-        records = [command for command in commands if isinstance(command, Record)]
-        intents = [command for command in commands if isinstance(command, Intent)]
         try:
-            stored = self._write(records, intents) if records or intents else ()
+            stored = self._write(commands)
         except JournalBlocked as fault:
             self._held = JournalStall(commands, str(fault), now, self._core_now(now), now)
             _log.error(
@@ -335,8 +332,6 @@ class MasterRuntime:
         if now - held.tried < _TRY_AGAIN:
             return False
         held.tried = now
-        records = [command for command in held.commands if isinstance(command, Record)]
-        intents = [command for command in held.commands if isinstance(command, Intent)]
         length = now - held.since
         back = Record(
             EventKind.JOURNAL_BACK,
@@ -344,7 +339,7 @@ class MasterRuntime:
             facts={"seconds": round(length, 1)},
         )  # fmt: skip
         try:
-            stored = self._write([back, *records], intents)
+            stored = self._write([back, *held.commands])
         except JournalBlocked as fault:
             held.reason = str(fault)
             return False
@@ -388,9 +383,12 @@ class MasterRuntime:
             elif isinstance(command, Redeliver):
                 links.redeliver(command, now)
 
-    def _write(
-        self, records: Sequence[Record], intents: Sequence[Intent]
-    ) -> Sequence[StoredRecord]:
+    def _write(self, commands: Sequence[Command]) -> Sequence[StoredRecord]:
+        """Write the records and intents among the commands as one group."""
+        records = [command for command in commands if isinstance(command, Record)]
+        intents = [command for command in commands if isinstance(command, Intent)]
+        if not records and not intents:
+            return ()
         return self._journal.write(records, intents, self._now() - self._started)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import types
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -243,20 +244,21 @@ def _union_reader(choices: tuple[Any, ...]) -> _Convert:
     elif all(hasattr(choice, "KIND") for choice in readers):
         read = _by_kind({choice.KIND: reader for choice, reader in readers.items()})
     else:
-        read = _first_fit(list(readers.values()))
+        read = _first_fit(*readers.values())
     if len(readers) == len(choices):
         return read
     return lambda plain: None if plain is None else read(plain)
 
 
-def _first_fit(readers: list[_Convert]) -> _Convert:
+def _first_fit(first: _Convert, *others: _Convert) -> _Convert:
     def read(plain: Any) -> Any:
-        for reader in readers:
-            try:
-                return reader(plain)
-            except ValueError:
-                continue
-        return readers[0](plain)
+        try:
+            return first(plain)
+        except ValueError:
+            for reader in others:
+                with suppress(ValueError):
+                    return reader(plain)
+            raise
 
     return read
 

@@ -1,8 +1,8 @@
 """Migration plans as data: steps in order, each with its undo, and one commit.
 
-A strategy proposes a `Plan`; `executor.py` carries it out, and a `Run` holds its progress. Before
-the commit a failure undoes the steps done so far, newest first, back to a running source; after it
-the plan is rolled forward. A plan that can do neither is STUCK, which is recorded and shown.
+A strategy proposes a `Plan`; the master's core executes it, and a `Migration` holds its progress.
+Before the commit a failure undoes the steps done so far, newest first, back to a running source;
+after it the plan is rolled forward. A migration that can do neither is shown as stuck.
 """
 
 from __future__ import annotations

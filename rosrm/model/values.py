@@ -1,7 +1,7 @@
 """Values of the core: processes, instances, hosts, resources.
 
-Seconds, bytes and fractions 0..1 are the base units. All values are frozen; mutable state lives in
-the reducers of `rosrm.core` and in the standing arrays of `hosts.py`.
+Seconds, bytes and fractions 0..1 are the base units. All values are frozen; mutable state is in
+`rosrm.core`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 #: Slots of a `resource_info` message: most resources of one host.
 RESOURCE_SLOTS: Final = 16
@@ -18,6 +18,11 @@ RESOURCE_SLOTS: Final = 16
 ABSURD_USAGE: Final = 64.0
 
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
+
+RestartCondition = Literal["never", "on-failure", "always"]
+ReadinessKind = Literal["auto", "graph", "running"]
+HostLossAction = Literal["wait", "elsewhere", "stop"]
+IsolationAction = Literal["keep", "stop"]
 
 
 class Kind(str, Enum):
@@ -32,7 +37,6 @@ class RestartPolicy:
     """Restart of an ended process on its host, with a bounded back-off.
 
     Attributes:
-        when: "never", "on-failure" or "always".
         delay: seconds before the first restart.
         max_delay: bound of the back-off, seconds.
         factor: by which the delay grows with each restart.
@@ -40,7 +44,7 @@ class RestartPolicy:
         window: seconds; after as long without a restart, the count begins at 0 again.
     """
 
-    when: str = "never"
+    when: RestartCondition = "never"
     delay: float = 1.0
     max_delay: float = 30.0
     factor: float = 2.0
@@ -58,7 +62,7 @@ class Readiness:
         timeout: seconds; not ready by then, the start has failed.
     """
 
-    kind: str = "auto"
+    kind: ReadinessKind = "auto"
     timeout: float = 30.0
 
 
@@ -109,7 +113,7 @@ class HostLossPolicy:
         delay: seconds after the loss until that is done.
     """
 
-    then: str = "wait"
+    then: HostLossAction = "wait"
     delay: float = 0.0
 
 
@@ -122,7 +126,7 @@ class IsolationPolicy:
         after: seconds; 0: so soon that it has ended when a successor starts elsewhere.
     """
 
-    then: str = "keep"
+    then: IsolationAction = "keep"
     after: float = 0.0
 
 
@@ -168,7 +172,8 @@ class ProcessSpec:
         namespace: of the node; "" or absolute.
         parameters: ROS parameters, values as in JSON.
         remappings: ROS name to ROS name.
-        ros: it is a ROS node and gets its name, namespace, parameters and remappings.
+        ros: it is a ROS node and gets its name, namespace, parameters and remappings; None, which
+            becomes a boolean: True for an executable of a ROS package.
         needs: declared amounts by resource name, in base units.
         required_labels: host labels without which a host may never take it.
         preferred_labels: among hosts that fit, those with more of these go first.
@@ -187,7 +192,7 @@ class ProcessSpec:
     remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     environment: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     working_directory: str | None = None
-    ros: bool = False
+    ros: bool | None = None
     kind: Kind = Kind.SERVICE
     restart: RestartPolicy = RestartPolicy()
     needs: Mapping[str, float] = field(default_factory=lambda: EMPTY)
@@ -203,10 +208,10 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
 
-    @property
-    def ros_node(self) -> bool:
-        """Return True if it is a ROS node, as declared or as an executable of a ROS package."""
-        return self.ros or self.package is not None
+    def __post_init__(self) -> None:
+        """Set the default of `ros`, which depends on `package`."""
+        if self.ros is None:
+            object.__setattr__(self, "ros", self.package is not None)
 
     @property
     def program(self) -> str:

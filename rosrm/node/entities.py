@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -15,8 +15,6 @@ from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 
 #: Source time stamps in every mark: those of the newest messages of each input.
 COVERED_KEPT: Final = 256
-#: Most messages that are taken from one reader in a row.
-_AT_A_TIME: Final = 1000
 #: Bytes assumed for a field without a size of its own.
 _SMALL: Final = 32
 
@@ -100,21 +98,6 @@ def wants_all(qos: Any) -> bool:
     return qos.history is HistoryPolicy.KEEP_ALL or qos.depth > 1
 
 
-def waiting(subscription: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield received messages that the executor has not served yet, with their information.
-
-    They are taken from the reader, as by the executor. Their number is limited, so the loop ends
-    even if messages arrive faster than it takes them.
-    """
-    handle = subscription.handle
-    with handle:
-        for _ in range(_AT_A_TIME):
-            taken = handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                return
-            yield taken
-
-
 def wants_info(callback: Callable[..., Any]) -> bool:
     """Return True if a callback takes (message, information), by rclpy's rule."""
     signature = inspect.signature(callback)
@@ -179,8 +162,7 @@ class TimerOf:
 
     def stop(self) -> None:
         """Stop running until the next start."""
-        if self.period_ns:
-            self.timer.timer_period_ns, self.period_ns = self.period_ns, 0
+        self.back_in_step()
         self.timer.cancel()
 
 
@@ -208,17 +190,14 @@ class ServiceOf:
     """
 
     def __init__(
-        self,
-        create: Callable[[Callable[[Any, Any], Any]], Any],
-        destroy: Callable[[Any], Any],
-        name: str,
-        serve: Callable[[Any, Any], Any],
-    ) -> None:
+        self, create: Callable[[Callable[[Any, Any], Any]], Any], destroy: Callable[[Any], Any],
+        name: str, serve: Callable[[Any, Any], Any],
+    ) -> None:  # fmt: skip
         self._create = create
         self._destroy = destroy
         self._serve = serve
         self._service: Any = None
-        self._send: Callable[[Any, Any], None] = _drop
+        self._send: Callable[[Any, Any], None] = lambda *_: None
         self._held: deque[tuple[Any, DeferredAnswer]] = deque()
         self.srv_name = name
 
@@ -255,10 +234,6 @@ class ServiceOf:
         if self._service is None:
             raise AttributeError(f"{name}: the service {self.srv_name} is not open in a shadow")
         return getattr(self._service, name)
-
-
-def _drop(_answer: Any, _header: Any) -> None:
-    """Drop an answer, because there is no server yet."""
 
 
 class OpeningOf:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
 from typing import Any, Final
@@ -26,13 +27,14 @@ from rosrm.node.entities import (
     TimerOf,
     refuse_coroutine,
     size_of,
-    waiting,
     wants_all,
     wants_info,
 )
 from rosrm.node.handoff.buffer import InputBuffer, Sent
 from rosrm.node.handoff.replay import InputReplay
 from rosrm.node.identity import NodeIdentity
+from rosrm.ros.polling import waiting
+from rosrm_msgs.msg import CoveredInput
 
 #: Most messages of one input, and most bytes of all inputs, that are buffered for a successor: a
 #: silent source with a stuck destination may have to buffer half a minute of a fast sensor.
@@ -66,7 +68,7 @@ class NodeEntities:
         turn: held while a callback runs.
         sequence: cycles so far.
         in_cycle: a callback of the author has begun and not ended; also True after it raised.
-        on_cycle: called after each cycle.
+        on_cycle: called after each cycle; set by the role in a handoff, as is the next.
         on_overflow: called with the topic of an input whose buffer is full.
     """
 
@@ -82,8 +84,8 @@ class NodeEntities:
         self.inputs: list[Input] = []
         self.outputs: list[Any] = []
         self.timers: list[TimerOf] = []
-        self.on_cycle: Callable[[], None] = _nothing
-        self.on_overflow: Callable[[str], None] = _ignore
+        self.on_cycle: Callable[[], None] = lambda: None
+        self.on_overflow: Callable[[str], None] = lambda _: None
         self._gate = PublisherGate(self.mode is Mode.ACTIVE)
         self._openings: list[ServiceOf | OpeningOf] = []
         self._replay = InputReplay(plain, self.turn, self._serve_next)
@@ -148,13 +150,9 @@ class NodeEntities:
         return next(key for key in itertools.chain([topic], numbered) if key not in taken)
 
     def create_timer(
-        self,
-        period: float,
-        callback: Callable[..., Any] | None,
-        *rest: Any,
-        autostart: bool,
+        self, period: float, callback: Callable[..., Any] | None, *rest: Any, autostart: bool,
         **named: Any,
-    ) -> Any:
+    ) -> Any:  # fmt: skip
         """Create a timer that runs while this node is active."""
         if callback is None:  # rclpy's Rate, which sets a callback of its own later: no cycle
             return self.plain.create_timer(period, None, *rest, autostart=autostart, **named)
@@ -277,11 +275,7 @@ class NodeEntities:
         return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
 
     def serve_what_has_come(self, then: Callable[[], None]) -> None:
-        """Serve received messages before falling silent, because a later shadow never got them.
-
-        Args:
-            then: called when they are served.
-        """
+        """Serve received messages, because a later shadow never got them, then call `then`."""
         if not self._replay.is_on:
             self.catch_up()
         if self.buffer:
@@ -332,25 +326,42 @@ class NodeEntities:
             what = f"{type(error).__name__}: {error}"
             self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
-    def inherit(self, key: str, covered: Iterable[int]) -> None:
-        """Add time stamps that the source covered to those of the input here."""
-        for one in self.inputs:
-            if one.key == key:
-                one.covered.extend(covered)
+    def covered_inputs(self, publishers: Callable[[Input], int]) -> list[CoveredInput]:
+        """Return the processed messages of each buffered input, for a mark of the state."""
+        return [
+            CoveredInput(
+                topic=one.key, publishers=publishers(one), covered=array("q", one.covered)
+            )
+            for one in self.inputs if one.buffered
+        ]  # fmt: skip
+
+    def cover(self, inputs: Iterable[CoveredInput]) -> None:
+        """Drop messages that a state covers, now or when they arrive."""
+        for one in inputs:
+            self.buffer.cover(
+                one.topic, one.covered, single=one.publishers <= 1, now=time.monotonic()
+            )
+
+    def inherit(self, inputs: Iterable[CoveredInput]) -> None:
+        """Count messages that the source of the state processed as processed here."""
+        own = {one.key: one for one in self.inputs}
+        for covered in inputs:
+            if covered.topic in own:
+                own[covered.topic].covered.extend(covered.covered)
 
     def timers_due(self) -> list[int]:
         """Return the nanoseconds until each timer is due, in order of creation; -1: cancelled."""
         return [timer.due_ns() for timer in self.timers]
 
     def become_active(
-        self, timers_due: list[float | None], announce: Callable[[], None],
+        self, timers_due: Sequence[int], since: float, announce: Callable[[], None],
         settle: Sequence[Callable[[], None]] = (),
     ) -> None:  # fmt: skip
         """Become active: first announce it, then serve buffered messages.
 
         Args:
-            timers_due: seconds until each timer is due, negative where it is late; None: it was
-                cancelled. Timers beyond the list start now.
+            timers_due: as `timers_due` returned it; timers beyond the list start now.
+            since: monotonic time at which it did.
             announce: called at once, because serving may take long.
             settle: called after the first slices of buffered messages and the start of timers and
                 services.
@@ -359,13 +370,13 @@ class NodeEntities:
         self._gate.is_open = True
         self._late_until = time.monotonic() + _LATE
         announce()
-        self._replay.begin(self._go_on(timers_due, time.monotonic(), settle))
+        self._replay.begin(self._start(timers_due, since, settle))
 
-    def _go_on(
-        self, timers_due: list[float | None], begun: float, settle: Sequence[Callable[[], None]]
+    def _start(
+        self, timers_due: Sequence[int], since: float, settle: Sequence[Callable[[], None]]
     ) -> Iterator[None]:
         """Start timers and services in steps of some ms; new messages are served between steps."""
-        self._start_timers(timers_due, time.monotonic() - begun)
+        self._start_timers(timers_due, time.monotonic() - since)
         for opening in list(self._openings):
             yield
             if self.mode is not Mode.ACTIVE:
@@ -376,24 +387,16 @@ class NodeEntities:
             yield
             call()
 
-    def _start_timers(self, due: list[float | None], passed: float) -> None:
-        for index, timer in enumerate(list(self.timers)):
-            if index >= len(due):
+    def _start_timers(self, timers_due: Sequence[int], passed: float) -> None:
+        for timer, due in itertools.zip_longest(list(self.timers), timers_due):
+            if timer is None:
+                return
+            if due is None:
                 if timer.started:
                     timer.timer.reset()
-                continue
-            seconds = due[index]
-            if seconds is None:
+            elif due < 0:
                 timer.timer.cancel()
             elif timer.follows_ros_time():
                 timer.timer.reset()  # simulated seconds differ from monotonic ones
             else:
-                timer.start_in(seconds - passed)
-
-
-def _nothing() -> None:
-    """Do nothing, as long as no role is set."""
-
-
-def _ignore(_topic: str) -> None:
-    """Do nothing, as long as no role is set."""
+                timer.start_in(due / 1e9 - passed)

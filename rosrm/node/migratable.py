@@ -68,12 +68,9 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     # --- for authors -----------------------------------------------------------------------
 
     def keep_state(
-        self,
-        topic: str,
-        message_type: Any,
-        save: Callable[[], Any],
+        self, topic: str, message_type: Any, save: Callable[[], Any],
         restore: Callable[[Any], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Name one topic of this node's state; several calls make a state of several parts.
 
         Args:
@@ -115,7 +112,6 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """Create a subscription as rclpy's.
 
         Args:
-            msg_type, topic, callback, qos_profile, named: as rclpy has them.
             buffer: in a handoff every message is processed once, by the source or by the
                 destination; False: messages are skipped while the node is not active.
         """

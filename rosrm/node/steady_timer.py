@@ -14,11 +14,7 @@ def steady_timer(
 ) -> Any:
     """Create a timer by the monotonic clock; rclpy's default follows the node's (wall) clock.
 
-    Args:
-        plain: rclpy's own methods of a node.
-        period: seconds.
-        callback: called at each period.
-        autostart: True: the timer runs from now on; False: from its `reset`.
+    Without `autostart` it runs from its `reset` on. `plain` has rclpy's own methods of the node.
     """
     clock = Clock(clock_type=ClockType.STEADY_TIME)
     return plain.create_timer(period, callback, clock=clock, autostart=autostart)

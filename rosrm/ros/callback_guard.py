@@ -20,16 +20,14 @@ _LOGGED_EVERY: Final = 1.0
 
 
 class CallbackGuard:
-    """Calls callbacks; an exception is logged and counted, and the caller continues.
+    """Calls callbacks; an exception is logged, and the caller continues.
 
     Attributes:
-        failures: callbacks that raised.
         interrupted: a Ctrl-C, or an exception of a signal handler, that arrived in a callback; the
             loop has to raise it.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.failures = 0
         self.interrupted: BaseException | None = None
         self._clock = clock
         self._places: dict[str, tuple[float, int]] = {}
@@ -55,7 +53,6 @@ class CallbackGuard:
 
     def _note(self, place: str, callback: str, reason: str) -> None:
         """Log a failure, at most once a second for each place."""
-        self.failures += 1
         now = self._clock()
         logged, unlogged = self._places.get(place, (float("-inf"), 0))
         if now - logged < _LOGGED_EVERY:

@@ -73,8 +73,7 @@ class RequestGate:
     def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
         """Return the refusal of a request, or None.
 
-        Args:
-            epoch: older epochs than this are refused; None: the sender need not know it.
+        Epochs older than `epoch` are refused; None: the sender need not know it.
         """
         fault = version_refusal(envelope.protocol_version, envelope.sender or "the sender")
         if fault:
@@ -127,29 +126,21 @@ class ControlServer:
     """Offers services behind a gate.
 
     Args:
-        participant: offers the services.
-        gate: admits or refuses every request.
         epoch: returns the current one if older ones are to be refused.
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        gate: RequestGate,
+        self, participant: Participant, gate: RequestGate,
         epoch: Callable[[], int | None] = lambda: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant = participant
         self._gate = gate
         self._epoch = epoch
 
     def offer(
-        self,
-        service_type: Any,
-        name: str,
-        handle: Callable[[Any, Callable[[Any], None]], None],
-        *,
+        self, service_type: Any, name: str, handle: Callable[[Any, Callable[[Any], None]], None], *,
         remember: bool = True,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Offer a service.
 
         Args:
@@ -198,7 +189,6 @@ class ControlClient:
     """Sends requests; each ends by its answer or by its deadline.
 
     Attributes:
-        participant: sends the requests.
         sender: role and name, for messages.
     """
 
@@ -217,7 +207,6 @@ class ControlClient:
         """Send a request.
 
         Args:
-            client: an rclpy service client.
             deadline: monotonic seconds, compared with `expire`'s argument.
             done: called with the response; with None when the deadline has passed, or when its call
                 with the response raised.

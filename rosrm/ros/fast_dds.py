@@ -22,7 +22,6 @@ def announcements(environment: Mapping[str, str], pace: Pace, *, udp: bool) -> d
 
     Args:
         environment: may have a profile, or transports, of the user.
-        pace: of the announcements.
         udp: receive by UDP alone, unless the user has set other transports. A killed process leaves
             ports in shared memory that delay its peers. Nodes may accept that for large messages;
             rosrm's components must not.
@@ -37,12 +36,9 @@ def announcements(environment: Mapping[str, str], pace: Pace, *, udp: bool) -> d
 
 @contextlib.contextmanager
 def announcing(environment: MutableMapping[str, str], pace: Pace, *, udp: bool) -> Iterator[None]:
-    """Give Fast DDS a profile while a participant is created, unless the user has given one.
+    """Apply `announcements` to this process while a participant is created.
 
-    Args:
-        environment: of this process; restored afterwards, for the processes that it starts.
-        pace: see `announcements`.
-        udp: see `announcements`.
+    The environment is restored afterwards, for the processes that this one starts.
     """
     added = announcements(environment, pace, udp=udp)
     environment.update(added)

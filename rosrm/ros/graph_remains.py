@@ -50,12 +50,10 @@ def open_sockets() -> dict[int, str]:
 
 
 def close_leaked(sockets: Mapping[int, str]) -> None:
-    """Close those of these sockets that are still open and unused: not bound, not connected.
+    """Close those sockets that are still open and unused: not bound, not connected.
 
-    Fast DDS 2.14 leaves one for each network interface, from its query of the MAC address.
-
-    Args:
-        sockets: opened while Fast DDS was at work.
+    Fast DDS 2.14 leaves one for each network interface, from its query of the MAC address. The
+    caller names the sockets that were opened while Fast DDS was at work.
     """
     now = open_sockets()
     for number, one in sockets.items():

@@ -129,9 +129,8 @@ class Participant:
     ) -> None:
         """Offer a service with deferred responses.
 
-        Args:
-            handle: called with each request and the means to answer it. If it raises before it
-                has answered, the request is answered as failed.
+        `handle` is called with each request and the means to answer it. If it raises before it has
+        answered, the request is answered as failed.
         """
         # The executor passes the callback's result to `send_response` with the header that an
         # answer needs. So the callback returns the request, and `take` receives both.

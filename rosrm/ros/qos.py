@@ -2,55 +2,36 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+best_effort: Final = partial(
+    QoSProfile, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+reliable: Final = partial(
+    QoSProfile, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
+)
+#: A late subscriber receives the newest messages at once.
+latched: Final = partial(reliable, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
 #: Room for requests of a thousand slaves at once; the default keeps 10 and silently drops others.
-SERVICE: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=2000, reliability=ReliabilityPolicy.RELIABLE
-)
-
+SERVICE: Final = reliable(depth=2000)
 #: Best effort, because the next reading replaces a lost one. The depth is for all hosts.
-READINGS: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=4000, reliability=ReliabilityPolicy.BEST_EFFORT
-)
-
+READINGS: Final = best_effort(depth=4000)
 #: A sender keeps only its newest reading.
-READING_OUT: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-)
-
+READING_OUT: Final = best_effort(depth=1)
 #: Reliable and in order; the receiver detects a gap by sequence, and requests the missing part.
-STATUSES: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=2000, reliability=ReliabilityPolicy.RELIABLE
-)
-
-#: One topic for all hosts: a late subscriber receives the newest beat at once.
-BEAT: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)  # fmt: skip
-
+STATUSES: Final = reliable(depth=2000)
+#: One topic for all hosts.
+BEAT: Final = latched(depth=1)
 #: For subscribers that need no repetition of a lost beat, because the next one follows soon. A
 #: thousand reliable readers would each acknowledge each beat.
-BEAT_IN: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-)
-
+BEAT_IN: Final = best_effort(depth=1)
 #: For observers of the master's load.
-LOAD: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.RELIABLE
-)
-
-#: The master's newest messages about every handoff; a late subscriber receives them at once.
-STATE_CONFIG: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)  # fmt: skip
-
+LOAD: Final = reliable(depth=5)
+#: The master's newest messages about every handoff.
+STATE_CONFIG: Final = latched(depth=100)
 #: One handoff: a restarted master receives the reports that it has missed.
-HANDOFF: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=20, reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)  # fmt: skip
+HANDOFF: Final = latched(depth=20)

@@ -63,7 +63,7 @@ class Decoded:
     Attributes:
         readings: the newest of each run of a host; None: the batch has none.
         runs: parallel to the readings, row by row.
-        strangers: one line for each kind of refused message.
+        refusals: one line for each kind of refused message.
         received: messages of this protocol version.
     """
 

@@ -71,9 +71,9 @@ def take_over(command_line: Sequence[str]) -> Handover:
     if len(command_line) != 2 or command_line[0] != _OPTION:
         raise ConfigError(f"usage: {_OPTION} N; use `rosrm master` or `rosrm slave` to start one")
     with os.fdopen(int(command_line[1])) as source:
-        told = json.load(source)
-    plugins = tuple(PluginAddress(*address) for address in told["plugins"])
-    return Handover(told["settings"], plugins)
+        handed = json.load(source)
+    plugins = tuple(PluginAddress(*address) for address in handed["plugins"])
+    return Handover(handed["settings"], plugins)
 
 
 def handle_stop_signals(handler: Callable[[int, FrameType | None], None]) -> None:

@@ -6,6 +6,8 @@ import os
 import shutil
 from pathlib import Path
 
+from rosrm.wording import size
+
 
 def room_for(path: Path) -> str:
     """Return the free and total size of a file's file system; "" where it cannot be read."""
@@ -16,12 +18,5 @@ def room_for(path: Path) -> str:
             place = place.parent
     except OSError:
         return ""
-    return f"the file system {place} has {_size(usage.free)} free of {_size(usage.total)}"
-
-
-def _size(count: float) -> str:
-    for unit in ("B", "KiB", "MiB", "GiB"):
-        if count < 1024:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1024
-    return f"{count:.1f} TiB"
+    free, total = size(usage.free, binary=True), size(usage.total, binary=True)
+    return f"the file system {place} has {free} free of {total}"

@@ -20,28 +20,22 @@ _WHEEL_FOLDER: Final = re.compile(
 )
 
 
-def without_bootstrapper(
-    environment: Mapping[str, str], prefix: str = sys.prefix
-) -> dict[str, str]:
+def without_bootstrapper(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without the bootstrapper's changes; without its guard, unchanged.
 
     The bootstrapper keeps earlier folders of LD_LIBRARY_PATH, though in no order; those stay.
-
-    Args:
-        environment: to be cleaned; it is not modified.
-        prefix: of this Python.
     """
     cleaned = dict(environment)
     if cleaned.pop(_GUARD, None) is None:
         return cleaned
-    before = _without_wheel_folders(cleaned.pop(_LIBRARIES, "").split(":"), prefix)
+    before = _without_wheel_folders(cleaned.pop(_LIBRARIES, "").split(":"))
     if before:
         cleaned[_LIBRARIES] = ":".join(before)
     return cleaned
 
 
-def _without_wheel_folders(folders: list[str], prefix: str) -> list[str]:
-    added = {"", f"{prefix}/lib"}
+def _without_wheel_folders(folders: list[str]) -> list[str]:
+    added = {"", f"{sys.prefix}/lib"}
     for folder in folders:
         wheel = _WHEEL_FOLDER.fullmatch(folder)
         if wheel:

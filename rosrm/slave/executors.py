@@ -6,9 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rosrm.errors import Refused, RosrmError, describe_fault, describe_plugin_fault
@@ -19,30 +17,6 @@ from rosrm.ros.slave.services import ExecutorOutcome
 
 #: Takes the outcome of an executor.
 Done = Callable[[ExecutorOutcome], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Here:
-    """Description of the host for an executor, passed as the argument `here`.
-
-    Attributes:
-        host: name of the host.
-        state: the slave's directory.
-        pids: pids of the leaders of the instances, by `process#number`; 0 for an instance that
-            waits for a start or restart.
-    """
-
-    host: str
-    state: Path
-    pids: Mapping[str, int]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the description as JSON types."""
-        live = {instance: pid for instance, pid in self.pids.items() if pid}
-        return {
-            "host": self.host, "state": str(self.state), "pids": live,
-            "instances": list(self.pids),
-        }  # fmt: skip
 
 
 class Executors:
@@ -82,15 +56,15 @@ class Executors:
         return {("migration", strategy): error for strategy, error in self.failing.items()}
 
     def execute(
-        self, name: str, arguments: Mapping[str, Any], timeout: float, *, here: Here, done: Done
-    ) -> None:
+        self, name: str, arguments: Mapping[str, Any], timeout: float, *, here: Mapping[str, Any],
+        done: Done,
+    ) -> None:  # fmt: skip
         """Run an executor in a thread of its own.
 
         Args:
-            name: of the executor.
             arguments: a JSON object.
             timeout: seconds, after which its strategy counts as failing.
-            here: description of this host.
+            here: description of this host in JSON types, a further argument.
             done: called in the loop with the outcome.
 
         Raises:
@@ -99,7 +73,7 @@ class Executors:
         offered = self._offered.get(name)
         if offered is None:
             there = ", ".join(sorted(self._offered)) or "none"
-            raise Refused(f"no executor {name!r} on {here.host}; there are: {there}")
+            raise Refused(f"no executor {name!r} on {here['host']}; there are: {there}")
         strategy, function = offered.strategy, offered.call
         place = definition(function)
         late = f"executor {name} did not return within {timeout:g} s ({place})"
@@ -107,7 +81,7 @@ class Executors:
             min(timeout, threading.TIMEOUT_MAX), self._post, [partial(self._fail, strategy, late)]
         )
         timer.daemon = True
-        given = {**arguments, "here": here.as_json()}
+        given = {**arguments, "here": here}
 
         def settle(outcome: ExecutorOutcome) -> None:
             if outcome.code in ("", "unable"):

@@ -23,23 +23,16 @@ _STOPPED: Final = "T"
 class HealthWatch:
     """Health checks of the watched instances, subscribed only to the configured topics.
 
-    Args:
-        participant: creates a node when the first instance needs a topic or a lifecycle state.
-        graph: maps publishers to processes.
-        sessions: process tree of each instance.
-        launchers: of this host.
+    The participant creates a node when the first instance needs a topic or a lifecycle state.
 
     Attributes:
         watches: True if the last call of `look` had instances to check.
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        graph: GraphWatch,
-        sessions: SessionTable,
+        self, participant: Participant, graph: GraphWatch, sessions: SessionTable,
         launchers: Launchers,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant, self._graph, self._sessions = participant, graph, sessions
         self._launchers = launchers
         self.watches = False
@@ -47,12 +40,7 @@ class HealthWatch:
         self._monitors: dict[tuple[InstanceId, int], HealthMonitor] = {}
 
     def look(self, watched: Mapping[InstanceId, HeldInstance], now: float) -> Iterator[LookedAt]:
-        """Yield the result of one check of each watched instance.
-
-        Args:
-            watched: all watched instances.
-            now: monotonic seconds.
-        """
+        """Yield the result of one check of each watched instance."""
         self.watches = bool(watched)
         runs = {(instance, held.status.pid) for instance, held in watched.items()}
         for run in [run for run in self._monitors if run not in runs]:

@@ -34,15 +34,12 @@ class _Segment(NamedTuple):
 
 
 def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
-    """Read a part of an instance's output.
+    """Read a part of an instance's output; raises `Refused` if this host has no log of it.
 
     Args:
         state_directory: of the supervisor.
         query: with the number of the instance.
         ended: the instance has ended.
-
-    Raises:
-        Refused: this host has no log of the instance.
     """
     instance = InstanceId(query.process, query.number)
     path = log_path(state_directory, instance)
@@ -176,11 +173,7 @@ def _marks(
 ) -> tuple[list[tuple[float, int, int]], int]:
     """Return the marks of a part, including one after its end, and the end of the part.
 
-    Args:
-        segment: file with the part.
-        begin: offset of the part.
-        end: offset after the part.
-        now: the file is still written; bytes without a mark count as written now.
+    With `now` the file is still written, and bytes without a mark count as written now.
     """
     with log_index.Index(str(segment.path)) as index:
         first = index.find(lambda mark: mark.offset >= begin)

@@ -44,7 +44,7 @@ from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
-from rosrm.slave.executors import Done, Executors, Here
+from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
@@ -78,10 +78,6 @@ Settled = Callable[[str], None]
 
 class SlaveRuntime:
     """One slave.
-
-    Args:
-        config: checked settings.
-        registry: the installed plugins.
 
     Raises:
         Refused: another slave runs on this state directory.
@@ -139,7 +135,7 @@ class SlaveRuntime:
             self._limit = self._limits()
             self._endpoint = SlaveEndpoint(
                 self._participant, self._description(probes.absent), self._state, take=self._take,
-                kept_states=lambda: self._replication.states(),  # noqa: PLW0108 - made later
+                snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
                 seen=JournalWatermark(config.state / "journal_seen"),
             )  # fmt: skip
             self._note_probes(first)
@@ -152,20 +148,18 @@ class SlaveRuntime:
             self._replication = ReplicationService(
                 kept, config.host, config.keep,
                 ReplicationEndpoint(self._participant, config.host),
-                post=self._post, publish=self._endpoint.publish_kept,
+                post=self._post, publish=self._endpoint.publish_snapshots,
             )  # fmt: skip
             duties = Duties(
-                self._take, self._set_restart, self._replication.keep, self._drop_kept,
-                self._execute,
-                self._read_log,
+                self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
+                self._execute, self._read_log,
             )  # fmt: skip
             SlaveServices(
                 self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch
             )
             self._starter = Starter(
                 config, kept, self._state, self._supervisor, self._endpoint, self._replication,
-                graph,
-                sessions, launchers, take=self._take,
+                graph, sessions, launchers, take=self._take,
             )  # fmt: skip
             self._ending = Shutdown(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
@@ -248,11 +242,11 @@ class SlaveRuntime:
     def _is_registered(self) -> bool:
         return self._endpoint.link is MasterLink.REGISTERED
 
-    def _serve(self, goes_on: Callable[[], bool]) -> None:
+    def _serve(self, condition: Callable[[], bool]) -> None:
         now = time.monotonic()
         next_sample = next_usage = next_graph = next_health = now
         logged_at = now - _LOG_PERIOD
-        while goes_on():
+        while condition():
             if now >= next_sample:
                 next_sample = max(next_sample + self._config.period, now)
                 self._cycle(now)
@@ -282,12 +276,12 @@ class SlaveRuntime:
 
     def _stop(self, number: int, _frame: Any) -> None:
         if self._stopping:  # the handler may interrupt a log call: the loop logs instead
-            self._from_threads.append(lambda: self._ending.say_progress())  # noqa: PLW0108 - as above
+            self._from_threads.append(lambda: self._ending.log_progress())  # noqa: PLW0108 - as above
         self._stopping = self._stopping or signal.Signals(number).name
 
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
-        self._endpoint.go_on(now)
+        self._endpoint.advance(now)
         self._replication.tick(now)
         sample = self._sampler.latest(now)
         if sample.reports:
@@ -300,7 +294,7 @@ class SlaveRuntime:
             sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),
         )  # fmt: skip
-        self._say_usage()
+        self._publish_usage()
         self._take(TimePassed())
 
     def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
@@ -323,7 +317,7 @@ class SlaveRuntime:
         failing.update(self._executors.failing_plugins())
         self._endpoint.publish_statuses((), complete=False)
 
-    def _say_usage(self) -> None:
+    def _publish_usage(self) -> None:
         seen = self._usage.after_reading()
         if seen:
             self._endpoint.publish_usage(
@@ -399,7 +393,7 @@ class SlaveRuntime:
         self._unsettled.setdefault((order.instance, order.restart), []).append(settled)
         self._take(event_of(order))
 
-    def _drop_kept(self, instance: InstanceId) -> None:
+    def _drop_snapshots(self, instance: InstanceId) -> None:
         """Delete the snapshots of a process, of instances up to this one."""
         lives = any(
             one.process == instance.process and one.number <= instance.number
@@ -430,8 +424,12 @@ class SlaveRuntime:
     def _execute(self, order: RunExecutor, done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""
         held = self._state.held.items()
-        pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
-        here = Here(self._config.host, self._config.state, pids)
+        live = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
+        here = {
+            "host": self._config.host, "state": str(self._config.state), "instances": list(live),
+            # Instances that wait for a start or restart have none.
+            "pids": {one: pid for one, pid in live.items() if pid},
+        }  # fmt: skip
         arguments = dict(order.arguments)
         self._executors.execute(order.executor, arguments, order.timeout, here=here, done=done)
 

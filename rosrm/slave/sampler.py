@@ -144,11 +144,7 @@ class Sampler:
         return (1 << len(self.resources)) - 1
 
     def latest(self, now: float) -> Sample:
-        """Return the newest readings, and queue a read of each probe that is due. Never waits.
-
-        Args:
-            now: monotonic seconds.
-        """
+        """Return the newest readings, and queue a read of each probe that is due. Never waits."""
         reports: list[ProbeReport] = []
         for watched in self._watched:
             if watched.busy:
@@ -162,14 +158,7 @@ class Sampler:
         return Sample(np.array(self._usage, np.float32), stale, tuple(reports))
 
     def settle(self, timeout: float) -> bool:
-        """Wait until no read is running.
-
-        Args:
-            timeout: seconds.
-
-        Returns:
-            False if a read still runs after the time-out.
-        """
+        """Wait until no read is running; return False if one still runs after `timeout` seconds."""
         end = time.monotonic() + timeout
         while any(watched.busy for watched in self._watched):
             if not self._progress.wait(max(0.0, end - time.monotonic())):
@@ -180,8 +169,7 @@ class Sampler:
     def first(self, timeout: float = 2.0) -> Sample:
         """Read every probe once, wait for the answers, and return the sample for the registration.
 
-        Args:
-            timeout: seconds; a probe without an answer by then stays stale.
+        A probe without an answer after `timeout` seconds stays stale.
         """
         reports = self.latest(self._clock()).reports
         self.settle(timeout)
@@ -191,11 +179,7 @@ class Sampler:
     def close(self, timeout: float = 2.0) -> tuple[str, ...]:
         """Close every probe, each in the thread that reads it; no further call may follow.
 
-        Args:
-            timeout: seconds for all of them together.
-
-        Returns:
-            Names of the probes that hang or raised, and so stay unclosed.
+        After `timeout` seconds in all, return the probes that hang or raised, and so stay unclosed.
         """
         for watched in self._watched:
             # A probe that hangs in its own thread must not be closed during its read.
@@ -303,12 +287,8 @@ class _Watched:
     """
 
     def __init__(
-        self,
-        made: MadeProbe,
-        first: int,
-        clock: Callable[[], float],
-        progress: threading.Event,
-    ) -> None:
+        self, made: MadeProbe, first: int, clock: Callable[[], float], progress: threading.Event,
+    ) -> None:  # fmt: skip
         self.name = made.name
         self.names = tuple(resource.name for resource in made.resources)
         self.deadline = made.deadline

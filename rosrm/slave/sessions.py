@@ -44,15 +44,12 @@ class SessionTable:
     Args:
         proc: mount point of the process file system.
         session_of: returns the session id of a process; raises `OSError` if it has ended.
-        launchers: of this host.
     """
 
     def __init__(
-        self,
-        proc: Path = Path("/proc"),
-        session_of: Callable[[int], int] = os.getsid,
+        self, proc: Path = Path("/proc"), session_of: Callable[[int], int] = os.getsid,
         launchers: Launchers | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._proc = str(proc)
         self._session_of = session_of
         self._launchers = launchers or Launchers()
@@ -91,11 +88,7 @@ class SessionTable:
         return (*members, *own)
 
     def add(self, leader: int) -> None:
-        """Add a session that has begun; its leader counts at once.
-
-        Args:
-            leader: pid, which is also the session id.
-        """
+        """Add a session that has begun, by the pid of its leader, who counts at once."""
         self._members[leader] = (leader,)
         if self._launchers.leads(leader) is not False:
             self._led.add(leader)
@@ -104,9 +97,8 @@ class SessionTable:
     def remove(self, leader: int, cpu_time: float) -> None:
         """Remove a session that has ended (its leader was reaped).
 
-        Args:
-            leader: pid; the time counts even if the session was never added.
-            cpu_time: seconds used by the leader and its reaped children, as reported by `wait4`.
+        The time counts even if the session was never added: the seconds used by the leader and its
+        reaped children, as reported by `wait4`.
         """
         self._members.pop(leader, None)
         self._led.discard(leader)
@@ -120,11 +112,7 @@ class SessionTable:
         return self._usage
 
     def refresh(self, now: float) -> None:
-        """Find the processes of all sessions and read their usage; call this once a second.
-
-        Args:
-            now: monotonic seconds.
-        """
+        """Find the processes of all sessions and read their usage; call this once a second."""
         elapsed = 0.0 if self._walked is None else now - self._walked
         self._walked = now
         if not self._members:

@@ -32,11 +32,7 @@ class Shutdown:
     """Shutdown of one slave, also without its master or its supervisor.
 
     Attributes:
-        config: of the host.
         state: instances of the slave; read-only here.
-        starter: starts processes.
-        supervisor: stops them.
-        endpoint: informs the master.
         serve: runs the loop of the slave while its argument returns True.
         has_begun: the slave accepts no more work.
         keeps: the slave starts no more processes, because it has reported the running ones to the
@@ -63,13 +59,9 @@ class Shutdown:
         self.endpoint.failure = self.endpoint.failure or fault
 
     def carry_out(self, cause: str) -> int:
-        """Inform the master, then stop the processes or leave them running.
+        """Inform the master, then stop the processes or leave them running; return the exit code.
 
-        Args:
-            cause: a signal or `--stop-all`; "": the endpoint has failed.
-
-        Returns:
-            The exit code of the slave.
+        The cause is a signal or `--stop-all`; "": the endpoint has failed.
         """
         self.has_begun = True
         failure = self.endpoint.failure
@@ -102,7 +94,7 @@ class Shutdown:
         self._inform_master()
         return self._stop_processes(1 if failure else 0, live, cause)
 
-    def say_progress(self) -> None:
+    def log_progress(self) -> None:
         """Log the processes that still stop and the time until SIGKILL, after another signal."""
         left = _live(self._begun())
         if self._kill_at and left:
@@ -131,7 +123,7 @@ class Shutdown:
         if self._supervisor_fault:
             _log.error("%s", self._supervisor_fault)
             return self._fail_without_supervisor()
-        self.endpoint.wait_until_heard()
+        self.endpoint.wait_until_received()
         part = "supervisor" if cause == STOP_ALL else "slave"
         count = counted(live, "process was stopped", "processes were stopped")
         _log.info("%s of %s ended; %s", part, self.config.host, count)

@@ -12,17 +12,25 @@ from typing import Final
 
 from rosrm.config.settings import LogSettings
 from rosrm.core.slave import commands, events
+from rosrm.core.supervisor import events as orders
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.launch.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
+from rosrm.supervisor import messages
 from rosrm.supervisor.client import (
     SupervisorClient,
     SupervisorEnded,
     SupervisorGone,
     SupervisorSilent,
 )
-from rosrm.supervisor.client_values import Amended, LaunchOrder, SupervisorMessage
+from rosrm.supervisor.client_values import (
+    Amended,
+    LaunchOrder,
+    SupervisorMessage,
+    key_of,
+    restart_rule,
+)
 from rosrm.supervisor.logs import LogLimits
 from rosrm.wording import counted
 
@@ -31,7 +39,7 @@ _log = logging.getLogger("rosrm.slave")
 #: Seconds for a new supervisor to be ready, or for a busy one to answer.
 _PATIENCE: Final = 30.0
 #: Seconds for which orders may wait before a message to the user.
-_TOLD_AFTER: Final = 5.0
+_LOGGED_AFTER: Final = 5.0
 
 
 class SupervisorLink:
@@ -82,58 +90,37 @@ class SupervisorLink:
 
     # --- orders --------------------------------------------------------------------------
 
-    def start(self, orders: Sequence[LaunchOrder]) -> None:
+    def start(self, launches: Sequence[LaunchOrder]) -> None:
         """Send launch orders."""
-        self._unanswered.update((order.instance, order) for order in orders)
+        self._unanswered.update((launch.instance, launch) for launch in launches)
         # The receiving thread detects a killed supervisor and replaces it.
         with contextlib.suppress(SupervisorGone):
-            self._client.start(orders)
-        self._say_if_it_waits()
+            self._client.start(launches)
+        self._log_waits()
 
     def carry_out(self, command: commands.Command) -> None:
         """Send a command of the core."""
+        if isinstance(command, commands.Stop | commands.Fence):
+            self._unanswered.pop(command.instance, None)
         with contextlib.suppress(SupervisorGone):
-            self._tell(command)
-        self._say_if_it_waits()
+            self._client.send(_order_of(command))
+        self._log_waits()
 
-    def _say_if_it_waits(self) -> None:
+    def _log_waits(self) -> None:
         waits = self._client.waits
-        if waits > _TOLD_AFTER and not self._logged_waits:
+        if waits > _LOGGED_AFTER and not self._logged_waits:
             _log.info(
                 "the supervisor (pid %d) has accepted no order for %.0f s: is it stopped? Orders "
                 "wait until it continues",
                 self._client.pid, waits,
             )  # fmt: skip
-        self._logged_waits = waits > _TOLD_AFTER
-
-    def _tell(self, command: commands.Command) -> None:
-        client = self._client
-        if isinstance(command, commands.Stop | commands.Fence):
-            self._unanswered.pop(command.instance, None)
-        if isinstance(command, commands.Stop):
-            client.stop(command.instance)
-        elif isinstance(command, commands.Fence):
-            client.fence(command.instance)
-        elif isinstance(command, commands.Restart):
-            client.restart(command.instance)
-        elif isinstance(command, commands.Renew):
-            client.heard(command.at, command.alive)
-        elif isinstance(command, commands.Fail):
-            client.fail(command.instance, command.pid, command.reason, kill=command.kill)
-        elif isinstance(command, commands.Amend):
-            client.amend(command.instance, command.restart, {SHADOW: None})
-        elif isinstance(command, commands.Remember):
-            client.remember(command.instance, to_memo(command.memo))
-        elif isinstance(command, commands.Forget):
-            client.forget(command.instances)
-        else:
-            raise TypeError(command)
+        self._logged_waits = waits > _LOGGED_AFTER
 
     def shut_down(self) -> None:
         """Order the supervisor to stop all processes and end."""
         self._is_shutting_down = True
         with contextlib.suppress(SupervisorGone):
-            self._client.shutdown()
+            self._client.send(orders.ShutdownOrdered())
 
     # --- messages ------------------------------------------------------------------------
 
@@ -159,8 +146,7 @@ class SupervisorLink:
         """Receive until the supervisor must be replaced; raises `SupervisorError` at the end."""
         try:
             while True:
-                messages = client.receive(None)
-                self._post(partial(self._take_messages, messages))
+                self._post(partial(self._take_messages, client.receive(None)))
         except (SupervisorGone, SupervisorEnded) as gone:  # ended: by a SIGTERM to it alone
             if self._is_shutting_down or self._is_closed:
                 raise
@@ -179,22 +165,18 @@ class SupervisorLink:
                     _log.info("%s; waiting until it does", silence)
                 logged = True
 
-    def _take_messages(self, messages: Sequence[SupervisorMessage]) -> None:
-        statuses = tuple(one for one in messages if isinstance(one, InstanceStatus))
+    def _take_messages(self, received: Sequence[SupervisorMessage]) -> None:
+        statuses = tuple(one for one in received if isinstance(one, InstanceStatus))
         for status in statuses:
             self._unanswered.pop(status.instance, None)
             self._follow(status)
         self._take(events.SupervisorReported(statuses))
-        for one in messages:
+        for one in received:
             if isinstance(one, Amended):
                 self._take(events.RestartPolicyRecorded(one.instance, one.restart))
 
     def take_over(self) -> int:
-        """Re-adopt the supervisor's instances; instances unknown to the supervisor do not run.
-
-        Returns:
-            Number of instances of the supervisor.
-        """
+        """Re-adopt the supervisor's instances, and return their number; no others run."""
         client = self._client
         for note in client.notes:
             _log.info("%s", note)
@@ -234,3 +216,27 @@ class SupervisorLink:
         """Report the orderly end of the supervisor, or its failure without a successor."""
         orderly = isinstance(error, SupervisorEnded)
         self._ended("" if orderly else f"the supervisor of this host is gone: {error}")
+
+
+def _order_of(command: commands.Command) -> messages.Order:
+    """Return a command of the core as an order to the supervisor."""
+    match command:
+        case commands.Stop(instance):
+            return orders.StopOrdered(key_of(instance))
+        case commands.Fence(instance):
+            return orders.FenceOrdered(key_of(instance))
+        case commands.Restart(instance):
+            return orders.RestartOrdered(key_of(instance))
+        case commands.Renew(at, alive):
+            return orders.ContactReported(at, alive)
+        case commands.Fail(instance, pid, reason, kill):
+            return orders.FailOrdered(key_of(instance), pid, reason, kill)
+        case commands.Amend(instance, restart):
+            amended = orders.AmendOrdered(key_of(instance), restart_rule(restart))
+            return messages.Amend(amended, {SHADOW: None})
+        case commands.Remember(instance, memo):
+            return messages.Remember(key_of(instance), to_memo(memo))
+        case commands.Forget(instances):
+            return messages.Forget(tuple(orders.StatusStored(key_of(one)) for one in instances))
+        case _:
+            raise TypeError(command)

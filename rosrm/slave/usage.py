@@ -26,7 +26,7 @@ class UsageWatch:
         self._leaders: dict[InstanceId, int] = {}
         self._starting: set[InstanceId] = set()
         self._seen: Mapping[int, SessionUsage] = {}
-        self._say_in = 0
+        self._publish_in = 0
 
     def follow(self, status: InstanceStatus) -> None:
         """Update the table of sessions by the new status of an instance."""
@@ -54,12 +54,12 @@ class UsageWatch:
         self._sessions.refresh(now)
         usage = self._sessions.usage()
         self._seen = {one.number: usage[pid] for one, pid in self._leaders.items() if pid in usage}
-        self._say_in = _READINGS_FIRST
+        self._publish_in = _READINGS_FIRST
 
     def after_reading(self) -> Mapping[int, SessionUsage]:
         """Count a published reading; return the usage to publish, by instance number, or {}."""
-        self._say_in -= 1
-        if not self._seen or self._say_in > 0:
+        self._publish_in -= 1
+        if not self._seen or self._publish_in > 0:
             return {}
         seen, self._seen = self._seen, {}
         return seen

@@ -34,7 +34,7 @@ def peek(path: Path) -> Head | None:
         os.close(descriptor)
 
 
-def files(directory: Path) -> list[tuple[Path, Head]]:
+def snapshot_files(directory: Path) -> list[tuple[Path, Head]]:
     """Return the files with a sound header, newest first."""
     found = [(path, head) for path in paths_of(directory) if (head := peek(path)) is not None]
     return sorted(found, key=lambda one: one[1].age, reverse=True)
@@ -47,7 +47,7 @@ def paths_of(directory: Path) -> Iterable[Path]:
 
 def newest_head(directory: Path) -> Head | None:
     """Return the header of the newest file; None: there is none."""
-    found = files(directory)
+    found = snapshot_files(directory)
     return found[0][1] if found else None
 
 
@@ -67,12 +67,8 @@ def content_of(path: Path) -> bytes:
 
 
 def newest(directory: Path, up_to: int) -> tuple[Listing | None, list[str]]:
-    """Return the newest complete snapshot of a directory, and the faults of damaged files.
-
-    Args:
-        up_to: highest instance number whose snapshot counts.
-    """
-    found = files(directory)
+    """Return the newest complete snapshot of instances `up_to` a number, and faults of files."""
+    found = snapshot_files(directory)
     sound = {path for path, _ in found}
     faults = [
         f"{path}: its head is damaged"
@@ -91,7 +87,7 @@ def newest(directory: Path, up_to: int) -> tuple[Listing | None, list[str]]:
 
 def newest_content(directory: Path) -> tuple[Head, bytes] | None:
     """Return the newest complete snapshot with the bytes of its file; None: there is none."""
-    for path, _ in files(directory):
+    for path, _ in snapshot_files(directory):
         with contextlib.suppress(Damaged):
             data = content_of(path)
             head, _ = checked(data)

@@ -47,8 +47,7 @@ class SlotWriter:
     def write(self, sequence: int, blocks: Sequence[Block]) -> bool:
         """Write a snapshot over the older one; a kill at any instant leaves the newer one complete.
 
-        Returns:
-            False: a newer instance writes here; nothing was changed.
+        Returns False, with nothing changed, if a newer instance writes here.
 
         Raises:
             OSError: the snapshot cannot be written; the newer one is still complete.
@@ -154,18 +153,7 @@ class CopyWriter:
             self._file = -1
 
 
-def write_copy(directory: Path, data: bytes) -> None:
-    """Store a replica from another host; raises the errors of `CopyWriter`."""
-    copy = CopyWriter(directory)
-    try:
-        copy.append(data)
-    except OSError:
-        copy.abandon()
-        raise
-    copy.finish()
-
-
-def drop(directory: Path, up_to: int) -> bool:
+def drop_snapshots(directory: Path, up_to: int) -> bool:
     """Delete the snapshots of instances up to a number; return True if none is left."""
     left = False
     for path in paths_of(directory):

@@ -3,12 +3,16 @@
     __main__.py           start: subreaper, daemon, then the bare interpreter
     bare_interpreter.py   entry point of the bare interpreter
     server.py             event loop, the imperative shell around `rosrm.core.supervisor`
+    endpoint.py           both ends of the socket, and one supervisor for one host
+    connection.py         the supervisor's side of a connection, with send_buffer.py
     spawn.py              spawning of one process
     process_tree.py       process trees of the instances: signals, reaping
     procfs.py             lookup in /proc of the processes of an instance
     instance_record.py    the record that survives the supervisor's own death: instances.jsonl
+    paths.py              the files in the supervisor's directory
     lease_file.py         the last contact with the master, for a restart
     logs.py, log_index.py the processes' log files: rotated, bounded, indexed by time
+    own_log.py            the supervisor's own problems: supervisor.log
     messages.py           protocol between supervisor and slave, as json_lines.py
     discovery.py          lookup of the supervisor of a host, or its start
     takeover.py           take-over of the processes of a killed supervisor

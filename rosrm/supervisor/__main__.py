@@ -26,7 +26,7 @@ def main() -> None:
         description="The parent of one host's processes; it outlives the slave.",
     )
     parser.add_argument("--state", required=True, metavar="DIR", help="the host's state directory")
-    parser.add_argument("--log-max-bytes", type=int, default=10 << 20, help="of one log file")
+    parser.add_argument("--log-max-bytes", type=int, default=10 << 20, help="bytes of one log file")
     parser.add_argument("--log-keep", type=int, default=2, help="older files for each instance")
     parser.add_argument("--log-instances", type=int, default=5, help="logs kept of one process")
     parser.add_argument("--log-processes", type=int, default=500, help="processes with logs kept")
@@ -37,11 +37,8 @@ def main() -> None:
         _detach()
     _become_subreaper()
     limits = (
-        options.log_max_bytes,
-        options.log_keep,
-        options.log_instances,
-        options.log_processes,
-    )
+        options.log_max_bytes, options.log_keep, options.log_instances, options.log_processes
+    )  # fmt: skip
     bare = os.path.join(os.path.dirname(os.path.abspath(__file__)), "bare_interpreter.py")
     command = [sys.executable, "-I", "-S", bare, state, *(str(limit) for limit in limits)]
     os.execv(sys.executable, command)  # noqa: S606 - no shell is wanted

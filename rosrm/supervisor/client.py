@@ -6,20 +6,11 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rosrm.core.supervisor.events import (
-    AmendOrdered,
-    ContactReported,
-    FailOrdered,
-    FenceOrdered,
-    RestartOrdered,
-    ShutdownOrdered,
-    StatusStored,
-    StopOrdered,
-)
+from rosrm.core.supervisor.events import ContactReported
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceStatus, RestartPolicy
 from rosrm.supervisor import json_lines, messages, paths
@@ -98,13 +89,9 @@ class SupervisorClient:
 
     @classmethod
     def connect(
-        cls,
-        state_directory: Path,
-        *,
-        start: bool = True,
-        log: LogLimits = DEFAULT_LOG_LIMITS,
+        cls, state_directory: Path, *, start: bool = True, log: LogLimits = DEFAULT_LOG_LIMITS,
         timeout: float = 5.0,
-    ) -> SupervisorClient:
+    ) -> SupervisorClient:  # fmt: skip
         """Connect to the supervisor of a state directory, and start one where none listens.
 
         Raises:
@@ -137,63 +124,12 @@ class SupervisorClient:
                 self._choose_base(orders[0].environment)
             self._send(b"".join(messages.encode_order(self._launch(order)) for order in orders))
 
-    def stop(self, instance: InstanceId) -> None:
-        """Send SIGINT, SIGTERM, SIGKILL to the tree; bar a later start of an unknown instance."""
-        self._order(StopOrdered(key_of(instance)))
-
-    def fence(self, instance: InstanceId) -> None:
-        """Send SIGKILL to the tree, no restart; bar a later start of an unknown instance."""
-        self._order(FenceOrdered(key_of(instance)))
-
-    def heard(self, at: float, alive: float) -> None:
-        """Renew the fences: the master received a message of this host, and this slave was at work.
-
-        Args:
-            at, alive: monotonic times of these two.
-
-        Skipped while the supervisor does not read (it is stopped), because a newer renewal follows.
-        """
-        if self._outgoing.is_free:
-            self._order(ContactReported(at, alive))
-
-    def restart(self, instance: InstanceId) -> None:
-        """Stop an instance, then start it again; the restart policy does not count this."""
-        self._order(RestartOrdered(key_of(instance)))
-
-    def fail(self, instance: InstanceId, pid: int, reason: str, *, kill: bool) -> None:
-        """Count a run of an instance as failed: stop it, then apply its restart policy.
-
-        Args:
-            pid: of the run; nothing happens if that run has ended.
-            reason: text for the user.
-            kill: SIGKILL at once; otherwise SIGINT and SIGTERM first.
-        """
-        self._order(FailOrdered(key_of(instance), pid, reason, kill))
-
-    def amend(
-        self, instance: InstanceId, restart: RestartPolicy, changes: Mapping[str, str | None]
-    ) -> None:
-        """Replace the restart policy of an instance, even an ended one; the answer is `Amended`.
-
-        Args:
-            changes: of its environment at the next start; None: unset the variable.
-        """
-        order = AmendOrdered(key_of(instance), restart_rule(restart))
-        self._order(messages.Amend(order, changes))
-
-    def remember(self, instance: InstanceId, memo: str) -> None:
-        """Replace the text that the supervisor stores for a later run of the client."""
-        self._order(messages.Remember(key_of(instance), memo))
-
-    def forget(self, instances: Iterable[InstanceId]) -> None:
-        """Let the supervisor forget final statuses that the caller has stored."""
-        forgotten = tuple(StatusStored(key_of(instance)) for instance in instances)
-        if forgotten:
-            self._order(messages.Forget(forgotten))
-
-    def shutdown(self) -> None:
-        """Stop everything, then end the supervisor; `receive` reports the progress."""
-        self._order(ShutdownOrdered())
+    def send(self, order: messages.Order) -> None:
+        """Send an order; skip a contact that would wait, because a newer one follows."""
+        if isinstance(order, ContactReported) and not self._outgoing.is_free:
+            return
+        with self._sending:
+            self._send(messages.encode_order(order))
 
     # --- answers ------------------------------------------------------------------------------
 
@@ -246,27 +182,16 @@ class SupervisorClient:
         }
         changes.update((name, None) for name in base if name not in order.environment)
         return messages.Launch(
-            key_of(order.instance),
-            order.argv,
-            self._base_id,
-            changes,
-            order.working_directory,
-            restart_rule(order.restart),
-            stop_rule(order.stop),
-            order.memo,
-            fence_rule(order.fence),
-            order.heard,
-        )
+            key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
+            restart_rule(order.restart), stop_rule(order.stop), order.memo,
+            fence_rule(order.fence), order.last_contact,
+        )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
         """Send an environment as the base: others differ little, and are sent as changes."""
         self._base = dict(environment)
         self._base_id = os.urandom(8).hex()
         self._send(messages.encode_order(messages.Environment(self._base_id, self._base)))
-
-    def _order(self, order: messages.Order) -> None:
-        with self._sending:
-            self._send(messages.encode_order(order))
 
     def _send(self, data: bytes) -> None:
         try:
@@ -283,7 +208,7 @@ class SupervisorClient:
     # --- receiving ----------------------------------------------------------------------------
 
     def _introduce(self, log: LogLimits, deadline: float) -> None:
-        self._order(messages.Hello(messages.PROTOCOL, os.getpid(), log))
+        self.send(messages.Hello(messages.PROTOCOL, os.getpid(), log))
         while not self.pid:
             if self._failure is not None:
                 raise self._failure
@@ -300,7 +225,7 @@ class SupervisorClient:
             self._lose(f"{self._name()} is gone: {error.strerror}")
             return
         if not data:
-            self._lose(f"{self._name()} is gone; its processes go on")
+            self._lose(f"{self._name()} is gone; its processes keep running")
         try:
             for line in self._lines.feed(data):
                 self._take(json_lines.parse(line))
@@ -329,7 +254,7 @@ class SupervisorClient:
         elif kind == "ended":
             self._ending = True
         else:
-            raise ValueError(f"it tells {kind!r}, which this version does not know")
+            raise ValueError(f"it sent {kind!r}, which this version does not know")
 
     def _take_welcome(self, fields: Mapping[str, object]) -> None:
         number, pid = fields["protocol"], fields["pid"]

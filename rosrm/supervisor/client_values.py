@@ -27,7 +27,7 @@ class LaunchOrder:
         working_directory: None: the default one, below the state directory.
         memo: kept by the supervisor for a later run of the client; see `SupervisorClient.memos`.
         fence: rule by which the supervisor ends the instance without an order; None: never.
-        heard: last contact of the master with this host, monotonic; 0.0: now.
+        last_contact: of the master with this host, monotonic; 0.0: now.
     """
 
     instance: InstanceId
@@ -38,7 +38,7 @@ class LaunchOrder:
     stop: StopPolicy = field(default_factory=StopPolicy)
     memo: str = ""
     fence: Fence | None = None
-    heard: float = 0.0
+    last_contact: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,7 +83,7 @@ class Connection:
         try:
             self._peer.sendall(self._unsent + data)
         except OSError as error:
-            own_log.say(f"the client (pid {self.pid}) was not told the rest: {error}")
+            own_log.write(f"the client (pid {self.pid}) did not read the last messages: {error}")
 
     def close(self) -> None:
         """Release the socket."""

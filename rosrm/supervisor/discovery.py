@@ -29,13 +29,12 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
         except OSError as error:
             raise SupervisorError(f"{state} cannot be used: {error.strerror}") from None
         problem = _start(state, log, deadline)
-        if problem and time.monotonic() > deadline:
+        if not problem:
+            continue
+        if time.monotonic() > deadline or "another supervisor" not in problem:
             raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
-        if problem and "another supervisor" not in problem:
-            raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
-        if problem:
-            # Another supervisor is about to listen or to end: neither can be awaited from here.
-            time.sleep(0.02)
+        # Another supervisor is about to listen or to end: neither can be awaited from here.
+        time.sleep(0.02)
 
 
 def _start(state: Path, log: LogLimits, deadline: float) -> str:
@@ -63,9 +62,9 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
                 break
             answer += part
     process.wait()
-    return (
-        "" if answer == b"ready\n" else answer.decode(errors="replace").strip() or "it said nothing"
-    )
+    if answer == b"ready\n":
+        return ""
+    return answer.decode(errors="replace").strip() or "it wrote no reason"
 
 
 def readable(file: socket.socket | object, timeout: float | None) -> bool:

@@ -30,7 +30,6 @@ VERSION: Final = 1
 COMPACT_BYTES: Final = 1 << 20
 COMPACT_FACTOR: Final = 4
 
-
 _APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
 
 
@@ -94,8 +93,8 @@ def _take(recorded: Recorded, fields: Mapping[str, Any]) -> None:
         recorded.environments[fields["id"]] = dict(fields["variables"])
     elif kind == "dead":
         recorded.dead[fields["process"]] = int(fields["number"])
-        for key in [key for key in recorded.instances if _dead(key, fields)]:
-            del recorded.instances[key]
+        key = messages.read_key(fields["key"])
+        if recorded.instances.pop(key, None) is not None:
             recorded.launches.pop(key, None)
     elif kind == "header":
         if fields["version"] != VERSION:
@@ -103,10 +102,6 @@ def _take(recorded: Recorded, fields: Mapping[str, Any]) -> None:
         recorded.same_boot = fields["boot"] == procfs.boot_id()
     else:
         raise ValueError(f"unknown record {kind!r}")
-
-
-def _dead(key: Key, fields: Mapping[str, Any]) -> bool:
-    return key == messages.read_key(fields["key"])
 
 
 def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
@@ -162,7 +157,8 @@ class InstanceRecord:
 
     def state(self, instance: Instance, birth: int) -> None:
         """Add the whole state of an instance; `birth`: see `procfs.was_born`."""
-        self._add(_state(instance, birth))
+        fields = {name: getattr(instance, name) for name in Instance.__slots__}
+        self._add({"record": "state", "birth": birth, **fields})
 
     def dead(self, key: Key, number: int) -> None:
         """Add a forgotten instance; its process starts no number up to `number` any more."""
@@ -192,17 +188,13 @@ class InstanceRecord:
         return self._size >= self._compact_at
 
     def rewrite(
-        self,
-        core_state: SupervisorState,
-        launches: Mapping[Key, Launch],
-        environments: Mapping[str, Mapping[str, str]],
-        birth: Callable[[Key], int],
-    ) -> None:
+        self, core_state: SupervisorState, launches: Mapping[Key, Launch],
+        environments: Mapping[str, Mapping[str, str]], birth: Callable[[Key], int],
+    ) -> None:  # fmt: skip
         """Replace the record by one that holds only the current state, if the disk has room.
 
-        Args:
-            environments: all that launches refer to now or may later; one may be missing, where a
-                line was damaged.
+        The environments are all that launches refer to now or may later; one may be missing, where
+        a line was damaged.
         """
         waiting = self._waiting
         self._waiting = []
@@ -256,10 +248,3 @@ class InstanceRecord:
 
     def _fail(self, why: str) -> None:
         self.trouble = f"{self._path} cannot be written: {why}"
-
-
-def _state(instance: Instance, birth: int) -> dict[str, Any]:
-    fields: dict[str, Any] = {"record": "state", "birth": birth}
-    for name in Instance.__slots__:
-        fields[name] = getattr(instance, name)
-    return fields

@@ -23,9 +23,9 @@ class LastContact:
         self._newest = ContactReported(0.0)
         self._trouble = ""
 
-    def keep(self, heard: ContactReported) -> None:
+    def keep(self, contact: ContactReported) -> None:
         """Write newer times to the file, so that they survive this process."""
-        newest = ContactReported(*map(max, heard, self._newest))
+        newest = ContactReported(*map(max, contact, self._newest))
         if newest == self._newest:
             return
         self._newest = newest
@@ -33,17 +33,14 @@ class LastContact:
             if self._file < 0:
                 flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
                 self._file = os.open(self._path, flags, 0o600)
-            os.pwrite(self._file, _line(self._boot, newest), 0)
+            line = f"{self._boot} {newest.at:020.6f} {newest.alive:020.6f}\n"
+            os.pwrite(self._file, line.encode(), 0)
             self._trouble = ""
         except OSError as error:
             trouble = error.strerror or str(error)
             if trouble != self._trouble:
-                own_log.say(f"{self._path} cannot be written: {trouble}")
+                own_log.write(f"{self._path} cannot be written: {trouble}")
             self._trouble = trouble
-
-
-def _line(boot: str, newest: ContactReported) -> bytes:
-    return f"{boot} {newest.at:020.6f} {newest.alive:020.6f}\n".encode()
 
 
 def read(state: str) -> ContactReported:

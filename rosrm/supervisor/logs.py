@@ -55,12 +55,7 @@ class LogKeeper:
         self._folder = LogFolder(state)
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
-        """Open the log of an instance and return its descriptor; remove old logs to make room.
-
-        Args:
-            instance: about to start.
-            known: instances whose logs stay.
-        """
+        """Open the log of a starting instance; make room, but keep logs of `known` instances."""
         log = os.open(
             paths.log_file(self._state, *instance),
             os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC,
@@ -74,10 +69,7 @@ class LogKeeper:
     def watch(self, instance: Key, now: float, started: int = 0) -> None:
         """Begin to check the log of a running instance.
 
-        Args:
-            instance: running.
-            now: monotonic seconds.
-            started: pid of the process that was started after `open`; 0: it ran before.
+        `started` is the pid of the process that was started after `open`; 0: it ran before.
         """
         log = self._logs[instance] = _Log(paths.log_file(self._state, *instance))
         opened = self._opened.pop(instance, 0)
@@ -134,7 +126,7 @@ class _Log:
             try:
                 rotate(self.path, size, limits)
             except OSError as error:
-                own_log.say(f"{self.path} was truncated, but not rotated: {error}")
+                own_log.write(f"{self.path} was truncated, but not rotated: {error}")
             self.base, self.size = log_index.base(self.path) or 0, 0
         return True
 
@@ -152,7 +144,7 @@ class _Log:
             log_index.add(self.path, Mark(now, self.base + size, pid))
             self._has_index = True
         except OSError as error:
-            own_log.say(f"the time index of {self.path} was not written: {error}")
+            own_log.write(f"the time index of {self.path} was not written: {error}")
 
 
 class LogFolder:
@@ -208,13 +200,7 @@ class LogFolder:
 
 
 def rotate(path: str, size: int, limits: LogLimits) -> None:
-    """Copy the newest `max_bytes` of a log to a file beside it, and truncate the log.
-
-    Args:
-        path: of the log.
-        size: bytes in it.
-        limits: number and size of the files that are kept.
-    """
+    """Copy the newest `max_bytes` of a log of `size` bytes to a file beside it, and truncate it."""
     base = log_index.base(path) or 0
     start = max(0, size - limits.max_bytes)
     with open(path, "rb+", buffering=0) as log:

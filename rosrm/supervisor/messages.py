@@ -55,16 +55,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from rosrm.core.supervisor.events import (
-    AmendOrdered,
-    ContactReported,
-    FailOrdered,
-    FenceOrdered,
-    RestartOrdered,
-    ShutdownOrdered,
-    StatusStored,
-    StopOrdered,
-)
+from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.supervisor.json_lines import ProtocolError, line, parse
@@ -111,7 +102,7 @@ class Launch(NamedTuple):
 class Amend(NamedTuple):
     """A new restart policy, and environment changes for the next start."""
 
-    order: AmendOrdered
+    order: events.AmendOrdered
     changes: Mapping[str, str | None]
 
 
@@ -125,22 +116,22 @@ class Remember(NamedTuple):
 class Forget(NamedTuple):
     """The client has stored these final statuses."""
 
-    instances: tuple[StatusStored, ...]
+    instances: tuple[events.StatusStored, ...]
 
 
 Order = (
     Hello
     | Environment
     | Launch
-    | StopOrdered
-    | FenceOrdered
-    | ContactReported
-    | RestartOrdered
-    | FailOrdered
+    | events.StopOrdered
+    | events.FenceOrdered
+    | events.ContactReported
+    | events.RestartOrdered
+    | events.FailOrdered
     | Amend
     | Remember
     | Forget
-    | ShutdownOrdered
+    | events.ShutdownOrdered
 )
 
 
@@ -171,26 +162,6 @@ class Status(NamedTuple):
 
 def encode_order(order: Order) -> bytes:
     """Return an order as one line."""
-    return line(_order_fields(order))
-
-
-_WORDS: Final[Mapping[type, str]] = {
-    Hello: "hello",
-    Environment: "environment",
-    Launch: "start",
-    StopOrdered: "stop",
-    FenceOrdered: "fence",
-    ContactReported: "heard",
-    RestartOrdered: "restart",
-    FailOrdered: "fail",
-    Amend: "amend",
-    Remember: "remember",
-    Forget: "forget",
-    ShutdownOrdered: "shutdown",
-}
-
-
-def _order_fields(order: Order) -> dict[str, Any]:
     fields = order._asdict()
     if isinstance(order, Environment):
         fields["variables"] = dict(order.variables)
@@ -200,7 +171,23 @@ def _order_fields(order: Order) -> dict[str, Any]:
         fields = {**order.order._asdict(), "changes": dict(order.changes)}
     elif isinstance(order, Forget):
         fields = {"instances": [forgotten.instance for forgotten in order.instances]}
-    return {"do": _WORDS[type(order)], **fields}
+    return line({"do": _KINDS[type(order)], **fields})
+
+
+_KINDS: Final[Mapping[type, str]] = {
+    Hello: "hello",
+    Environment: "environment",
+    Launch: "start",
+    events.StopOrdered: "stop",
+    events.FenceOrdered: "fence",
+    events.ContactReported: "heard",
+    events.RestartOrdered: "restart",
+    events.FailOrdered: "fail",
+    Amend: "amend",
+    Remember: "remember",
+    Forget: "forget",
+    events.ShutdownOrdered: "shutdown",
+}
 
 
 def launch_fields(launch: Launch) -> dict[str, Any]:
@@ -212,17 +199,13 @@ def decode_order(text: bytes) -> Order:
     """Return the order in one line. Raises ProtocolError."""
     fields = parse(text)
     kind = fields.get("do")
-    try:
-        return _order(kind, fields)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ProtocolError(f"the order {kind!r} cannot be read: {error!r}") from None
-
-
-def _order(kind: object, fields: Mapping[str, Any]) -> Order:
     reader = _READERS.get(kind) if isinstance(kind, str) else None
     if reader is None:
         raise ProtocolError(f"unknown order {kind!r}; known: {', '.join(_READERS)}")
-    return reader(fields)
+    try:
+        return reader(fields)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProtocolError(f"the order {kind!r} cannot be read: {error!r}") from None
 
 
 def read_launch(fields: Mapping[str, Any]) -> Launch:
@@ -247,13 +230,13 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
     )
 
 
-def _read_fail(fields: Mapping[str, Any]) -> FailOrdered:
+def _read_fail(fields: Mapping[str, Any]) -> events.FailOrdered:
     key, pid = read_key(fields["instance"]), int(fields["pid"])
-    return FailOrdered(key, pid, _text(fields["reason"]), bool(fields["kill"]))
+    return events.FailOrdered(key, pid, _text(fields["reason"]), bool(fields["kill"]))
 
 
 def _read_amend(fields: Mapping[str, Any]) -> Amend:
-    order = AmendOrdered(read_key(fields["instance"]), read_restart(fields["restart"]))
+    order = events.AmendOrdered(read_key(fields["instance"]), read_restart(fields["restart"]))
     return Amend(order, _changes(fields["changes"]))
 
 
@@ -263,17 +246,17 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     ),
     "environment": lambda fields: Environment(_text(fields["id"]), _texts(fields["variables"])),
     "start": read_launch,
-    "stop": lambda fields: StopOrdered(read_key(fields["instance"])),
-    "fence": lambda fields: FenceOrdered(read_key(fields["instance"])),
-    "heard": lambda fields: ContactReported(float(fields["at"]), float(fields["alive"])),
-    "restart": lambda fields: RestartOrdered(read_key(fields["instance"])),
+    "stop": lambda fields: events.StopOrdered(read_key(fields["instance"])),
+    "fence": lambda fields: events.FenceOrdered(read_key(fields["instance"])),
+    "heard": lambda fields: events.ContactReported(float(fields["at"]), float(fields["alive"])),
+    "restart": lambda fields: events.RestartOrdered(read_key(fields["instance"])),
     "fail": _read_fail,
     "amend": _read_amend,
     "remember": lambda fields: Remember(read_key(fields["instance"]), _text(fields["memo"])),
     "forget": lambda fields: Forget(
-        tuple(StatusStored(read_key(key)) for key in fields["instances"])
+        tuple(events.StatusStored(read_key(key)) for key in fields["instances"])
     ),
-    "shutdown": lambda _: ShutdownOrdered(),
+    "shutdown": lambda _: events.ShutdownOrdered(),
 }
 
 
@@ -332,12 +315,9 @@ def _texts(value: Any) -> dict[str, str]:
 
 
 def encode_welcome(
-    pid: int,
-    notes: Sequence[str],
-    statuses: Sequence[Status],
-    memos: Mapping[Key, str],
+    pid: int, notes: Sequence[str], statuses: Sequence[Status], memos: Mapping[Key, str],
     fenced: Sequence[Key],
-) -> bytes:
+) -> bytes:  # fmt: skip
     """Return the answer to `hello`."""
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
@@ -349,7 +329,7 @@ def encode_status(status: Status) -> bytes:
     return line({"tell": "status", "status": status})
 
 
-def encode_amended(order: AmendOrdered) -> bytes:
+def encode_amended(order: events.AmendOrdered) -> bytes:
     """Return the line that confirms a recorded amendment."""
     return line({"tell": "amended", "instance": order.instance, "restart": order.restart})
 

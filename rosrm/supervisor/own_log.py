@@ -6,7 +6,7 @@ import sys
 import time
 
 
-def say(text: str) -> None:
+def write(text: str) -> None:
     """Write one line, with the time by this host's clock."""
     sys.stderr.write(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {text}\n")
     sys.stderr.flush()

@@ -126,8 +126,8 @@ class ProcessTrees:
                 key = self._owner(pid)
                 self._adopted[pid] = key
                 if key is not None and key not in self._sessions:
-                    own_log.say(f"killed {pid}, left over by {mark(key)}")
-                    send_signal(pid, signal.SIGKILL)
+                    own_log.write(f"killed {pid}, left over by {mark(key)}")
+                    _send(os.kill, pid, signal.SIGKILL, str(pid))
 
     def _owner(self, pid: int) -> Key | None:
         stat = procfs.read_stat(pid)
@@ -179,16 +179,16 @@ class ProcessTrees:
         """Send a signal to every process of the instance."""
         session = self._sessions.get(key, 0)
         if session in self._children or session in self._taken_over:
-            _send_to_group(session, number)
+            _send(os.killpg, session, number, f"the group {session}")
         if key in self._strays:
             self.watch_strays(key, self._find(key))
             for pidfd in self._strays.get(key, {}).values():
-                _send_by_pidfd(pidfd, number)
+                _send(signal.pidfd_send_signal, pidfd, number, "a left-over process")
 
     def kill(self, found: Iterable[Stat]) -> None:
         """Send SIGKILL to processes that belong to no instance any more."""
         for stat in found:
-            send_signal(stat.pid, signal.SIGKILL)
+            _send(os.kill, stat.pid, signal.SIGKILL, str(stat.pid))
 
     # --- the selector -------------------------------------------------------------------------
 
@@ -205,29 +205,11 @@ def mark(key: Key) -> str:
     return f"{key[0]}#{key[1]}"
 
 
-def send_signal(pid: int, number: int) -> None:
-    """Send a signal to one process; ignore one that is gone, and log one of another user."""
+def _send(call: Callable[[int, int], None], target: int, number: int, what: str) -> None:
+    """Send a signal; ignore a process that is gone, and log one of another user."""
     try:
-        os.kill(pid, number)
+        call(target, number)
     except ProcessLookupError:
         return
     except PermissionError as error:
-        own_log.say(f"signal {number} to {pid}: {error.strerror}")
-
-
-def _send_to_group(session: int, number: int) -> None:
-    try:
-        os.killpg(session, number)
-    except ProcessLookupError:
-        return
-    except PermissionError as error:
-        own_log.say(f"signal {number} to the group {session}: {error.strerror}")
-
-
-def _send_by_pidfd(pidfd: int, number: int) -> None:
-    try:
-        signal.pidfd_send_signal(pidfd, number)
-    except ProcessLookupError:
-        return
-    except PermissionError as error:
-        own_log.say(f"signal {number} to a left-over process: {error.strerror}")
+        own_log.write(f"signal {number} to {what}: {error.strerror}")

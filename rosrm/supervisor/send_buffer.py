@@ -15,7 +15,7 @@ from rosrm.supervisor.discovery import writable
 #: Most bytes that may wait for the peer, beside those in its socket.
 MOST_UNSENT: Final = 8 << 20
 #: Seconds that `close` waits for the sending thread.
-_LAST_WORDS: Final = 5.0
+_CLOSE_PATIENCE: Final = 5.0
 _FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
 
 
@@ -110,5 +110,5 @@ class Outgoing:
         """Break the connection, and release the socket."""
         self.drop()
         if self._thread is not None:
-            self._thread.join(_LAST_WORDS)
+            self._thread.join(_CLOSE_PATIENCE)
         self._peer.close()

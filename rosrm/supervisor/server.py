@@ -33,17 +33,11 @@ SPAWNS_A_ROUND: Final = 8
 #: Seconds between attempts to write the record while the disk is full.
 RECORD_AGAIN: Final = 1.0
 #: Seconds that the client has to read the last messages.
-LAST_WORDS: Final = 1.0
+END_PATIENCE: Final = 1.0
 
 
 class Server:
-    """The supervisor of one state directory.
-
-    Args:
-        state: the state directory, absolute.
-        listener: the listening socket.
-        limits: of the logs.
-    """
+    """The supervisor of one state directory, given by its absolute path."""
 
     def __init__(self, state: str, listener: socket.socket, limits: LogLimits) -> None:
         self._state = state
@@ -59,7 +53,7 @@ class Server:
         self._environments: dict[str, dict[str, str]] = {}
         self._notes: list[str] = []
         self._spawns: deque[Key] = deque()
-        self._telling: list[bytes] = []
+        self._unsent: list[bytes] = []
         self._client: Connection | None = None
         self._served = False
         self._leaving = False
@@ -118,7 +112,7 @@ class Server:
     def _leave(self) -> None:
         os.unlink(os.path.join(self._state, paths.SOCKET))
         if self._client is not None:
-            self._client.finish(messages.encode_ended(), LAST_WORDS)
+            self._client.finish(messages.encode_ended(), END_PATIENCE)
 
     # --- the core's commands ------------------------------------------------------------------
 
@@ -148,7 +142,7 @@ class Server:
         if not instance.pid and instance.phase != STOPPING:
             self._trees.release(key)
         self._record.state(instance, self._trees.birth(key))
-        self._telling.append(messages.encode_status(messages.Status.of(instance)))
+        self._unsent.append(messages.encode_status(messages.Status.of(instance)))
 
     def _unspawn(self, key: Key) -> None:
         if key in self._spawns:
@@ -156,10 +150,10 @@ class Server:
             self._happened(SpawnFailed(key, ""))
 
     def _report(self) -> None:
-        telling = b"".join(self._telling)
-        self._telling.clear()
-        if self._client is not None and telling:
-            self._send(self._client, telling)
+        unsent = b"".join(self._unsent)
+        self._unsent.clear()
+        if self._client is not None and unsent:
+            self._send(self._client, unsent)
 
     # --- spawning -----------------------------------------------------------------------------
 
@@ -227,7 +221,7 @@ class Server:
         self._environments.update(recorded.environments)
         self._notes = recorded.notes
         for note in recorded.notes:
-            own_log.say(note)
+            own_log.write(note)
         for event in takeover.what_happened(recorded, self._state, self._core, self._trees):
             self._happened(event)
         self._rewrite_record()
@@ -266,7 +260,7 @@ class Server:
         if isinstance(order, messages.Hello):
             self._welcome(connection, order)
         elif connection is not self._client:
-            raise ProtocolError("say hello first")
+            raise ProtocolError("the first order must be hello")
         elif isinstance(order, messages.Environment):
             self._learn_environment(connection, order)
         elif isinstance(order, messages.Launch):
@@ -285,7 +279,7 @@ class Server:
 
     def _welcome(self, connection: Connection, hello: messages.Hello) -> None:
         if connection is self._client:
-            raise ProtocolError("hello was said already")
+            raise ProtocolError("hello was sent twice")
         if hello.protocol != messages.PROTOCOL:
             raise ProtocolError(
                 f"this supervisor (pid {os.getpid()}) speaks protocol {messages.PROTOCOL}, "
@@ -299,7 +293,7 @@ class Server:
         self._client = connection
         self._served = True
         self._logs.limits = hello.log
-        self._telling.clear()  # the welcome's statuses hold all of these changes
+        self._unsent.clear()  # the welcome's statuses hold all of these changes
         statuses = [messages.Status.of(instance) for instance in self._core.instances.values()]
         memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
         fenced = [one.key for one in self._core.instances.values() if one.fence is not None]
@@ -340,7 +334,7 @@ class Server:
         if launch is not None:
             self._keep_launch(launch.amended(amendment))
         self._happened(amendment.order)
-        self._telling.append(messages.encode_amended(amendment.order))
+        self._unsent.append(messages.encode_amended(amendment.order))
 
     def _remember(self, order: messages.Remember) -> None:
         launch = self._launches.get(order.instance)

@@ -44,7 +44,6 @@ def spawn(
     Args:
         argv: command line; the first word is looked up in the PATH of `environment`.
         environment: the whole environment.
-        directory: working directory.
         null: descriptor that becomes its standard input.
         log: descriptor that becomes its standard output and error.
     """

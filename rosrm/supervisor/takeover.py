@@ -23,25 +23,25 @@ from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import Stat
 
 
-def restore(state: str, core: SupervisorState, family: ProcessTrees) -> Recorded:
+def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
     """Read the record into the core, and take over the leaders that still run."""
     recorded = instance_record.read(state)
     core.dead.update(recorded.dead)
     newest = lease_file.read(state)
     for instance in recorded.instances.values():
         if not recorded.same_boot:
-            _begin_clock_anew(instance, time.monotonic())
+            _restart_clock(instance, time.monotonic())
         alive = instance.fence is not None and instance.fence.alive
         instance.heard = max(instance.heard, newest.at, newest.alive if alive else 0.0)
         core.restore(instance)
         leader = procfs.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]
         if leader is not None and leader.alive and procfs.was_born(leader, birth):
-            family.take_over(instance.key, leader)
+            trees.take_over(instance.key, leader)
     return recorded
 
 
-def _begin_clock_anew(instance: Instance, now: float) -> None:
+def _restart_clock(instance: Instance, now: float) -> None:
     """Restart the clock of an instance recorded in an earlier boot; its deadlines are due now."""
     instance.recent.clear()  # times of the former boot may lie ahead, and would count for hours
     if instance.pid:
@@ -55,41 +55,41 @@ def _begin_clock_anew(instance: Instance, now: float) -> None:
 
 
 def what_happened(
-    recorded: Recorded, state: str, core: SupervisorState, family: ProcessTrees
+    recorded: Recorded, state: str, core: SupervisorState, trees: ProcessTrees
 ) -> Iterator[Event]:
     """Yield the changes of each instance while no supervisor ran."""
     waiting = [
         instance
         for instance in core.instances.values()
-        if not instance.ended and not family.birth(instance.key)
+        if not instance.ended and not trees.birth(instance.key)
     ]
     marked = procfs.find_marked(state) if waiting else {}
     for instance in waiting:
         left = marked.get(mark(instance.key), [])
         if instance.phase == STARTING:
-            yield _start_of(instance, left, recorded, family)
+            yield _start_of(instance, left, recorded, trees)
         elif instance.phase in (RUNNING, STOPPING):
-            yield from _end_of(instance, left, family)
+            yield from _end_of(instance, left, trees)
 
 
 def _start_of(
-    instance: Instance, found: list[Stat], recorded: Recorded, family: ProcessTrees
+    instance: Instance, found: list[Stat], recorded: Recorded, trees: ProcessTrees
 ) -> Event:
     """Return the outcome of a start that was ordered but has no recorded outcome."""
     leaders = [stat for stat in found if stat.pid == stat.session]
     if instance.key not in recorded.spawning:
         return Resumed(instance.key)
     if leaders:
-        family.take_over(instance.key, leaders[0])
+        trees.take_over(instance.key, leaders[0])
         return Spawned(instance.key, leaders[0].pid)
-    family.kill(found)
+    trees.kill(found)
     lost = "the supervisor was killed while it started this: how that went is not known"
     return SpawnFailed(instance.key, lost, transient=True)
 
 
-def _end_of(instance: Instance, left: list[Stat], family: ProcessTrees) -> Iterator[Event]:
+def _end_of(instance: Instance, left: list[Stat], trees: ProcessTrees) -> Iterator[Event]:
     """Yield the events for an instance that ran and whose leader has ended."""
-    family.watch_strays(instance.key, left)
+    trees.watch_strays(instance.key, left)
     if instance.pid:
         yield Exited(instance.key, UNKNOWN_EXIT, leftovers=bool(left))
     elif not left:

@@ -11,7 +11,7 @@ from unittest import SkipTest
 from rosrm.config.checking import validated
 from rosrm.config.documents import Problems, parse
 from rosrm.errors import ConfigError, PluginError
-from rosrm.extensions.discovery import HOOKS, ChosenOffer
+from rosrm.extensions.discovery import HOOKS, ChosenOffer, Offer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import FailedProbe, Registry
 from rosrm.extensions.time_limit import limited
@@ -71,6 +71,16 @@ def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str,
     return dict(to_plain(value))
 
 
+def registry_of(kind: PluginKind, offer: Offer) -> Registry:
+    """Return a registry with one offer; raises `ContractBroken` if the offer is wrong."""
+    hook = _HOOK_OF[kind]
+    plugin = SimpleNamespace(**{hook: hookimpl(specname=hook)(lambda: [offer])})
+    registry = Registry.of(tested=plugin)
+    if registry.broken:
+        raise ContractBroken(registry.broken[0].reason)
+    return registry
+
+
 def made(kind: PluginKind, offer: ChosenOffer, options: Mapping[str, Any], *context: Any) -> Any:
     """Return the object of an offer, created and checked as by master or slave.
 
@@ -84,11 +94,7 @@ def made(kind: PluginKind, offer: ChosenOffer, options: Mapping[str, Any], *cont
         ContractBroken: the offer or its object is wrong.
         SkipTest: the plugin reports itself absent on this host.
     """
-    hook = _HOOK_OF[kind]
-    plugin = SimpleNamespace(**{hook: hookimpl(specname=hook)(lambda: [offer])})
-    registry = Registry.of(tested=plugin)
-    if registry.broken:
-        raise ContractBroken(registry.broken[0].reason)
+    registry = registry_of(kind, offer)
     name, plain = offer.name, checked_options(offer.options, options)
     try:
         if kind == "probe":

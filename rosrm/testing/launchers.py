@@ -1,13 +1,14 @@
-"""The contract of a launcher: the behaviour that the slave relies on."""
+"""Contract of launchers with the slave."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import weakref
 from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
-from types import SimpleNamespace
 from typing import ClassVar
 from unittest import SkipTest
 
@@ -20,20 +21,18 @@ from rosrm.extensions.contracts import (
     LauncherOffer,
     ProcessTreeLauncher,
 )
-from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.plugin_calls import implements, required
-from rosrm.extensions.registry import Registry
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec
 from rosrm.slave.launch.launchers import PREPARE_LIMIT
-from rosrm.testing.calls import ContractBroken, call
+from rosrm.testing.calls import ContractBroken, call, registry_of
 
 
 class LauncherContract:
-    """The behaviour of a launcher that the slave relies on.
+    """Contract of a launcher with the slave.
 
     Attributes:
-        offer: what is tested.
+        offer: the tested offer.
         spec: of a process whose strategy declares this launcher.
     """
 
@@ -41,13 +40,11 @@ class LauncherContract:
     spec: ClassVar[ProcessSpec] = ProcessSpec("p", command=("sleep", "60"))
 
     def make(self) -> Launcher:
-        """Return a new launcher of a slave with an empty directory."""
-        hook = hookimpl(specname="register_launchers")(lambda: [self.offer])
-        registry = Registry.of(tested=SimpleNamespace(register_launchers=hook))
-        if registry.broken:
-            raise ContractBroken(registry.broken[0].reason)
-        context = LauncherContext(Path(mkdtemp(prefix="rosrm-")), sys.executable, 1)
-        found = registry.launchers(context)
+        """Return a new launcher of a slave with an empty directory, removed after the test."""
+        folder = Path(mkdtemp(prefix="rosrm-"))
+        weakref.finalize(self, shutil.rmtree, folder)
+        context = LauncherContext(folder, sys.executable, 1)
+        found = registry_of("launcher", self.offer).launchers(context)
         if found.absent:
             raise SkipTest(f"{self.offer.name} is absent: {found.absent[self.offer.name]}")
         if found.broken:
@@ -66,7 +63,7 @@ class LauncherContract:
         return None if prepared is None else required(prepared, Launch)
 
     def test_prepares_a_command_line_of_text(self) -> None:
-        """The supervisor starts it, with an environment of text."""
+        """The launcher returns a command line and an environment of text for the supervisor."""
         prepared = self._prepared(self.make(), self.launch())
         if prepared is not None:
             assert prepared.argv, "the command line is empty"
@@ -75,13 +72,13 @@ class LauncherContract:
                 assert all(isinstance(text, str) for text in item), f"environment: {item}"
 
     def test_starts_the_same_instance(self) -> None:
-        """The order stays as the master gave it."""
+        """The launcher does not change the assignment."""
         launch = self.launch()
         prepared = self._prepared(self.make(), launch)
         assert prepared is None or prepared.assignment == launch.assignment
 
-    def test_says_nothing_of_a_process_that_it_has_not_started(self) -> None:
-        """Each launcher is asked about the instances of all others."""
+    def test_denies_instances_of_other_launchers(self) -> None:
+        """The launcher answers no for any process that it has not started."""
         launcher: object = self.make()
         if implements(launcher, ProcessTreeLauncher):
             leads = call("leads", CALL_LIMIT, partial(launcher.leads, os.getpid()))
@@ -91,7 +88,7 @@ class LauncherContract:
             assert gone is False, f"has_departed answered {gone} for another process"
 
     def test_discards_images_that_are_not_there(self) -> None:
-        """A user may restart any process."""
+        """The launcher accepts an instance without images: a user may restart any process."""
         launcher: object = self.make()
         if implements(launcher, ImageLauncher):
             instance = InstanceId(self.spec.name, 999)

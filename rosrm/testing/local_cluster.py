@@ -25,7 +25,7 @@ import psutil
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import NoMaster, RosrmError
 from rosrm.model.rows import HostRow, Listing, ProcessRow
-from rosrm.ros.client import MasterClient
+from rosrm.ros.master_connection import MasterClient
 from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
 from rosrm.testing.loopback import settings_on_this_machine
 

@@ -231,7 +231,7 @@ class MigrationContract:
                         "a SetRestart before the Commit needs an undo with the policy of the spec"
                     )
 
-    def test_a_silent_source_goes_on_only_when_its_successor_has_given_up(self) -> None:
+    def test_a_silent_source_resumes_only_when_its_successor_has_given_up(self) -> None:
         """The undo of SWITCH is ABORT, and an earlier SHADOW has the undo RESUME."""
         for move in self.moves():
             undone_by = {
@@ -276,14 +276,13 @@ class MigrationContract:
                     "instances": list(pids),
                 }  # fmt: skip
                 self._check_executor(step)
-                told = {**step.arguments, "results": results, "here": here}
-                told = json.loads(json.dumps(told))
+                given = json.loads(json.dumps({**step.arguments, "results": results, "here": here}))
                 who, execute = (
                     f"the executor {step.executor!r}",
                     self.offer.executors[step.executor],
                 )
                 try:
-                    answer = call(who, step.timeout, partial(execute, told))
+                    answer = call(who, step.timeout, partial(execute, given))
                 except ContractBroken:
                     raise
                 except Exception:  # noqa: BLE001, S112 - an executor may fail its step by raising

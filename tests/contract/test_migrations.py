@@ -129,7 +129,7 @@ def _handing_over(
         (_handing_over(aborts=False), "test_plan_is_sound"),
         (_handing_over(phase=HandoffPhase.TAKE_OVER), "test_plan_is_sound"),
         (_handing_over(alias="p"), "test_plan_is_sound"),
-        (_handing_over(resumes=False), "test_a_silent_source_goes_on_only_when"),
+        (_handing_over(resumes=False), "test_a_silent_source_resumes_only_when"),
         (_handing_over(releases=False), "test_a_shadow_is_released_after"),
         (_handing_over(gives_back=False), "test_a_source_that_is_not_restarted"),
         (_changed(timeout=object()), "test_survives_the_journal"),

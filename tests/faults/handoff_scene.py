@@ -9,13 +9,13 @@ from pathlib import Path
 from rosrm.config.settings import LivenessSettings
 from rosrm.model.rows import ProcessRow
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
-from tests.faults.handoff_watcher import Fault, Watcher, blocks, instances, is_gapless
+from tests.faults.handoff_watcher import Fault, Watcher, answered_by, blocks, instances, is_gapless
 from tests.ros.clusters import QUICK, Cluster, host
 from tests.waiting import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "moving"
-PROGRAMS = "benchmarks.handoff_nodes"
+COUNT = "benchmarks.handoff_nodes"
 RATE = 50.0
 #: Consecutive outputs of one instance after which that instance counts as the active one.
 _ALONE = 10
@@ -40,15 +40,12 @@ class Scene:
 
     Args:
         make: function that creates a cluster.
-        program: program of `benchmarks.handoff_nodes`.
+        module: Python module that runs the program `count` of `benchmarks.handoff_nodes`.
         inputs: inputs per second that the watcher publishes to the process.
-        module: Python module that runs the program.
         options: options of the migration strategy.
     """
 
-    def __init__(
-        self, make, program: str, inputs: float = 0.0, module: str = PROGRAMS, **options
-    ) -> None:
+    def __init__(self, make, module: str = COUNT, *, inputs: float = 0.0, **options) -> None:
         self.cluster: Cluster = make(host("h0"), host("h1"), liveness=LivenessSettings())
         self.watcher = Watcher(self.cluster.domain, inputs)
         self._source = self._pid = 0
@@ -57,7 +54,7 @@ class Scene:
         self.cluster.submit(
             ProcessSpec(
                 NAME, module=module,
-                arguments=(program, "--rate", str(RATE)),
+                arguments=("count", "--rate", str(RATE)),
                 environment={"PYTHONPATH": str(ROOT)}, ros=True, stop=QUICK,
                 restart=RestartPolicy("on-failure", delay=0.2, attempts=100),
                 migration=MigrationPolicy("handoff", options=options),
@@ -95,7 +92,7 @@ class Scene:
         return self.cluster.log_of("master")[-3000:]
 
     def settle(self) -> ProcessRow:
-        """Wait until exactly one instance runs, owns the name and publishes."""
+        """Wait until exactly one instance runs, owns the name, publishes, and answers inputs."""
         self.cluster.wait(NAME, "running")
         # An older output may be from an instance that is silent by now.
         before = len(self.watcher.outputs)
@@ -105,7 +102,7 @@ class Scene:
             last = self.watcher.outputs[before:][-_ALONE:]
             heard = len(last) == _ALONE and {one.instance for one in last} == {row.number}
             alone = instances(self.cluster, NAME).keys() == {row.number}
-            return row.state == "running" and heard and alone
+            return row.state == "running" and heard and alone and bool(answered_by(last))
 
         view = self.cluster.wait_until("one active instance", settled, PATIENCE)
         return next(row for row in view.processes if row.name == NAME)
@@ -179,5 +176,5 @@ class Scene:
         return self.watcher.outputs
 
     def is_gapless(self) -> bool:
-        """Return True if no output is lost or repeated, and the instances did not alternate."""
+        """Return True if no output or input is lost or repeated, and the instances took turns."""
         return is_gapless(self.outputs) and len(blocks(self.outputs)) <= 2

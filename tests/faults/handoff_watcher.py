@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import threading
 from collections.abc import Callable
+from itertools import groupby, pairwise
 from typing import NamedTuple
 
 import rclpy
@@ -14,8 +14,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64, Int64MultiArray
 
 from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
-from rosrm.node.handoff.channel import CHANNEL, STATE_CONFIG
 from rosrm.ros import qos
+from rosrm.ros.qos import HANDOFF, STATE_CONFIG
 from rosrm.supervisor.procfs import read_environment
 from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
 from tests.ros.clusters import Cluster, pids_of, zombie
@@ -38,7 +38,7 @@ Fault = Callable[[], None]
 
 
 class Output(NamedTuple):
-    """The instance that published an output, its number, and the input that it answers."""
+    """The instance that published an output, its number, and the answered input; 0: none."""
 
     instance: int
     sequence: int
@@ -109,7 +109,7 @@ class Watcher:
     def _said(self, config: StateConfig) -> None:
         if config.channel not in self._channels:
             self._channels.add(config.channel)
-            self._node.create_subscription(HandoffReport, config.channel, self._reported, CHANNEL)
+            self._node.create_subscription(HandoffReport, config.channel, self._reported, HANDOFF)
         if config.source == self._source:
             self._hear(f"says {SAID[config.phase]}")
 
@@ -148,15 +148,19 @@ class Watcher:
 
 def blocks(outputs: list[Output]) -> list[list[Output]]:
     """Group the outputs, in order of arrival, by the instance that published them."""
-    return [list(group) for _, group in itertools.groupby(outputs, lambda one: one.instance)]
+    return [list(group) for _, group in groupby(outputs, lambda one: one.instance)]
 
 
 def is_gapless(outputs: list[Output]) -> bool:
     """Return True if each number and each answered input occurs once and in order."""
-    first = outputs[0]
-    return [one[1:] for one in outputs] == [
-        (first.sequence + n, first.answers + n) for n in range(len(outputs))
-    ]
+    counts = ([one.sequence for one in outputs], answered_by(outputs))
+    pairs = (pair for count in counts for pair in pairwise(count))
+    return all(after == before + 1 for before, after in pairs)
+
+
+def answered_by(outputs: list[Output]) -> list[int]:
+    """Return the inputs that were answered, in order."""
+    return [one.answers for one in outputs if one.answers]
 
 
 def instances(cluster: Cluster, process: str) -> dict[int, int]:

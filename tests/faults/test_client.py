@@ -8,8 +8,8 @@ import threading
 import pytest
 
 from rosrm.errors import Refused
-from rosrm.ros.client import MasterClient, is_unsure
 from rosrm.ros.control import accepted, refused
+from rosrm.ros.master_connection import MasterClient, is_unsure
 from tests.ros.clusters import host, service
 from tests.waiting import PATIENCE
 
@@ -32,7 +32,7 @@ def test_the_outcome_of_a_request_to_a_killed_master_is_unsure(make_cluster) -> 
     try:
         client.submit([service("first")])  # the client has discovered the service from here on
         # However long that took, the client sends no greeting before the request.
-        client._heard += 1000.0
+        client._last_contact += 1000.0
         master = cluster.master.process
         master.send_signal(signal.SIGSTOP)  # the request arrives, and the master does not answer
         asking = threading.Thread(target=submit)
@@ -52,7 +52,7 @@ def test_a_request_to_another_run_of_the_master_is_repeated(make_cluster) -> Non
         client.list()
         cluster.restart_master()
         cluster.wait_for_hosts()
-        client._heard += 1000.0  # the client greeted the former run just now
+        client._last_contact += 1000.0  # the client greeted the former run just now
         client.submit([service("p")])
         cluster.wait("p", "running")
 

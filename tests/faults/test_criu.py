@@ -1,8 +1,8 @@
-"""Everybody who has a part in a move by criu is killed at each of its steps.
+"""Each part of a migration by criu is killed at each of its steps.
 
-Who is killed with SIGKILL is started again, as its service manager would. Afterwards one instance
-owns the name, and its memory is the same: the count goes on from where it was, and no number was
-ever heard twice. Moments are told by what lies on the disks of the hosts.
+A part that is killed with SIGKILL is started again, like by a service manager. Afterwards one
+instance owns the name, and its memory is the same: the count continues, and no number was received
+twice. Files on the disks of the hosts show each moment.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SLOWLY = 4_000_000
 
 
 class Scene:
-    """A counter that is moved to and fro.
+    """A counter that migrates to and fro.
 
     Args:
         make: makes a cluster.
@@ -49,12 +49,12 @@ class Scene:
         self.ear.close()
 
     def move(self, moment: str) -> None:
-        """Begin a move, and return at one of its moments."""
+        """Begin a migration, and return at one of its moments."""
         row = self.cluster.wait(NAME, "running")
         self.ear.hear(20)
         self.source, self._number = row.host, row.number
         self._before = self.cluster.client.list().last_sequence
-        left = set(self._signs(moment))  # of moves before
+        left = set(self._signs(moment))  # of earlier migrations
         refusal = ask(self.cluster, _OTHER[row.host])
         assert not refusal, refusal
         deadline = time.monotonic() + PATIENCE
@@ -76,7 +76,7 @@ class Scene:
         return there.glob(f"in-*/{restore_result.FILE}")
 
     def kill(self, victim: str) -> None:
-        """SIGKILL, and what a service manager does then."""
+        """Kill a part with SIGKILL, and start it again like a service manager."""
         cluster = self.cluster
         if victim == "master":
             cluster.master.process.kill()
@@ -93,7 +93,7 @@ class Scene:
         cluster.start_slave(next(one for one in cluster.hosts if one.host == name))
 
     def _pid_of(self, victim: str) -> int:
-        """The destination may not have been started yet."""
+        """Return the pid of the source, or of the destination once it was started."""
         deadline = time.monotonic() + PATIENCE
         while True:
             found = instances(self.cluster, NAME)
@@ -103,14 +103,14 @@ class Scene:
             assert time.monotonic() < deadline, f"no {victim}: {found}"
 
     def end(self, *, but: str = "?") -> str:
-        """How the move has ended: "migrated" or "stayed"; one instance is there, and is heard.
+        """Return the end, "migrated" or "stayed"; one instance is left, whose counts arrive.
 
         Args:
             but: host where an image may be left for a while.
         """
         deadline = time.monotonic() + 90.0
         while not (ends := self._ends()):
-            assert time.monotonic() < deadline, f"the move has not ended: {self._log()}"
+            assert time.monotonic() < deadline, f"the migration has not ended: {self._log()}"
             self.cluster.client.spin(0.1)
         assert len(ends) == 1, ends
         row = self.cluster.wait(NAME, "running")
@@ -121,13 +121,13 @@ class Scene:
         return ends[0]
 
     def switch_off(self, victim: str) -> str:
-        """The host of the source or of the destination loses its power; its name."""
+        """Switch off the host of the source or of the destination; return its name."""
         name = self.source if victim == "source" else _OTHER[self.source]
         self.cluster.switch_off(name)
         return name
 
     def switch_on(self, name: str) -> None:
-        """It comes back with nothing; only what lay on its disk is there."""
+        """Switch a host on again; only its disk is as before."""
         self.cluster.start_slave_again(name)
 
     def _ends(self) -> list[str]:
@@ -147,7 +147,7 @@ def scene(make_shared):
 
 @pytest.fixture(scope="module")
 def restless(make_shared):
-    """As `scene`, but when its host is lost, which is soon, the counter goes to the other one."""
+    """Yield a scene with a short lease and `host_loss: elsewhere`."""
     one = Scene(make_shared, lease=4.0, host_loss=HostLossPolicy("elsewhere"))
     yield one
     one.close()
@@ -155,8 +155,8 @@ def restless(make_shared):
 
 @pytest.mark.parametrize("moment", ["checkpoint", "fetch", "restore", "join"])
 @pytest.mark.parametrize("victim", ["master", "source's slave", "destination's slave"])
-def test_one_who_carries_the_move_out_is_killed(criu, scene, victim, moment):
-    """The node counts on, here or there, and no count is heard twice."""
+def test_the_master_or_a_slave_is_killed(criu, scene, victim, moment):
+    """The node continues its count, here or there, and no count is received twice."""
     scene.move(moment)
     scene.kill(victim)
     scene.end()
@@ -166,7 +166,7 @@ def test_one_who_carries_the_move_out_is_killed(criu, scene, victim, moment):
 
 @pytest.mark.parametrize("moment", ["restore", "join"])
 def test_the_destination_is_killed(criu, scene, moment):
-    """Before the commit the source goes on; after it, the policy starts another one."""
+    """Before the commit the source continues; after it, the policy starts another instance."""
     scene.move(moment)
     scene.kill("destination")
     if scene.end() == "stayed":
@@ -175,7 +175,7 @@ def test_the_destination_is_killed(criu, scene, moment):
 
 
 def test_the_source_is_killed_in_its_dump(criu, scene):
-    """Its policy starts it again; nobody else is there."""
+    """Its policy starts it again, and there is no other instance."""
     scene.move("checkpoint")
     scene.kill("source")
     assert scene.end() == "stayed"
@@ -183,7 +183,7 @@ def test_the_source_is_killed_in_its_dump(criu, scene):
 
 
 def test_the_source_is_killed_once_its_image_is_restored(criu, scene):
-    """It stood still, and all that it remembered is in the image: the count goes on from there."""
+    """The source was frozen, and the image has all its memory: the count continues from there."""
     scene.move("join")
     scene.kill("source")
     assert scene.end() == "migrated"
@@ -193,12 +193,12 @@ def test_the_source_is_killed_once_its_image_is_restored(criu, scene):
 
 @pytest.mark.parametrize("moment", ["fetch", "restore"])
 def test_the_destination_s_host_is_switched_off(criu, scene, moment):
-    """Before the commit the source goes on, at the latest when that host counts as lost."""
+    """Before the commit the source continues, at the latest when that host counts as lost."""
     scene.move(moment)
     name = scene.switch_off("destination")
     scene.ear.hear(20, 90.0)
     scene.switch_on(name)
-    # Its next slave gives the image two minutes: it cannot know that the move has ended.
+    # Its next slave gives the image two minutes: it cannot know that the migration has ended.
     assert scene.end(but=name) == "stayed"
     assert min(scene.ear.steps()) > 0
 
@@ -206,8 +206,8 @@ def test_the_destination_s_host_is_switched_off(criu, scene, moment):
 @pytest.mark.parametrize(
     ("victim", "moment"), [("source", "fetch"), ("source", "restore"), ("destination", "join")]
 )
-def test_a_host_is_switched_off_whose_process_does_not_wait_for_it(criu, restless, victim, moment):
-    """No move is stuck for it: one counter is heard from the other host, and stays the only one."""
+def test_a_host_with_host_loss_elsewhere_is_switched_off(criu, restless, victim, moment):
+    """The migration ends: one counter runs on the other host, and stays the only one."""
     scene = restless
     scene.move(moment)
     name = scene.switch_off(victim)
@@ -217,7 +217,7 @@ def test_a_host_is_switched_off_whose_process_does_not_wait_for_it(criu, restles
     assert row.host == _OTHER[name]
     assert not scene.cluster.events("migration_stuck", process=NAME)
     scene.switch_on(name)
-    # Its next slave gives what was fetched there two minutes.
+    # Its next slave keeps the fetched image for two minutes.
     scene.end(but=name)
     assert scene.cluster.wait(NAME, "running").number == row.number
     assert min(scene.ear.steps()) > 0

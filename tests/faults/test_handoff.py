@@ -1,5 +1,6 @@
 """Handoffs in which each participant is killed at each step: "moved" or "stayed", one active.
 
+The moved node counts by a timer and answers inputs: none may be lost or answered twice.
 A watcher outside the cluster receives the protocol's messages, and the victim is killed with
 SIGKILL as soon as the given one arrives. A killed master or slave is restarted, as its service
 manager would. A moment is left out where the victim neither acts nor waits for a new message.
@@ -9,8 +10,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.faults.handoff_scene import Scene
-from tests.faults.handoff_watcher import blocks
+from tests.faults.handoff_scene import RATE, Scene, all_of
+from tests.faults.handoff_watcher import answered_by, blocks, is_gapless
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -29,16 +30,16 @@ COMMITTED = MOMENTS[MOMENTS.index("destination policy") :]
 
 @pytest.fixture(scope="module")
 def scene(make_shared):
-    """A scene whose process counts by a timer."""
-    one = Scene(make_shared, "count")
+    """A scene whose node counts by a timer, and answers each input once."""
+    one = Scene(make_shared, "tests.ros.programs.counts_and_answers", inputs=RATE)
     yield one
     one.close()
 
 
 @pytest.fixture(scope="module")
 def stubborn(make_shared):
-    """A scene like `scene`, whose process ends by SIGKILL only."""
-    one = Scene(make_shared, "count", module="tests.ros.programs.blocks_signals")
+    """A scene whose node counts by a timer, and ends by SIGKILL only."""
+    one = Scene(make_shared, "tests.ros.programs.blocks_signals")
     yield one
     one.close()
 
@@ -55,7 +56,7 @@ def inject(scene: Scene, victim: str, moment: str) -> str:
     "moment", [one for one in MOMENTS if one not in ("SHADOWING", "ATTACHED", "SWITCHING")]
 )
 def test_the_master_is_killed(scene, moment):
-    """No output is lost or repeated: the next master continues the current step, or undoes it."""
+    """No output or input is lost or repeated: the next master continues the step, or undoes it."""
     inject(scene, "master", moment)
     assert scene.is_gapless(), scene.outputs
 
@@ -64,15 +65,16 @@ def test_the_master_is_killed(scene, moment):
     ("whose", "moment"),
     [
         ("source", "destination starting"), ("source", "source policy"), ("source", "says SHADOW"),
-        ("source", "says SWITCH"), ("source", "RELEASED"), ("source", "source stopping"),
-        ("source", "says DONE"), ("destination", "destination starting"),
-        ("destination", "says SHADOW"), ("destination", "READY"), ("destination", "says SWITCH"),
+        ("source", "says SWITCH"), ("source", "SILENT"), ("source", "RELEASED"),
+        ("source", "ACTIVE"), ("source", "source stopping"), ("source", "says DONE"),
+        ("destination", "destination starting"), ("destination", "says SHADOW"),
+        ("destination", "READY"), ("destination", "says SWITCH"), ("destination", "SILENT"),
         ("destination", "ACTIVE"), ("destination", "source stopping"),
         ("destination", "says DONE"),
     ],
 )  # fmt: skip
 def test_a_slave_is_killed(scene, whose, moment):
-    """The processes on the slave's host keep running; no output is lost or repeated."""
+    """The processes on the slave's host keep running; no output or input is lost or repeated."""
     inject(scene, f"{whose}'s slave", moment)
     assert scene.is_gapless(), scene.outputs
 
@@ -86,6 +88,14 @@ def test_the_destination_is_killed(scene, moment):
         assert len(blocks(scene.outputs)) == 1
 
 
+def test_the_destination_is_killed_in_the_switch(scene):
+    """The source, already silent, serves its buffered inputs: each once and in order."""
+    fault = all_of(scene.kill("destination"), scene.let_go("source"))
+    scene.move(*scene.source_held(), ("SWITCHING", fault))
+    assert scene.end() == "stayed"
+    assert scene.is_gapless(), scene.outputs
+
+
 @pytest.mark.parametrize("moment", MOMENTS[:11])
 def test_the_source_is_killed(scene, moment):
     """From SWITCH on the source's state is not lost; before, its restart policy starts it again."""
@@ -96,6 +106,10 @@ def test_the_source_is_killed(scene, moment):
         first, second = speakers
         # A source killed in the middle of a cycle may have its last output repeated.
         assert second[0].sequence in (first[-1].sequence, first[-1].sequence + 1)
+        assert is_gapless(first)
+        assert is_gapless(second)
+        last, following = answered_by(first)[-1], answered_by(second)[0]
+        assert following in (last, last + 1)
 
 
 def test_a_source_that_ignores_signals_is_killed(stubborn):

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.timeout(180)
 @pytest.fixture(scope="module")
 def scene(make_shared):
     """A scene whose process counts by a timer; SWITCH times out after 1.5 s."""
-    one = Scene(make_shared, "count", switch_timeout=1.5)
+    one = Scene(make_shared, switch_timeout=1.5)
     yield one
     one.close()
 

@@ -62,7 +62,7 @@ def test_a_signal_leaves_nothing(lab, tmp_path):
     said = []
     for line in process.stderr:
         said.append(line)
-        if "all is well" in line:
+        if "no deviations" in line:
             break
     process.send_signal(signal.SIGTERM)
     rest = process.communicate(timeout=120)[1]

@@ -1,4 +1,4 @@
-"""Real processes are dumped into images, and restored below the program that holds them."""
+"""Dump of real processes into images, and their restore below the shim."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.core.supervisor.events import StopOrdered
 from rosrm.errors import CriuError
 from rosrm.model.values import RestartPolicy
+from rosrm.supervisor.client_values import key_of
 from rosrm_criu.engine import dump, image, process_tree, restore, restore_result
 from rosrm_criu.engine.image import MappedFile
 from tests.criu_kit import TIMEOUT, eventually
@@ -37,16 +39,16 @@ while True:
 
 @pytest.fixture
 def counter(theatre):
-    """A counter that counts."""
+    """Return a counter that counts."""
     actor = theatre.start(COUNTER)
     actor.counts()
     return actor
 
 
-# --- what goes on -------------------------------------------------------------------------------
+# --- what continues -----------------------------------------------------------------------------
 
 
-def test_a_restored_process_goes_on_where_it_was_and_its_log_in_the_new_file(theatre, counter):
+def test_a_restored_process_continues_and_logs_into_the_new_file(theatre, counter):
     """No number is missing or written twice; the old log grows no more."""
     directory = theatre.dump(counter)
     before = counter.numbers()
@@ -72,7 +74,7 @@ def test_five_hops_in_a_row(theatre, counter):
 
 
 def test_a_udp_socket_is_the_same_after_the_restore(theatre):
-    """It answers at the same address, and knows how often it was asked."""
+    """The process answers at the same address, and continues its count."""
     code = """
 import socket
 ours, count = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), 0
@@ -96,7 +98,7 @@ while True:
 
 
 def test_a_heap_of_numpy_with_its_threads_is_the_same(theatre):
-    """8 MB of chance numbers, three threads: the same sum, and the threads run."""
+    """8 MB of random numbers and three threads have the same sum, and the threads run."""
     code = """
 import hashlib, threading, time, numpy
 heap = numpy.random.default_rng(1).random(1 << 20)
@@ -118,8 +120,8 @@ turn("c")
     assert theatre.manifest.size > 8 << 20
 
 
-def test_a_child_comes_along(theatre):
-    """The tree is dumped, pipes within it too: the child's numbers go on through its parent."""
+def test_child_and_pipe_are_restored_with_their_parent(theatre):
+    """The tree is dumped with its pipes: the child's numbers still come through its parent."""
     code = f"""
 import subprocess, sys
 child = subprocess.Popen([sys.executable, "-I", "-S", "-c", {COUNTER!r}], stdout=subprocess.PIPE)
@@ -136,7 +138,7 @@ for line in child.stdout:
 
 
 def test_a_file_below_the_working_directory_follows(theatre):
-    """It is put back as it was when the process stood still, and written on at the same place."""
+    """The file has its content at the dump, and the process continues at its position."""
     code = f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}"
     actor = theatre.start(code)
     count = theatre.work / "count"
@@ -150,8 +152,8 @@ def test_a_file_below_the_working_directory_follows(theatre):
     assert numbers == list(range(1, numbers[-1] + 1))
 
 
-def test_a_log_of_its_own_is_made_anew_where_it_is_missing(theatre):
-    """As rcl's in ~/.ros/log: what is only appended to stays behind, and goes on empty."""
+def test_a_missing_log_of_its_own_is_created(theatre):
+    """A file that is only appended to, such as rcl's in ~/.ros/log, does not follow."""
     own = theatre.folder / "logs/own.log"
     own.parent.mkdir()
     actor = theatre.start(f"import sys; sys.stdout = open({str(own)!r}, 'a')\n{COUNTER}")
@@ -163,8 +165,8 @@ def test_a_log_of_its_own_is_made_anew_where_it_is_missing(theatre):
     eventually(lambda: own.exists() and own.read_text().count("\n") > 2, "its log again")
 
 
-def test_who_runs_in_its_supervisors_directory_does_so_on_another_host(theatre):
-    """There it has another path: working directory and files below it move along, hop by hop."""
+def test_a_process_in_its_supervisors_directory_moves_to_that_of_another_host(theatre):
+    """Its path differs there: working directory and files below it follow, hop by hop."""
 
     def state(number: int) -> dict[str, str]:
         return {"ROSRM_SUPERVISOR": str(theatre.folder / f"host{number}")}
@@ -197,19 +199,19 @@ def working_directory(pid: int) -> str:
     return os.readlink(f"/proc/{pid}/cwd")  # noqa: PTH115 - as /proc says it
 
 
-def test_a_file_of_the_kernels_needs_not_lie_there(theatre):
-    """What it reads of itself in /proc is elsewhere in /proc, and CRIU knows that."""
+def test_files_of_proc_are_not_part_of_the_image(theatre):
+    """CRIU itself restores an open file of the process's own folder in /proc."""
     actor = theatre.start(f"import os; own = open(f'/proc/{{os.getpid()}}/stat')\n{COUNTER}")
     actor.counts()
     theatre.restore(theatre.dump(actor)).counts()
     assert theatre.manifest.files == ()
 
 
-# --- what becomes of the source -----------------------------------------------------------------
+# --- the source -------------------------------------------------------------------------------
 
 
-def test_it_does_not_stand_still_for_the_checksums(theatre, counter, monkeypatch):
-    """Of a large image they take as long as the dump; a process that runs on is not held up."""
+def test_it_is_not_stopped_for_the_checksums(theatre, counter, monkeypatch):
+    """The checksums of a large image take as long as its dump; the process runs in that time."""
     make = image.file_checksums
 
     def make_while_it_counts(directory, names):
@@ -222,42 +224,16 @@ def test_it_does_not_stand_still_for_the_checksums(theatre, counter, monkeypatch
     assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
 
 
-def test_it_stands_still_until_it_is_resumed(theatre, counter):
-    """Until the commit nothing is lost: who takes the move back resumes the source."""
-    theatre.dump(counter, leave="stopped")
-    seen = counter.numbers()
-    assert process_tree.is_stopped(counter.pid)
-    dump.resume(counter.pid)
-    counter.counts()
-    assert counter.numbers()[: len(seen) + 1] == list(range(1, len(seen) + 2))
-
-
-def test_who_stood_still_before_is_not_set_going(theatre, counter):
-    """A process that somebody stopped stays stopped after its dump."""
+def test_a_process_that_was_stopped_before_stays_stopped(theatre, counter):
+    """A dump does not continue a process that a user has stopped."""
     counter.process.send_signal(signal.SIGSTOP)
     assert process_tree.wait_until_stopped([counter.pid], TIMEOUT)
     theatre.dump(counter, leave="running")
     assert process_tree.is_stopped(counter.pid)
 
 
-def test_a_pipe_to_outside_is_named_and_the_source_runs_on(theatre):
-    """CRIU would dump it without a word; nobody would be at its other end."""
-    ours, theirs = os.pipe()
-    try:
-        actor = theatre.start(COUNTER, pass_fds=(theirs,))
-        actor.counts()
-        with pytest.raises(
-            CriuError, match=f"{theirs} of pid {actor.pid} .*a pipe .*{os.getpid()}"
-        ):
-            theatre.dump(actor)
-        actor.counts()
-    finally:
-        os.close(ours)
-        os.close(theirs)
-
-
-def test_whatever_fails_the_source_runs_on(theatre, counter, monkeypatch):
-    """A bug of ours too, after CRIU has stopped the process."""
+def test_after_any_error_the_source_runs_on(theatre, counter, monkeypatch):
+    """This includes a bug of rosrm after CRIU has stopped the process."""
     monkeypatch.setattr(image, "write", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         theatre.dump(counter)
@@ -278,16 +254,16 @@ def test_a_unix_socket_to_outside_is_named_and_the_source_runs_on(theatre, kind)
         actor.counts()
 
 
-def test_a_socket_pair_within_the_process_is_no_tie(theatre):
-    """As an event loop holds one to wake itself."""
+def test_a_socket_pair_within_the_process_is_dumped(theatre):
+    """An event loop has one to wake itself."""
     code = f"import socket; pair = socket.socketpair()\n{COUNTER}"
     actor = theatre.start(code)
     actor.counts()
     theatre.restore(theatre.dump(actor)).counts()
 
 
-def test_a_debugger_is_named_and_goes_on(theatre, counter):
-    """Two cannot hold one process; the process does not suffer."""
+def test_a_debugger_is_named_and_the_source_runs_on(theatre, counter):
+    """Only one process can trace another one; the process is not harmed."""
     code = """
 import ctypes, signal, sys
 libc = ctypes.CDLL(None, use_errno=True)
@@ -310,7 +286,7 @@ while True:
 
 @pytest.mark.skipif(not os.access("/dev/fuse", os.W_OK), reason="/dev/fuse may not be opened")
 def test_a_device_is_named_and_the_source_runs_on(theatre):
-    """What CRIU itself refuses is said in words, and nothing but its log is left of the image."""
+    """The error explains CRIU's own refusal, and only CRIU's log is left of the image."""
     actor = theatre.start(f"device = open('/dev/fuse', 'rb+', buffering=0)\n{COUNTER}")
     actor.counts()
     with pytest.raises(CriuError, match=r"file descriptor \d+ is the device /dev/fuse"):
@@ -319,7 +295,7 @@ def test_a_device_is_named_and_the_source_runs_on(theatre):
     assert [path.name for path in (theatre.folder / "image").iterdir()] == ["dump.log"]
 
 
-def test_an_image_that_has_no_room_is_not_begun(theatre, counter, monkeypatch):
+def test_an_image_without_disk_space_is_not_begun(theatre, counter, monkeypatch):
     """The file system of the image keeps some space; the process is not touched."""
     monkeypatch.setattr(process_tree, "memory_of", lambda pids: 1 << 60)
     with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
@@ -328,28 +304,28 @@ def test_an_image_that_has_no_room_is_not_begun(theatre, counter, monkeypatch):
     assert [*(theatre.folder / "image").iterdir()] == []
 
 
-# --- below the hold -----------------------------------------------------------------------------
+# --- below the shim -----------------------------------------------------------------------------
 
 
 def test_the_exit_code_comes_through_the_shim(theatre, counter):
-    """SIGTERM is passed on, and the process's own answer to it is the shim's end."""
+    """SIGTERM is forwarded, and the shim ends with the exit code of the process."""
     restored = theatre.restore(theatre.dump(counter))
     restored.process.terminate()
     assert restored.process.wait(TIMEOUT) == 7
 
 
 @pytest.mark.parametrize("option", [[], ["--no-namespace"]])
-def test_who_ends_at_once_was_restored_all_the_same(theatre, option):
-    """A process that waits for nothing but its last instruction: its end comes through."""
+def test_a_process_that_ends_at_once_was_restored(theatre, option):
+    """The exit code of a process with one last instruction arrives."""
     code = "import os, signal; os.kill(os.getpid(), signal.SIGSTOP); os._exit(9)"
     actor = theatre.start(code)
     assert process_tree.wait_until_stopped([actor.pid], TIMEOUT)
     directory = theatre.dump(actor)
     shim = theatre.shim(directory, *option)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / restore_result.FILE).exists, "the end of the restore")
     os.killpg(shim.pid, signal.SIGCONT)
     assert shim.process.wait(TIMEOUT) == 9
-    assert json.loads((directory / "hold.json").read_text())["reason"] == ""
+    assert json.loads((directory / restore_result.FILE).read_text())["reason"] == ""
 
 
 def test_signals_come_through_the_shim(theatre, counter):
@@ -362,9 +338,12 @@ def test_signals_come_through_the_shim(theatre, counter):
     assert restored.process.wait(TIMEOUT) == -signal.SIGUSR2
 
 
-@pytest.mark.parametrize("group", [True, False])
-def test_sigkill_of_the_shim_ends_all_of_it(theatre, group):
-    """Also a daemon that has left group and session. It takes milliseconds on an idle machine."""
+@pytest.mark.parametrize("ends", ["the group of the shim", "the shim", "the process"])
+def test_with_the_shim_or_the_process_all_of_it_ends(theatre, ends):
+    """Even a daemon that has left group and session ends, within milliseconds on an idle machine.
+
+    If the process itself ends, all others have ended before the shim does.
+    """
     code = f"""
 import os, signal
 def become_two(*_):
@@ -382,11 +361,16 @@ signal.signal(signal.SIGHUP, become_two)
     restored.says("daemon")
     namespace = pid_namespace(restored.outcome.pid)
     assert len(living_in(namespace)) == 3  # the init, the process, the daemon
-    if group:
-        os.killpg(restored.pid, signal.SIGKILL)
-    else:
-        restored.process.kill()
+    if ends == "the process":
+        restored.process.terminate()
+        assert restored.process.wait(TIMEOUT) == 7
+        assert living_in(namespace) == []
+        return
     killed = time.monotonic()
+    if ends == "the shim":
+        restored.process.kill()
+    else:
+        os.killpg(restored.pid, signal.SIGKILL)
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
     assert time.monotonic() - killed < 10.0
     assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
@@ -397,7 +381,7 @@ def pid_namespace(pid: int) -> str:
 
 
 def living_in(namespace: str) -> list[int]:
-    """Processes of a pid namespace that are not just waiting to be reaped."""
+    """Return the processes of a pid namespace, except zombies."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
@@ -408,28 +392,7 @@ def living_in(namespace: str) -> list[int]:
     return [pid for pid in found if process_tree.is_alive(pid)]
 
 
-def test_what_the_process_leaves_behind_ends_with_it(theatre):
-    """Its end is the end of the namespace, before the shim's own is seen."""
-    code = f"""
-import os, signal
-def become_two(*_):
-    if os.fork() == 0:
-        os.setsid()
-        os.write(1, b"daemon\\n")
-signal.signal(signal.SIGHUP, become_two)
-{COUNTER}"""
-    actor = theatre.start(code)
-    actor.counts()
-    restored = theatre.restore(theatre.dump(actor))
-    os.killpg(restored.pid, signal.SIGHUP)
-    restored.says("daemon")
-    namespace = pid_namespace(restored.outcome.pid)
-    restored.process.terminate()
-    assert restored.process.wait(TIMEOUT) == 7
-    assert living_in(namespace) == []
-
-
-def test_marks_of_its_former_instance_are_gone(theatre):
+def test_marks_of_the_former_instance_are_removed(theatre):
     """A supervisor that looks for leftovers of the old instance does not find the restored one."""
     marks = {"ROSRM_INSTANCE": "actor#1", "ROSRM_SUPERVISOR": "/somewhere", "MORE": "kept"}
     actor = theatre.start(COUNTER, environment=marks)
@@ -439,24 +402,26 @@ def test_marks_of_its_former_instance_are_gone(theatre):
     assert {b"ROSRM_INSTANCE=", b"ROSRM_SUPERVISOR=", b"MORE=kept"} <= {*shown}
 
 
-def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
-    """Memory of a process is nobody else's business; how the restore went is all that is left."""
+def test_the_image_is_private_and_removed_on_request(theatre, counter):
+    """No other user can read the memory; only the result of the restore is left."""
     directory = theatre.dump(counter)
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
     assert modes == {0}
     restored = theatre.restore(directory, remove=True)
-    eventually(lambda: [path.name for path in directory.iterdir()] == ["hold.json"], "a clean end")
+    eventually(
+        lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "a clean end"
+    )
     restored.process.terminate()
     restored.process.wait(TIMEOUT)
-    assert [path.name for path in directory.iterdir()] == ["hold.json"]
+    assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
 
 
 @pytest.mark.parametrize("victim", ["the process", "its shim"])
-def test_that_it_was_restored_is_known_after_its_end(theatre, counter, victim):
+def test_the_result_of_a_restore_outlives_the_process(theatre, counter, victim):
     """The result of a restore survives any early end of the process; its memory is removed."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, remove=True)
-    told = restored.outcome
+    outcome = restored.outcome
     eventually(
         lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "its removal"
     )
@@ -464,90 +429,85 @@ def test_that_it_was_restored_is_known_after_its_end(theatre, counter, victim):
     os.kill(pid, signal.SIGKILL)
     assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
     assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
-    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == told
+    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == outcome
 
 
 @pytest.fixture
 def host(tmp_path):
-    """A supervisor's state directory."""
+    """Yield a supervisor's state directory."""
     host = Host(tmp_path / "host")
     yield host
     host.clean_up()
 
 
-def test_below_a_supervisor(theatre, counter, host):
-    """The supervisor starts a shim like any process: it stops it, and sees its end."""
-    directory = theatre.dump(counter)
+def restored_below(host, theatre, directory, *, order=None, **options):
+    """Restore an image below a supervisor; return its client, and the running instance."""
     client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
+    command = theatre.shim_command(directory, **options)
+    client.start([host.order("actor", *command, number=2, **(order or {}))])
     running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    eventually((directory / restore_result.FILE).exists, "the end of the restore")
+    return client, running
+
+
+def test_a_supervisor_manages_a_restored_process(theatre, counter, host):
+    """The supervisor starts a shim like any process: it stops it, and sees its end."""
+    client, running = restored_below(host, theatre, theatre.dump(counter))
     assert process_tree.root_of(running.pid) != running.pid
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     ended = host.ended(client, "actor", number=2)
     assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
 
 
-def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
-    """It runs on meanwhile, is known again, and is stopped like any other."""
-    directory = theatre.dump(counter)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    before = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+def test_the_next_supervisor_adopts_it(theatre, counter, host):
+    """The process runs on while its supervisor is killed, and is stopped like any other."""
+    client, before = restored_below(host, theatre, theatre.dump(counter))
     log = host.log("actor", 2)
     host.kill_supervisor(client)
     client = host.connect()
     [after] = client.instances
     seen = log.read_text()
     eventually(lambda: len(log.read_text()) > len(seen), "more numbers")
-    client.stop(after.instance)
+    client.send(StopOrdered(key_of(after.instance)))
     host.ended(client, "actor", number=2)
     assert (after.state, after.pid) == (before.state, before.pid)
     assert not process_tree.is_alive(before.pid)
 
 
-def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
+def test_the_supervisor_kills_a_process_that_does_not_stop(theatre, host):
     """The stop policy ends in a SIGKILL of the shim's group, which leaves no process."""
     ignoring = "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     code = COUNTER.replace("count = 0", f"{ignoring}count = 0").replace("sys.exit(7)", "None")
     actor = theatre.start(code)
     actor.counts()
-    directory = theatre.dump(actor)
-    client = host.connect()
-    client.start([host.order("actor", *theatre.shim_command(directory), number=2)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = restored_below(host, theatre, theatre.dump(actor))
     namespace = pid_namespace(process_tree.root_of(running.pid))
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     ended = host.ended(client, "actor", number=2)
     assert ended.exit_signal == signal.SIGKILL
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
 
 
-def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
-    """The restart policy holds for what was restored: it begins at one, as after any crash."""
-    directory = theatre.dump(counter)
-    then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "a word of its own"]
-    command = theatre.shim_command(directory, remove=True, then=then)
-    client = host.connect()
+def test_the_restart_policy_holds_for_a_restored_process(theatre, counter, host):
+    """The restart policy applies to a restored process: it counts from one, as after any crash."""
+    then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "an argument"]
     restart = RestartPolicy("on-failure", delay=0.01)
-    client.start([host.order("actor", *command, number=2, restart=restart)])
-    running = host.running(client, "actor", number=2)
-    eventually((directory / "hold.json").exists, "the end of the restore")
+    client, running = restored_below(
+        host, theatre, theatre.dump(counter), order={"restart": restart}, remove=True, then=then
+    )
     log = host.log("actor", 2)
     assert "\n1\n" not in log.read_text()
     os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
     eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
-    client.stop(running.instance)
+    client.send(StopOrdered(key_of(running.instance)))
     host.ended(client, "actor", number=2)
 
 
 # --- without a namespace ------------------------------------------------------------------------
 
 
-def test_without_a_namespace_it_is_held_all_the_same(theatre, counter):
-    """Where no namespace may be entered: same pid, signals and end come through."""
+def test_without_a_namespace_it_is_restored_too(theatre, counter):
+    """If no namespace may be entered, the pid is the same, and signals and exit code arrive."""
     directory = theatre.dump(counter)
     restored = theatre.restore(directory, "--no-namespace")
     restored.counts()
@@ -568,8 +528,8 @@ def test_without_a_namespace_a_guard_ends_it_with_its_shim(theatre, counter):
     )
 
 
-def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
-    """The source still has it; it is not harmed."""
+def test_without_a_namespace_a_pid_in_use_is_reported(theatre, counter):
+    """The source still has the pid, and is not harmed."""
     directory = theatre.dump(counter, leave="stopped")
     with pytest.raises(CriuError, match=rf"its pid {counter.pid} is in use here"):
         theatre.restore(directory, "--no-namespace")
@@ -582,32 +542,32 @@ def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
 
 @pytest.mark.parametrize("pattern", ["criu/pages-1.img", "files/*"])
 def test_a_flipped_byte_is_refused(theatre, pattern):
-    """The size is the same. Neither has CRIU begun, nor was a file put over what lies there."""
+    """The size is the same. CRIU does not start, and no file on the host is replaced."""
     actor = theatre.start(f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}")
     count = theatre.work / "count"
     eventually(lambda: count.exists() and count.read_text().count("\n") > 2, "its file")
     directory = theatre.dump(actor)
-    count.write_text("of somebody else")
+    count.write_text("of another process")
     [damaged] = directory.glob(pattern)
     flip_a_bit(damaged)
     shim = theatre.shim(directory)
     assert shim.process.wait(TIMEOUT) == 125
-    wanted = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
-    assert wanted in shim.log.read_text()
-    assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
+    expected = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
+    assert expected in shim.log.read_text()
+    assert expected in json.loads((directory / restore_result.FILE).read_text())["reason"]
     assert not (directory / "restore.log").exists()
-    assert count.read_text() == "of somebody else"
+    assert count.read_text() == "of another process"
 
 
 def flip_a_bit(path: Path) -> None:
-    """In the middle of a file."""
+    """Flip a bit in the middle of a file."""
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
 
 
-def test_an_image_without_checksums_is_restored_all_the_same(theatre, counter):
-    """As one that has just come from another host: the transfer has a checksum of its own."""
+def test_an_image_without_checksums_is_restored(theatre, counter):
+    """An image of a migration has none, because the transfer has a checksum of its own."""
     directory = theatre.folder / "image"
     manifest = dump.dump(
         theatre.criu, counter.pid, directory, leave="killed", timeout=TIMEOUT, checksums=False
@@ -621,7 +581,7 @@ def test_an_image_without_checksums_is_restored_all_the_same(theatre, counter):
 
 
 def changed(directory: Path, **values: object) -> None:
-    """Another manifest."""
+    """Change the manifest of an image."""
     image.write(directory, replace(image.read(directory), **values))
 
 
@@ -635,16 +595,16 @@ def changed(directory: Path, **values: object) -> None:
         ({"mapped": (MappedFile("/etc/hostname", 1, 0o644),)}, "another one .* of 1"),
     ],
 )
-def test_what_is_missing_here_is_named(theatre, counter, values, said):
-    """Before CRIU begins: the path, and the host."""
+def test_a_missing_requirement_of_an_image_is_named(theatre, counter, values, said):
+    """The error names path and host, before CRIU starts."""
     directory = theatre.dump(counter)
     changed(directory, **values)
     with pytest.raises(CriuError, match=said):
         theatre.restore(directory)
 
 
-def test_a_file_that_it_reads_has_to_be_there(theatre):
-    """What it only reads does not follow."""
+def test_a_file_that_it_reads_must_exist(theatre):
+    """Files that are only read do not follow the process."""
     table = theatre.folder / "table"
     table.write_text("rows")
     actor = theatre.start(f"table = open({str(table)!r})\n{COUNTER}")
@@ -656,15 +616,15 @@ def test_a_file_that_it_reads_has_to_be_there(theatre):
 
 
 def test_an_image_that_others_may_read_is_refused(theatre, counter):
-    """Who can write to it can run what he likes as the process's user."""
+    """A user who can write to the image could run any program as the user of the process."""
     directory = theatre.dump(counter)
     directory.chmod(0o755)
     with pytest.raises(CriuError, match="open to others"):
         theatre.restore(directory)
 
 
-def test_what_tracing_maps_is_made_where_it_is_missing(theatre, counter):
-    """LTTng's shared memory, which every ROS process maps, has no content."""
+def test_a_missing_file_of_tracing_is_created(theatre, counter):
+    """Every ROS process maps LTTng's shared memory, which has no content."""
     directory = theatre.dump(counter)
     path = Path(f"/dev/shm/lttng-ust-wait-rosrm-test-{os.getpid()}")
     changed(directory, mapped=(MappedFile(str(path), 4096, 0o640),))
@@ -676,8 +636,8 @@ def test_what_tracing_maps_is_made_where_it_is_missing(theatre, counter):
         path.unlink(missing_ok=True)
 
 
-def test_criu_takes_no_id_that_it_is_to_restore():
-    """In a fresh namespace ids begin small, where those of a container's processes are too."""
+def test_criu_uses_no_pid_that_it_must_restore():
+    """In a new namespace ids begin small, like those of a container's processes."""
     assert restore.id_for_criu((), 32768) == 300
     assert restore.id_for_criu((12, 13, 310), 32768) == 310
     assert restore.id_for_criu(tuple(range(1, 32700, 100)), 32768) == 300

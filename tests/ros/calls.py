@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rosrm.ros.client import wait_until
+from rosrm.ros.master_connection import wait_until
 from rosrm.ros.participant import Participant
 
 

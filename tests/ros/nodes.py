@@ -19,7 +19,7 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rosrm.node import Node
-from rosrm.node.handoff.channel import CHANNEL, STATE_CONFIG
+from rosrm.ros.qos import HANDOFF, STATE_CONFIG
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig
@@ -184,7 +184,7 @@ class Conductor:
         self.reports: list[HandoffReport] = []
         self._publisher = stage.plain.create_publisher(StateConfig, TOPIC, STATE_CONFIG)
         stage.plain.create_subscription(
-            HandoffReport, self.config.channel, self.reports.append, CHANNEL
+            HandoffReport, self.config.channel, self.reports.append, HANDOFF
         )
 
     def say(self, phase: int, **other: Any) -> None:

@@ -25,7 +25,7 @@ NAME = "portable_counter"
 
 
 def two_hosts(make: Make, **settings) -> Cluster:
-    """`left` and `right`; nothing moves by itself."""
+    """Return a cluster of `left` and `right`, without automatic migrations."""
     return make(
         host("left"), host("right"),
         migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
@@ -34,7 +34,7 @@ def two_hosts(make: Make, **settings) -> Cluster:
 
 
 class Ear:
-    """Hears what portable counters count, in a thread of its own."""
+    """Receiver of the counts of portable counters, in a thread of its own."""
 
     def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
@@ -57,7 +57,7 @@ class Ear:
             self.checksums.add(checksum)
 
     def hear(self, more: int, patience: float = PATIENCE) -> None:
-        """So many counts more, within so many seconds."""
+        """Wait for so many more counts, at most `patience` seconds."""
         wanted, deadline = len(self.counts) + more, time.monotonic() + patience
         while len(self.counts) < wanted:
             assert time.monotonic() < deadline, f"{len(self.counts)} counts of {wanted}"
@@ -80,7 +80,7 @@ class Ear:
 
 
 def counter(*arguments: str, **fields) -> ProcessSpec:
-    """The example; it counts 50 times a second, and holds 1 MB."""
+    """Return the example, which counts 50 times a second and has a heap of 1 MB."""
     options = fields.pop("options", {})
     program = fields.pop("command", ())
     if not program:
@@ -94,7 +94,7 @@ def counter(*arguments: str, **fields) -> ProcessSpec:
 
 
 def ask(cluster: Cluster, to: str | None = None, name: str = NAME) -> str:
-    """Ask for a move, as soon as the hosts have said whether they can; why it is refused, or ""."""
+    """Request a migration once the hosts' capabilities are known; return the refusal, or ""."""
     deadline = time.monotonic() + PATIENCE
     while "not known yet" in (refusal := _asked(cluster, to, name)):
         assert time.monotonic() < deadline, refusal
@@ -111,29 +111,29 @@ def _asked(cluster: Cluster, to: str | None, name: str) -> str:
 
 
 def found_below(cluster: Cluster, pattern: str) -> list[Path]:
-    """What there is of images now, of all hosts; a folder may go while it is looked at."""
+    """Return the image files of all hosts; a folder may vanish during the search."""
     while True:
         with contextlib.suppress(FileNotFoundError):
             return sorted(cluster.directory.glob(f"hosts/*/images/{pattern}"))
 
 
-#: Seconds in which an image has gone of which nobody is told that its restore was cut off: those of
-#: the strategy for a start and a restore, and some.
+#: Seconds after which an image of an interrupted restore is removed: the strategy's timeouts for a
+#: start and a restore, and a margin.
 UNUSED = 90.0
 
 
 def nothing_left(cluster: Cluster, *, but: str = "?") -> None:
-    """No image, no process that stands still, nobody who offers anything.
+    """Check that there is no image, no stopped process and no sender.
 
     Args:
-        but: host whose images are not looked at.
+        but: host whose images do not count.
     """
 
     def images() -> list[Path]:
         found = found_below(cluster, "**/*")
-        # How a restore went stands there as long as what was restored.
-        looked_at = [path for path in found if but not in path.parts]
-        return [path for path in looked_at if path.is_file() and path.name != restore_result.FILE]
+        # The result of a restore stays as long as its instance.
+        counted = [path for path in found if but not in path.parts]
+        return [path for path in counted if path.is_file() and path.name != restore_result.FILE]
 
     wait_until(lambda: not images(), f"no image left: {images()}", UNUSED)
     slaves = {part.process.pid for part in cluster.slaves.values()}
@@ -148,7 +148,7 @@ def nothing_left(cluster: Cluster, *, but: str = "?") -> None:
 
 
 def pids(cluster: Cluster) -> list[int]:
-    """Of the leaders of the counter's instances."""
+    """Return the pids of the leaders of the counter's instances."""
     mark = f"{NAME}#"
     found = []
     for one in psutil.process_iter(["environ"]):

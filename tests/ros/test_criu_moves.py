@@ -14,19 +14,19 @@ def cluster(make_shared):
 
 
 def moved(cluster, times: int):
-    """The process once it has moved so often, and none of its moves has failed."""
+    """Return the process after so many migrations, none of which has failed."""
 
     def there(view) -> bool:
         stayed = [event.message for event in cluster.events("stayed")]
         assert not stayed, stayed
         return any(row.migrations == times and row.state == "running" for row in view.processes)
 
-    view = cluster.wait_until(f"{times} moves", there, 60.0)
+    view = cluster.wait_until(f"{times} migrations", there, 60.0)
     return next(row for row in view.processes if row.state == "running")
 
 
 def test_a_node_counts_on_where_it_is_restored(criu, cluster, ear):
-    """No count twice and none left out of what it did, its memory the same, over several moves."""
+    """Over several migrations no count is repeated or missing, and the memory is the same."""
     cluster.submit(counter())
     cluster.wait(NAME, "running")
     ear.hear(50)
@@ -36,7 +36,7 @@ def test_a_node_counts_on_where_it_is_restored(criu, cluster, ear):
         row = moved(cluster, times)
         assert row.host != before
         ear.hear(50)
-    # A reader that finds the writer later than that finds it misses the first of what it says.
+    # A reader that discovers the writer late misses its first counts.
     steps = ear.steps()
     assert min(steps) == 1
     assert sum(step > 1 for step in steps) <= 3
@@ -46,13 +46,13 @@ def test_a_node_counts_on_where_it_is_restored(criu, cluster, ear):
 
 
 def test_it_is_healthy_where_it_is_restored(criu, cluster, ear):
-    """Its topic is known for its own, though it sees another pid than others see."""
+    """The health watch knows its topic, although the node has another pid in its namespace."""
     cluster.submit(counter(health=Health("count", rate=10.0, timeout=3.0)))
     cluster.wait(NAME, "running")
     ear.hear(50)
     assert not ask(cluster)
     moved(cluster, 1)
-    ear.hear(300)  # twice as long as it may be amiss
+    ear.hear(300)  # twice the timeout of the health watch
     row = cluster.process(NAME)
     assert (row.state, row.restarts, row.migrations) == ("running", 0, 1)
     cluster.cancel(NAME)

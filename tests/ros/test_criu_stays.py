@@ -1,4 +1,4 @@
-"""What cannot move by criu says why, and goes on where it is; nothing of the attempt is left."""
+"""Failed migrations by criu: the reason, a source that runs on, and no remains of the attempt."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def cluster(make_shared):
 
 @pytest.fixture
 def running(criu, cluster, ear):
-    """Starts a counter; it is ended after the test."""
+    """Yield a function that starts a counter; cancel it after the test."""
 
     def start(*arguments: str, **fields) -> str:
         cluster.submit(counter(*arguments, **fields))
@@ -38,7 +38,7 @@ def running(criu, cluster, ear):
 
 
 def stayed(cluster, ear) -> str:
-    """Why a move that was asked for has failed; the node counts on, and nothing is left of it."""
+    """Return the reason of a failed migration; the node counts on, and nothing of it is left."""
     before = cluster.client.list().last_sequence
     assert not ask(cluster)
     event = cluster.wait_for_event("stayed", process=NAME, after=before, timeout=60.0)
@@ -60,7 +60,7 @@ def stayed(cluster, ear) -> str:
 def test_a_host_without_a_criu_that_works_gets_nothing(
     which, reason, cluster, ear, running, request, monkeypatch, tmp_path
 ):
-    """The request is refused with the reason, which stands in the events since the host came."""
+    """The request is refused with the reason, which is an event since the host registered."""
     program = tmp_path / "criu"
     if which != "none":
         program = Path(request.getfixturevalue("old")(which).command[-1])
@@ -82,7 +82,7 @@ def test_a_host_without_a_criu_that_works_gets_nothing(
 
 
 def test_there_is_no_working_directory_at_the_destination(cluster, ear, running, tmp_path):
-    """It is said before the node is asked to leave: not one count is late."""
+    """The error precedes the request to leave: no count is late."""
     place = tmp_path / "place"
     place.mkdir()
     running(working_directory=str(place))
@@ -94,7 +94,7 @@ def test_there_is_no_working_directory_at_the_destination(cluster, ear, running,
 
 
 def test_the_destination_has_no_room(cluster, ear, running):
-    """More is to stay free there than there is."""
+    """The reserve at the destination is larger than the free space."""
     running(options={"reserve": 10**15})
     why = stayed(cluster, ear)
     assert "do not fit beside" in why
@@ -102,7 +102,7 @@ def test_the_destination_has_no_room(cluster, ear, running):
 
 
 def test_an_image_that_was_damaged_is_not_restored(cluster, ear, running):
-    """A file of it is cut short before the restore; the image and the half of it are gone."""
+    """A file is cut short before the restore; afterwards both ends have no image."""
     source = running()
     other = {"left": "right", "right": "left"}[source]
     images = cluster.directory / "hosts" / other / "images"
@@ -115,7 +115,7 @@ def test_an_image_that_was_damaged_is_not_restored(cluster, ear, running):
 
 
 def cut_short(images: Path) -> None:
-    """The first file of a process's registers that arrives there."""
+    """Cut the first file of a process's registers that arrives."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         for file in images.glob("in-*/criu/core-*.img"):
@@ -124,8 +124,8 @@ def cut_short(images: Path) -> None:
         time.sleep(0.001)
 
 
-def test_a_process_that_holds_a_pipe_to_another_one_is_not_dumped(cluster, ear, running):
-    """The descriptor and who is at the other end are named."""
+def test_a_process_with_a_pipe_to_another_one_is_not_dumped(cluster, ear, running):
+    """The error names the descriptor and the process at the other end."""
     running("pipe", command=(sys.executable, TROUBLED))
     why = stayed(cluster, ear)
     assert "is a pipe that it shares with pid" in why
@@ -133,7 +133,7 @@ def test_a_process_that_holds_a_pipe_to_another_one_is_not_dumped(cluster, ear, 
 
 
 def test_a_node_that_hangs_in_a_callback_is_left_alone(cluster, ear, running, tmp_path):
-    """It is waited for as long as was said; when the callback ends it goes on as if nothing was."""
+    """The timeout is that of the option; after its callback the node runs as before."""
     block = tmp_path / "block"
     running("hangs", str(block), command=(sys.executable, TROUBLED), options={"leave_timeout": 1.0})
     before = cluster.client.list().last_sequence
@@ -149,7 +149,7 @@ def test_a_node_that_hangs_in_a_callback_is_left_alone(cluster, ear, running, tm
 
 
 def test_a_node_that_cannot_leave_says_what_to_use(criu, cluster):
-    """An ordinary node is not touched; the error names what makes it movable."""
+    """An ordinary node is not touched; the error names the library for portable nodes."""
     cluster.submit(node("ordinary", migration=counter().migration))
     cluster.wait("ordinary", "running")
     assert not ask(cluster, name="ordinary")

@@ -15,8 +15,8 @@ from rosrm.config.settings import ControlSettings
 from rosrm.errors import NoMaster, Refused
 from rosrm.model.values import HostDescription, ResourceDescription
 from rosrm.ros import convert, names, qos
-from rosrm.ros.client import MasterClient, find_master, wait_for_service
 from rosrm.ros.control import ControlClient
+from rosrm.ros.master_connection import MasterClient, find_master, wait_for_service
 from rosrm.ros.participant import Participant
 from rosrm.ros.reading_codec import LAYOUT, encode
 from rosrm.testing.local_cluster import claim_domain
@@ -427,8 +427,8 @@ def test_callbacks_that_raise_end_nothing() -> None:
         assert wait_for_service(asker, client, deadline)
         control.call(client, srv.List.Request(), deadline, fails)
         wait_until(
-            lambda: min(server.guard.failures, asker.guard.failures) >= 2, "two failures each",
-            seen=lambda: ends, pause=lambda _: (server.spin(0.02), asker.spin(0.02)),
+            lambda: len(ends) == 4, "two failures each", seen=lambda: ends,
+            pause=lambda _: (server.spin(0.02), asker.spin(0.02)),
         )  # fmt: skip
         control.expire(deadline)
     kinds = [type(one).__name__ for one in ends]

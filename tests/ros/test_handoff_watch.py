@@ -93,7 +93,7 @@ def test_one_publisher_alone_is_said():
 
 
 def test_nobody_is_said():
-    with pytest.raises(TimeoutError, match="nobody publishes /watched/state, in 1 s"):
+    with pytest.raises(TimeoutError, match="no node publishes /watched/state, in 1 s"):
         listen(1.0)
 
 

@@ -9,7 +9,7 @@ import pytest
 from std_msgs.msg import Int64
 
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
-from rosrm.node.handoff.channel import STATE_CONFIG
+from rosrm.ros.qos import STATE_CONFIG
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
 from tests.ros.clusters import CALM, NODE, alive, host

@@ -16,7 +16,7 @@ from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
 
 from rosrm.node import Migratable
-from rosrm.node.handoff import source
+from rosrm.node.handoff import state_parts
 from rosrm_msgs.msg import HandoffReport, StateConfig
 from tests.ros.nodes import (
     ALIAS,
@@ -271,7 +271,7 @@ def test_a_shadow_waits_until_it_is_matched_as_its_source_is(
     """A shadow waits for matched readers and inputs, because it would lose messages without."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
-    member = pair.second._rosrm.member
+    member = pair.second._rosrm.entities
     entity = member.outputs[0] if what == "output" else member.inputs[0].subscription
     with monkeypatch.context() as patch:
         patch.setattr(entity, method, lambda: 0)
@@ -285,7 +285,7 @@ def test_a_shadow_waits_until_its_buffer_overlaps_the_state(stage, pair, monkeyp
     stage.plain.create_timer(0.02, lambda: talker.publish(Int64(data=1)))
     stage.spin_until(lambda: pair.sums, "a sum")
     with monkeypatch.context() as patch:
-        patch.setattr(pair.second._rosrm.member.buffer, "overlaps", lambda topic: False)
+        patch.setattr(pair.second._rosrm.entities.buffer, "overlaps", lambda topic: False)
         shadowing(stage, pair, "until a message on /add has been here and in the state")
     pair.conductor.wait(2, R.READY)
 
@@ -293,7 +293,7 @@ def test_a_shadow_waits_until_its_buffer_overlaps_the_state(stage, pair, monkeyp
 def test_a_shadow_that_misses_an_input_does_not_become_active(stage, pair, monkeypatch):
     """The destination fails, and the source, which has the input, resumes."""
     pair.conductor.prepare()
-    monkeypatch.setattr(pair.second._rosrm.member.buffer, "misses_one", lambda topic: True)
+    monkeypatch.setattr(pair.second._rosrm.entities.buffer, "misses_one", lambda topic: True)
     pair.conductor.say(C.SWITCH)
     report = pair.conductor.wait(2, R.FAILED)
     assert "a message on /add did not come here" in report.message
@@ -306,12 +306,12 @@ def test_an_input_that_comes_after_the_switch_and_was_processed_before_it_counts
     """An input that reaches the successor after the state which covers it counts once."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
-    late, received = [], pair.second._rosrm.member._received
-    pair.second._rosrm.member._received = lambda *what: late.append(what)
-    pair.second._rosrm.member.catch_up = lambda: None
+    late, received = [], pair.second._rosrm.entities._received
+    pair.second._rosrm.entities._received = lambda *what: late.append(what)
+    pair.second._rosrm.entities.catch_up = lambda: None
     talker.publish(Int64(data=1))
     stage.spin_until(lambda: pair.sums and late, "the sum, and the message at the shadow")
-    pair.second._rosrm.member.buffer.is_idle = lambda *what: True
+    pair.second._rosrm.entities.buffer.is_idle = lambda *what: True
     pair.conductor.hand_over()
     goes_on(stage, pair.counts)
     received(*late.pop())
@@ -397,7 +397,7 @@ def test_a_source_that_resumes_has_lost_nothing(stage, pair):
     pair.conductor.silence(pair.second)
     for _ in range(5):
         talker.publish(Int64(data=1))
-    stage.spin_until(lambda: len(pair.first._rosrm.member.buffer) == 5, "five kept messages")
+    stage.spin_until(lambda: len(pair.first._rosrm.entities.buffer) == 5, "five kept messages")
     pair.conductor.resume()
     goes_on(stage, pair.counts)
     assert is_gapless(pair.counts)
@@ -551,7 +551,7 @@ def test_a_restore_function_that_raises(stage, pair):
 
 def test_a_state_that_is_too_large(stage, pair, monkeypatch):
     """The source refuses to send the state."""
-    monkeypatch.setattr(source, "LARGEST_PART", 4)
+    monkeypatch.setattr(state_parts, "LARGEST_PART", 4)
     fails(stage, pair, "12 bytes, more than the 4 that may travel", of=1)
 
 
@@ -600,12 +600,12 @@ def test_a_source_that_was_started_again_is_another_one(stage, pair):
 
 def test_more_input_than_can_be_kept(stage, pair, monkeypatch):
     """The shadow gives up; the source loses nothing."""
-    monkeypatch.setattr(pair.second._rosrm.member.buffer, "_limit", 3)
+    monkeypatch.setattr(pair.second._rosrm.entities.buffer, "_limit", 3)
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
     stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
     for _ in range(5):
         talker.publish(Int64(data=1))
-    stage.spin_until(lambda: pair.second._rosrm._destination._over, "the overflow")
+    stage.spin_until(lambda: pair.second._rosrm._destination._ended, "the overflow")
     fails(stage, pair, "more came on /add than can be kept")
     stage.spin_until(lambda: numbers(pair.sums) == [1, 2, 3, 4, 5], "the source's sums")
 

@@ -142,7 +142,7 @@ def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end):
         stage.remove(pair.first)
         successor = pair.second
     talker.say(0, 1, 2, 3)
-    stage.spin_until(lambda: len(successor._rosrm.member.buffer) == 4, "four that are kept")
+    stage.spin_until(lambda: len(successor._rosrm.entities.buffer) == 4, "four that are kept")
 
     def go_on():
         if end == "resumed":
@@ -212,7 +212,7 @@ def test_two_inputs_of_one_topic_have_each_message_both(stage):
     pair = pair_of(stage, Both)
     talker = Talker(stage, 0.0, readers=4)
     pair.conductor.prepare()
-    member, source = pair.first._rosrm.member, pair.first._rosrm._source
+    member, source = pair.first._rosrm.entities, pair.first._rosrm._source
     received = member._received
 
     def receive(one, message, info):
@@ -253,7 +253,7 @@ def test_a_request_during_the_silence_is_answered_once(stage):
     stage.spin_until(client.service_is_ready, "the service")
     pair.conductor.silence(pair.second)
     answers = [client.call_async(Trigger.Request()) for _ in range(5)]
-    (held,) = (one for one in pair.first._rosrm.member._openings if one.srv_name == "~/poke")
+    (held,) = (one for one in pair.first._rosrm.entities._openings if one.srv_name == "~/poke")
     stage.spin_until(lambda: len(held._held) == 5, "five requests that are held")
     assert pair.first.served == 0
     pair.conductor.resume()
@@ -295,7 +295,7 @@ def test_an_input_that_a_thread_holds_is_not_lost(stage, threads):
     pair = pair_of(stage, make)
     threads.take(pair.first)
     talker = Talker(stage, 0.0, readers=2)
-    gate, member = threading.Event(), pair.first._rosrm.member
+    gate, member = threading.Event(), pair.first._rosrm.entities
     received = member._received
 
     def receive(one, message, info):
@@ -345,7 +345,7 @@ def test_a_tick_that_a_thread_holds_is_not_skipped(stage, threads):
     pair = pair_of(stage, Rare)
     threads.take(pair.first)
     pair.conductor.prepare()
-    source, member = pair.first._rosrm._source, pair.first._rosrm.member
+    source, member = pair.first._rosrm._source, pair.first._rosrm.entities
     rare = next(one for one in member.timers if one.timer is pair.first.rare)
     with member.turn:  # a cycle during which the slow timer comes due
         stage.spin_until(lambda: rare.taken, "a tick that waits for its turn")

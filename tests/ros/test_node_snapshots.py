@@ -11,8 +11,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
-from rosrm import snapshots
 from rosrm.node.handoff.channel import MARK
+from rosrm.snapshots import reader
 from rosrm_msgs.msg import HandoffReport, StateMark
 from tests.ros.nodes import RELIABLE, Conductor, Counter
 
@@ -59,7 +59,7 @@ def crash(stage, node) -> None:
 
 
 def kept_up_to(directory, sequence: int) -> bool:
-    head = snapshots.newest_head(directory)
+    head = reader.newest_head(directory)
     return head is not None and head.sequence >= sequence
 
 
@@ -69,7 +69,7 @@ def test_what_was_processed_is_not_processed_again(stage, tmp_path):
     talker.publish(Int64(data=5))
     first = stage.instance(Busy, 1, keep=tmp_path)
     stage.spin_until(lambda: first.seen == [5], "the message")
-    at = first._rosrm.member.sequence
+    at = first._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, at), "a state that covers it")
     crash(stage, first)
     second = stage.instance(Busy, 1, keep=tmp_path)
@@ -130,9 +130,9 @@ def test_a_revived_node_can_be_moved(stage, tmp_path):
     at = second.count
     stage.spin_until(lambda: shadow.count >= at + 5, "counts of the successor")
     stage.spin_until(lambda: kept_up_to(tmp_path / "b", 1), "its own kept state")
-    assert snapshots.newest_head(tmp_path / "b").instance == 3
+    assert reader.newest_head(tmp_path / "b").instance == 3
     assert [one.data for one in counts] == list(range(counts[0].data, counts[-1].data + 1))
-    assert snapshots.newest_head(tmp_path / "a").instance == 2
+    assert reader.newest_head(tmp_path / "a").instance == 2
 
 
 def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
@@ -140,14 +140,14 @@ def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
     first = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: first.count >= 30, "thirty counts")
     stage.remove(first)
-    (newest, head), (_, before) = snapshots.files(tmp_path)
+    (newest, head), (_, before) = reader.snapshot_files(tmp_path)
     newest.write_bytes(newest.read_bytes()[: head.size - 3])
     second = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: second.count > 0, "a count")
-    assert second._rosrm.member.sequence <= before.sequence + 1
+    assert second._rosrm.entities.sequence <= before.sequence + 1
     assert second.count > 20
     crash(stage, second)
-    for path, _ in snapshots.files(tmp_path):
+    for path, _ in reader.snapshot_files(tmp_path):
         path.write_bytes(b"nonsense")
     third = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: third.count > 0, "a count")
@@ -173,7 +173,7 @@ def test_what_is_not_kept_at_once_is_kept_though_no_cycle_follows(stage, tmp_pat
         talker.publish(Int64(data=1))
     stage.spin_until(lambda: node.total == 5, "five messages")
     writes = node._rosrm._source._keeper
-    assert writes._kept < node._rosrm.member.sequence
+    assert writes._kept < node._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, 5), "the last state")
 
 
@@ -215,7 +215,7 @@ def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_
     marks = stage.listen(StateMark, "/counter/_rosrm/mark", MARK)
     first = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: marks and first.count >= 5, "five counts that somebody follows")
-    at = first._rosrm.member.sequence
+    at = first._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, at), "a kept state")
 
 
@@ -227,5 +227,5 @@ def test_once_there_is_room_again_every_state_is_kept_again(stage, tmp_path):
     stage.spin_until(lambda: node.count >= 20, "twenty counts")
     directory.unlink()
     stage.spin_until(lambda: kept_up_to(directory, 20), "a first state")
-    first = snapshots.newest_head(directory).sequence
+    first = reader.newest_head(directory).sequence
     stage.spin_until(lambda: kept_up_to(directory, first + 50), "states of later cycles")

@@ -95,7 +95,7 @@ def test_a_topic_without_a_publisher_undoes_the_migration(cluster):
     cluster.wait("lost", "running")
     cluster.client.migrate("lost", None)
     event = cluster.wait_for_event("stayed", process="lost")
-    assert "nobody publishes /wrong/state" in event.message
+    assert "no node publishes /wrong/state" in event.message
     cluster.wait("lost", "running")
     cluster.cancel("lost")
 

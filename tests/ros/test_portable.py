@@ -18,8 +18,8 @@ from std_msgs.msg import Int64, Int64MultiArray
 from std_srvs.srv import Trigger
 
 from rosrm.errors import PortableError
-from rosrm_criu.control.client import ask_prepare, ask_resume, await_joined, await_left, status_of
-from rosrm_criu.control.messages import VARIABLE, State
+from rosrm_criu.control.client import ask_prepare, ask_resume, await_joined, await_left
+from rosrm_criu.control.messages import VARIABLE, State, Status, read_message
 from rosrm_examples.portable_counter import filled
 from tests.ros.clusters import wait_until
 from tests.ros.nodes import PATIENCE
@@ -48,7 +48,7 @@ class Portable:
 
     def runs(self) -> bool:
         assert self.process.poll() is None, self.said()
-        status = status_of(self.directory)
+        status = read_message(self.directory, Status)
         return status is not None and status.state is State.RUNNING
 
     def prepare(self, request: str):
@@ -186,8 +186,8 @@ def test_to_leave_twice_is_to_leave_once(stage, start, heard) -> None:
     assert counts_on(heard), numbers(heard)
 
 
-def test_a_node_that_is_called_back_at_once_goes_on(stage, start, heard) -> None:
-    """Whether it had left or not: it runs, and counts on."""
+def test_a_node_that_is_called_back_at_once_runs_on(stage, start, heard) -> None:
+    """The node runs and counts on, whether it had left or not."""
     node = start()
     hear_more(stage, heard)
     ask_prepare(node.directory, node.pid, "m1")
@@ -197,14 +197,14 @@ def test_a_node_that_is_called_back_at_once_goes_on(stage, start, heard) -> None
 
 
 def test_parameters_and_timers_are_as_they_were(stage, start, heard) -> None:
-    """What was set at run time holds; a long timer goes on in its period; a cancelled one rests."""
+    """Parameters keep their values, timers their position; a cancelled timer stays cancelled."""
     node = start()
     hear_more(stage, heard)
     values = [Parameter("step", value=3), Parameter("limit", value=7.5)]
     request = SetParameters.Request(parameters=[one.to_parameter_msg() for one in values])
     answer = call(stage, SetParameters, "brain/set_parameters", request)
     assert all(one.successful for one in answer.results)
-    time.sleep(1.0)  # of a period of 100 s: a timer that began anew would show it
+    time.sleep(1.0)  # of a period of 100 s: a restarted timer would show it
     before = report(stage)
     node.prepare("m1")
     node.resume("m1")
@@ -215,7 +215,7 @@ def test_parameters_and_timers_are_as_they_were(stage, start, heard) -> None:
 
 
 def test_a_callback_is_not_cut_in_half(stage, start, heard) -> None:
-    """It ends, and is not begun again: what it publishes comes once."""
+    """The callback ends and does not run again: its output comes once."""
     node = start("long callback")
     hear_more(stage, heard, 2)
     node.prepare("m1")
@@ -225,7 +225,7 @@ def test_a_callback_is_not_cut_in_half(stage, start, heard) -> None:
 
 
 def test_callbacks_in_threads_come_to_rest(stage, start, heard) -> None:
-    """With an executor of several threads it is the same."""
+    """The same holds for an executor of several threads."""
     node = start("threads")
     hear_more(stage, heard)
     for move in ("m1", "m2"):
@@ -244,7 +244,7 @@ def test_callbacks_in_threads_come_to_rest(stage, start, heard) -> None:
     ],
 )
 def test_a_node_that_cannot_leave_stays_and_says_why(stage, start, heard, fault, said) -> None:
-    """One sentence for who asked; the node works on as before."""
+    """The client gets one sentence; the node works as before."""
     node = start(fault)
     hear_more(stage, heard)
     with pytest.raises(PortableError, match=said):
@@ -255,7 +255,7 @@ def test_a_node_that_cannot_leave_stays_and_says_why(stage, start, heard, fault,
 
 
 def test_a_node_that_cannot_join_again_fails_and_says_why(stage, start) -> None:
-    """Who waits reads what its `join` raised; the process ends with the traceback in its log."""
+    """The client gets the error of `join`; the process ends with the traceback in its log."""
     node = start("join fails")
     node.prepare("m1")
     with pytest.raises(PortableError, match="ValueError: no camera here"):
@@ -265,14 +265,14 @@ def test_a_node_that_cannot_join_again_fails_and_says_why(stage, start) -> None:
 
 
 def test_what_has_to_be_made_in_join_is_refused_in_the_constructor(start) -> None:
-    """At the first start, not after the first move."""
+    """The refusal comes at the first start, not after the first migration."""
     node = start("makes in constructor", wait=False)
     assert node.process.wait(PATIENCE) == 1
     assert "Brain.__init__ makes a publisher of /early" in node.said()
 
 
 def test_a_node_that_does_not_answer_is_named(start) -> None:
-    """Stopped by SIGSTOP: the wait ends in time, and says what is wrong."""
+    """The wait for a node that SIGSTOP has stopped ends in time, with the cause."""
     node = start()
     os.kill(node.pid, signal.SIGSTOP)
     os.waitid(os.P_PID, node.pid, os.WSTOPPED)
@@ -283,25 +283,25 @@ def test_a_node_that_does_not_answer_is_named(start) -> None:
 
 @pytest.mark.parametrize("away", [False, True])
 def test_sigterm_is_an_orderly_end(stage, start, heard, away) -> None:
-    """While it runs and while it is away: exit code 0, and nobody is there to be asked."""
+    """While it runs and while it is away, the exit code is 0, and the control directory is gone."""
     node = start()
     hear_more(stage, heard)
     if away:
         node.prepare("m1")
     node.process.terminate()
     assert node.process.wait(PATIENCE) == 0
-    assert status_of(node.directory) is None
+    assert read_message(node.directory, Status) is None
 
 
 def test_a_program_that_exits_has_not_failed(start) -> None:
-    """Its own exit code, and no word of a failure."""
+    """The exit code is its own, and no failure is reported."""
     node = start("exits")
     assert node.process.wait(PATIENCE) == 3
-    assert status_of(node.directory) is None
+    assert read_message(node.directory, Status) is None
 
 
 def test_started_by_hand_it_is_an_ordinary_node(stage, start, heard) -> None:
-    """No control directory: it joins, counts, and ends by SIGINT as any node."""
+    """Without a control directory it joins, counts, and ends by SIGINT like any node."""
     node = start(wait=False, controlled=False)
     hear_more(stage, heard)
     assert not node.directory.exists()
@@ -311,7 +311,7 @@ def test_started_by_hand_it_is_an_ordinary_node(stage, start, heard) -> None:
 
 
 def test_the_example_finds_its_memory_as_it_was(stage, start) -> None:
-    """Before a move and after it: the same checksum, and the count goes on by one each."""
+    """Before and after a migration the checksum is the same, and no count is missing."""
     example = [sys.executable, "-m", "rosrm_examples.portable_counter", "--mb", "9"]
     heard = stage.listen(Int64MultiArray, "count", 100)
     node = start(command=[*example, "--period", "0.01"])

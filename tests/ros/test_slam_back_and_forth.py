@@ -62,22 +62,22 @@ def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
         cluster.wait("slam", "running")
         wait_until(observer.publishers, "the SLAM is heard")
         cluster.submit(player(drive, hz, report))
-        wait_until(lambda: len(observer.heard) >= 2, "the first scans are mapped")
+        wait_until(lambda: len(observer.received) >= 2, "the first scans are mapped")
         for moves in range(1, MOVES + 1):
             move(cluster, moves)
             assert cluster.process("player").state == "running", "the drive was over too early"
-        enough = min(len(observer.heard) + 3, len(drive))
-        wait_until(lambda: len(observer.heard) >= enough, "scans are mapped after the last move")
+        enough = min(len(observer.received) + 3, len(drive))
+        wait_until(lambda: len(observer.received) >= enough, "scans are mapped after the last move")
         with suppress(Refused):  # it was at its end already
             cluster.client.cancel(["player"])
         cluster.ended("player")
         sent = json.loads(report.read_text())["scans_sent"]
-        wait_until(lambda: len(observer.heard) >= sent, "all scans are mapped")
-        holds_for(1.0, lambda: len(observer.heard) == sent, "no further scan")
-        heard = list(observer.heard)
+        wait_until(lambda: len(observer.received) >= sent, "all scans are mapped")
+        holds_for(1.0, lambda: len(observer.received) == sent, "no further scan")
+        received = list(observer.received)
     cluster.cancel("slam")
     driven = drive.part(0, sent)
-    run = LiveRun(driven, sent, heard, load_parts(out), 1.0 / hz)
+    run = LiveRun(driven, sent, received, load_parts(out), 1.0 / hz)
     summary = summarise(run, unmigrated_poses(driven), cluster.process("slam").migrations)
     assert differences(summary, "full", migrations=MOVES) == [], summary
     assert (summary["scans_sent"], summary["scans_processed"]) == (sent, sent)

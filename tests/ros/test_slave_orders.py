@@ -10,8 +10,8 @@ import pytest
 
 from rosrm.model.values import InstanceId, RestartPolicy
 from rosrm.ros import convert, names, qos
-from rosrm.ros.client import wait_for_service
 from rosrm.ros.control import ControlClient
+from rosrm.ros.master_connection import wait_for_service
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
 from tests.ros.calls import answer_to

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
-from rosrm import snapshots
 from rosrm.config.settings import CheckpointPolicySettings, KeepSettings, LivenessSettings
 from rosrm.model.values import (
     HostLossPolicy,
@@ -20,6 +19,9 @@ from rosrm.model.values import (
     Readiness,
     RestartPolicy,
 )
+from rosrm.snapshots import reader
+from rosrm.snapshots.format import Block
+from rosrm.snapshots.writer import SlotWriter
 from rosrm_msgs.msg import StateMark
 from tests.ros.clusters import CALM, STEADY, Cluster, host
 from tests.waiting import PATIENCE, wait_until
@@ -138,7 +140,7 @@ def test_a_large_snapshot(cluster):
     runs = wait_for_count(cluster, "large", 1, 1)
     # By default a snapshot may be a second behind; a busy machine takes time to write it.
     assert runs[1][0] >= 20, runs
-    assert snapshots.newest_head(snapshot_directory(cluster, row.host, "large")).size > 5_000_000
+    assert reader.newest_head(snapshot_directory(cluster, row.host, "large")).size > 5_000_000
     cluster.cancel("large")
 
 
@@ -164,19 +166,19 @@ def test_a_snapshot_that_cannot_be_restored_stays_as_it_is(cluster):
     cluster.wait("other", "failed")
     log = cluster.wait_for_log("other", "cannot be restored")
     assert "another version of the program" in log
-    assert snapshots.newest_content(directory)[1] == foreign
+    assert reader.newest_content(directory)[1] == foreign
 
 
 def rewritten(directory: Path) -> bytes:
     """Write the snapshot of another program, without parts; return its content."""
-    found, _ = snapshots.newest(directory, 99)
+    found, _ = reader.newest(directory, 99)
     mark = deserialize_message(found.blocks[0], StateMark)
     mark.parts = []
     data = bytes(serialize_message(mark))
-    writer = snapshots.SlotWriter(directory, "other", found.head.instance)
-    writer.write(found.head.sequence + 1, [snapshots.Block(data, zlib.crc32(data))])
+    writer = SlotWriter(directory, "other", found.head.instance)
+    writer.write(found.head.sequence + 1, [Block(data, zlib.crc32(data))])
     writer.close()
-    return snapshots.newest_content(directory)[1]
+    return reader.newest_content(directory)[1]
 
 
 def test_a_process_that_is_submitted_again_begins_from_nothing(cluster):
@@ -280,7 +282,7 @@ def copies(cluster: Cluster, name: str) -> dict[str, int]:
     """Return the last cycle of the replica on each host that has one."""
     found = {}
     for on in cluster.slaves:
-        head = snapshots.peek(snapshot_directory(cluster, on, name) / snapshots.COPY)
+        head = reader.peek(snapshot_directory(cluster, on, name) / reader.COPY)
         if head is not None:
             found[on] = head.sequence
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,8 @@ COMMANDS = {
     "format": ["ruff", "format", "--check", "--quiet"],
     "types": ["mypy", "--no-error-summary"],
 }
+#: Attributes of syntax nodes that hold a name: of a variable, attribute, argument or function.
+NAMING = ("id", "attr", "arg", "name")
 
 
 @pytest.mark.parametrize("what", COMMANDS)
@@ -41,6 +44,35 @@ def test_repository_keeps(what: str) -> None:
 
     if run.returncode != 0:
         pytest.fail(f"{' '.join(COMMANDS[what])}\n{run.stdout}{run.stderr}", pytrace=False)
+
+
+def test_a_package_that_lists_its_modules_lists_all_of_them():
+    for init in (ROOT / "rosrm").rglob("__init__.py"):
+        docstring = ast.get_docstring(ast.parse(init.read_text())) or ""
+        listed = set(re.findall(r"\b[a-z]\w*(?:\.py|/)", docstring))
+        if any(name.endswith(".py") for name in listed):
+            inner = {path.parent for path in init.parent.glob("*/__init__.py")}
+            files = {path.name for path in init.parent.glob("[a-z]*.py")}
+            assert listed == files | {f"{folder.name}/" for folder in inner}, init
+
+
+def described(node: ast.AST) -> set[str]:
+    """Return the names that the docstring of a class or function describes."""
+    sections = re.findall(
+        r"^(?:Args|Attributes):\n((?: .*\n)*)", f"{ast.get_docstring(node)}\n", re.MULTILINE
+    )
+    found = re.findall(r"^    (\w+(?:, \w+)*): ", "".join(sections), re.MULTILINE)
+    return {name for names in found for name in names.split(", ")}
+
+
+def test_docstrings_describe_only_what_exists():
+    for part in ("rosrm", "plugins", "tools"):
+        for path in (ROOT / part).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ClassDef | ast.FunctionDef):
+                    inner = [vars(one) for one in ast.walk(node)]
+                    names = {one[key] for one in inner for key in NAMING if key in one}
+                    assert described(node) <= names, f"{path}: {node.name}"
 
 
 def test_no_name_of_a_shipped_plugin_decides_anything():

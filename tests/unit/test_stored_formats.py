@@ -173,19 +173,21 @@ def test_the_manifest_of_a_checkpoint_image(tmp_path: Path) -> None:
 def test_the_files_of_a_control_directory(tmp_path: Path) -> None:
     """Master and node may have different versions; a reader accepts fields that it lacks."""
     request, status = tmp_path / "request", tmp_path / "status"
-    control.write_request(tmp_path, control.Request("r1", control.Want.LEAVE))
+    control.write_message(tmp_path, control.Request("r1", control.Want.LEAVE))
     assert json.loads(request.read_text()) == {"format": 1, "id": "r1", "want": "leave"}
     told = control.Status(control.State.LEFT, "r1", "why", {"leave": 0.5}, ("/scan",))
     plain = {
         "format": 1, "state": "left", "request": "r1", "fault": "why", "seconds": {"leave": 0.5},
         "missing": ["/scan"],
     }  # fmt: skip
-    control.write_status(tmp_path, told)
+    control.write_message(tmp_path, told)
     assert json.loads(status.read_text()) == plain
     status.write_text(json.dumps({**plain, "newer": 1}))
-    assert control.read_status(tmp_path) == told
+    assert control.read_message(tmp_path, control.Status) == told
     request.write_text('{"format": 1, "id": "r2", "want": "join", "newer": 1}')
-    assert control.read_request(tmp_path) == control.Request("r2", control.Want.JOIN)
+    assert control.read_message(tmp_path, control.Request) == control.Request(
+        "r2", control.Want.JOIN
+    )
 
 
 def test_the_state_file_of_a_lab() -> None:

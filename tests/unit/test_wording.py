@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.wording import counted, standing_for
+from rosrm.wording import amount, counted, duration, size, standing_for
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "no hosts"), (1, "1 host"), (2, "2 hosts")])
@@ -25,3 +25,32 @@ def test_a_number_with_its_noun(number: int, text: str) -> None:
 def test_a_state_with_its_time(state: str, text: str) -> None:
     """A terminal state has an end, any other state a duration."""
     assert standing_for(state, "2 min") == text
+
+
+@pytest.mark.parametrize(
+    ("value", "binary", "text"),
+    [(0, False, "0 B"), (999, False, "999 B"), (1000, False, "1.0 kB"), (64.06e6, False, "64.1 MB"),
+     (2**31, False, "2.1 GB"), (999_999, False, "1.0 MB"), (123e9, False, "123 GB"),
+     (1023, True, "1023 B"), (1024, True, "1.0 KiB"), (2**30, True, "1.0 GiB"),
+     (850 * 2**20, True, "850 MiB")],
+)  # fmt: skip
+def test_sizes_have_three_digits(value, binary, text):
+    assert size(value, binary=binary) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.04, "0.0 s"), (9.94, "9.9 s"), (65, "65 s"), (3600, "60 min"), (7500, "2 h 5 min"),
+     (200_000, "2 d"), (float("inf"), "?"), (-1, "0.0 s")],
+)  # fmt: skip
+def test_spans_have_at_most_two_units(value, text):
+    assert duration(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(0.5, "core", "0.5 cores"), (5e6, "B/s", "5.0 MB/s"), (3, "", "3"), (2, "lux", "2 lux"),
+     (float("nan"), "B", "?")],
+)  # fmt: skip
+def test_amounts_carry_the_unit_of_their_resource(value, unit, text):
+    assert amount(value, unit) == text

@@ -16,8 +16,8 @@ from rosrm import InstanceId, Launch, LauncherContext, ProcessSpec, options_of
 from rosrm.errors import CriuError, LaunchError, PortableError
 from rosrm.ros.names import token
 from rosrm.supervisor.spawn import SpawnError, find_executable
-from rosrm_criu.control.client import control_root, directory_of, status_of
-from rosrm_criu.control.messages import VARIABLE, State
+from rosrm_criu.control.client import control_root, directory_of
+from rosrm_criu.control.messages import VARIABLE, State, Status, read_message
 from rosrm_criu.engine import paths, process_tree, restart_from_image, restore_result, slots
 from rosrm_criu.engine.binary import find
 from rosrm_criu.options import NAME, CriuOptions, OwnCriuOptions
@@ -73,8 +73,8 @@ class CriuLauncher:
             raise LaunchError(f"{instance} cannot be restored: {error}") from None
 
     def discard_images(self, instance: InstanceId) -> None:
-        """Have the next start be from no periodic image."""
-        slots.begin_anew(paths.periodic(self._state, instance.number))
+        """Make the next start ignore all periodic images."""
+        slots.start_without_image(paths.periodic(self._state, instance.number))
 
     def leads(self, leader: int) -> bool | None:
         """Return True if the leader is a shim; None: not yet, but it may become one."""
@@ -92,7 +92,7 @@ class CriuLauncher:
         """Return True while the node is out of the graph for a move or a checkpoint."""
         try:
             control = directory_of(process_tree.root_of(leader))
-            status = None if control is None else status_of(control)
+            status = None if control is None else read_message(control, Status)
         except (OSError, PortableError):  # it has ended, or cannot be read: treat it like any other
             return False
         return status is not None and status.state in (State.LEAVING, State.LEFT, State.JOINING)
@@ -100,7 +100,7 @@ class CriuLauncher:
 
 def _is_portable(spec: ProcessSpec) -> bool:
     """Return True if its node is asked to leave the ROS graph before its memory is dumped."""
-    return spec.ros_node and spec.migration.strategy == NAME
+    return bool(spec.ros) and spec.migration.strategy == NAME
 
 
 def _is_periodic(spec: ProcessSpec) -> bool:

@@ -66,7 +66,7 @@ def execute(
         undo: the step that undoes this one.
         arguments: passed in addition to the common ones.
     """
-    told = {
+    common = {
         "process": move.spec.name,
         "source": move.source.number,
         "destination": move.destination.number,
@@ -74,7 +74,7 @@ def execute(
         "timeout": timeout,
         **arguments,
     }
-    return Execute(name, host, told, timeout + LONGER, undo)
+    return Execute(name, host, common, timeout + LONGER, undo)
 
 
 def suspend(move: Move, seconds: float) -> SetRestart:

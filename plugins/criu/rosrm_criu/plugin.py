@@ -3,14 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, Final
 
 from rosrm import Launcher, LauncherContext, LauncherOffer, MigrationOffer, hookimpl
 from rosrm_criu import plans
 from rosrm_criu.control.messages import VARIABLE
 from rosrm_criu.options import NAME, CriuOptions, OwnCriuOptions, capabilities
 from rosrm_criu.strategy import Criu
+
+Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+
+#: Function of each step, below `rosrm_criu.executors`.
+EXECUTORS: Final = {
+    plans.ABILITY: "move.report_capability",
+    plans.INTRODUCE: "move.introduce",
+    plans.CHECKPOINT: "move.checkpoint",
+    plans.GO_ON: "move.go_on",
+    plans.FETCH: "move.fetch_image",
+    plans.AWAIT_RESTORED: "move.await_restored",
+    plans.JOIN: "move.join",
+    plans.END: "move.end",
+    plans.KEEP: "checkpoint.keep",
+    plans.RUN_ON: "checkpoint.run_on",
+    plans.KILL: "checkpoint.kill",
+    plans.TAKE: "checkpoint.take",
+    plans.PUT_BACK: "checkpoint.put_back",
+    plans.AWAIT_KEPT: "checkpoint.await_kept",
+    plans.DROP: "checkpoint.drop",
+    plans.DUMP: "periodic.dump",
+    plans.SWEEP: "periodic.sweep",
+}
 
 
 @hookimpl
@@ -24,25 +48,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             own_options=OwnCriuOptions,
             capabilities=capabilities,
             summary="the whole memory of a portable node is dumped, and restored elsewhere",
-            executors={
-                plans.ABILITY: _when_asked("move", "say_ability"),
-                plans.INTRODUCE: _when_asked("move", "introduce"),
-                plans.CHECKPOINT: _when_asked("move", "checkpoint"),
-                plans.GO_ON: _when_asked("move", "go_on"),
-                plans.FETCH: _when_asked("move", "fetch_image"),
-                plans.AWAIT_RESTORED: _when_asked("move", "await_restored"),
-                plans.JOIN: _when_asked("move", "join"),
-                plans.END: _when_asked("move", "end"),
-                plans.KEEP: _when_asked("checkpoint", "keep"),
-                plans.RUN_ON: _when_asked("checkpoint", "run_on"),
-                plans.KILL: _when_asked("checkpoint", "kill"),
-                plans.TAKE: _when_asked("checkpoint", "take"),
-                plans.PUT_BACK: _when_asked("checkpoint", "put_back"),
-                plans.AWAIT_KEPT: _when_asked("checkpoint", "await_kept"),
-                plans.DROP: _when_asked("checkpoint", "drop"),
-                plans.DUMP: _when_asked("periodic", "dump"),
-                plans.SWEEP: _when_asked("periodic", "sweep"),
-            },
+            executors={step: partial(_execute, step) for step in EXECUTORS},
         )
     ]
 
@@ -67,12 +73,12 @@ def _launcher(context: LauncherContext) -> Launcher:
     return launcher
 
 
-def _when_asked(module: str, step: str) -> Callable[[Mapping[str, Any]], Mapping[str, Any]]:
-    """Return an executor that loads its module at the first call, as most slaves never need it."""
+def executor(step: str) -> Executor:
+    """Return the function of a step; it loads the module, which most slaves never need."""
+    module, name = EXECUTORS[step].split(".")
+    function: Executor = getattr(import_module(f"rosrm_criu.executors.{module}"), name)
+    return function
 
-    def execute(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        executors = import_module(f"rosrm_criu.executors.{module}")
-        answer: Mapping[str, Any] = getattr(executors, step)(arguments)
-        return answer
 
-    return execute
+def _execute(step: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    return executor(step)(arguments)

@@ -43,7 +43,7 @@ class Criu:
 
     def spec_fault(self, spec: ProcessSpec) -> str:
         """Return the reason why a process cannot migrate this way; "": it can."""
-        if not spec.ros_node:
+        if not spec.ros:
             return (
                 "it moves only ROS nodes that can leave and rejoin (rosrm_criu.node.PortableNode), "
                 "and this process is no node: set `ros: true`"
@@ -70,7 +70,7 @@ class Criu:
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
         """Return the seconds between periodic checkpoints from the process's options; 0: none."""
-        return self._own(spec).checkpoint_every if spec.ros_node else 0.0
+        return self._own(spec).checkpoint_every if spec.ros else 0.0
 
     def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
         """Return a step in which the node leaves, is dumped, and rejoins."""

@@ -41,7 +41,7 @@ class Relaunch:
 
 
 def _start_first(move: Move, options: RelaunchOptions) -> Plan:
-    settle = options.settle if move.spec.ros or move.spec.package is not None else 0.0
+    settle = options.settle if move.spec.ros else 0.0
     ready, stop = move.spec.readiness.timeout + settle, move.spec.stop.timeout
     return Plan(
         (

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -17,7 +17,6 @@ from rosrm.wording import counted
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
-    from rosrm.model.values import ProcessSpec
 
 Wait = Annotated[
     bool, typer.Option("--wait", help="Wait for the result; exit 1 with the reason if it failed.")
@@ -56,7 +55,7 @@ def submit(
     If one process cannot be queued, none is.
     """
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
-    from rosrm.config import load_work
+    from rosrm.config.work import load_work
 
     limit = longest(timeout)
     specs = [spec for file in files for spec in load_work(file)]
@@ -92,7 +91,7 @@ def cancel(
     if everything == bool(chosen):
         raise ConfigError("cancel: give names of processes or work files, or --all")
     named = [word for word in chosen if not _is_file(word)]
-    filed = [spec.name for word in chosen if _is_file(word) for spec in _load(word)]
+    filed = [name for word in chosen if _is_file(word) for name in _names_in(word)]
     with connection.master(ctx, domain) as client:
         if everything or filed:
             live = [row.name for row in client.list_processes() if row.state not in ENDED]
@@ -115,10 +114,10 @@ def _is_file(word: str) -> bool:
     return word == "-" or "/" in word or word.endswith(_FILE_ENDINGS)
 
 
-def _load(file: str) -> Sequence[ProcessSpec]:
-    from rosrm.config import load_work
+def _names_in(file: str) -> list[str]:
+    from rosrm.config.work import load_work
 
-    return load_work(file)
+    return [spec.name for spec in load_work(file)]
 
 
 def restart(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli.groups import DISTRIBUTIONS
+from rosrm.errors import ConfigError, PluginError, describe_plugin_fault
 from rosrm.wording import counted, get_close_matches, listed
 
 if TYPE_CHECKING:
@@ -57,7 +58,6 @@ def check(
 
     The files are checked against all rules and against the plugins installed on this machine.
     """
-    from rosrm.errors import ConfigError
     from rosrm.extensions.registry import Registry
 
     registry = Registry.discover()
@@ -73,8 +73,6 @@ def check(
 
 def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
     """Create the plugins that a master would create; raises `ConfigError` with all failures."""
-    from rosrm.errors import ConfigError, PluginError
-
     wrong = []
     for section, make in (
         ("scoring", lambda: registry.scoring(cluster.scoring.policy, cluster.scoring.options)),
@@ -97,7 +95,6 @@ def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
 
     A probe that reports itself absent is no failure, because the file may be for another host.
     """
-    from rosrm.errors import ConfigError
     from rosrm.extensions.contracts import ProbeContext
     from rosrm.extensions.registry import FailedProbe, close_quietly
     from rosrm.slave.sessions import SessionTable
@@ -117,9 +114,11 @@ def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
 
 def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     """Return a summary of a file; raises `ConfigError`."""
-    from rosrm.config import load_cluster, load_host, load_work
+    from rosrm.config.cluster import load_cluster
     from rosrm.config.documents import read
+    from rosrm.config.host import load_host
     from rosrm.config.kinds import kind_of
+    from rosrm.config.work import load_work
     from rosrm.core.master.graph_names import shared_nodes
 
     root = read(file)
@@ -160,7 +159,6 @@ def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
     """
     from pkgutil import resolve_name
 
-    from rosrm.errors import ConfigError, PluginError, describe_plugin_fault
     from rosrm.extensions.installed import CHECKS, installed_plugins
 
     for address in installed_plugins(CHECKS):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.options import AsJson, Domain, Names
+from rosrm.cli.options import AsJson, Domain, Names, seconds_of
 from rosrm.client.connecting import check_name
 
 if TYPE_CHECKING:
@@ -158,7 +158,8 @@ def top(
     """
     from rosrm.cli.output import top_screen
 
-    seconds, order = top_screen.period_of(period), top_screen.sort_of(sort)
+    seconds = seconds_of("--period", period, low=top_screen.LEAST_PERIOD, above=False)
+    order = top_screen.sort_of(sort)
     with connection.master(ctx, domain) as client:
         top_screen.show(
             lambda: client.list(hosts=True, processes=True, events=True, newest=4),

@@ -119,11 +119,11 @@ def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Dom
     from rosrm.cli.output import explain, json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        story = client.explain(name)
+        explanation = client.explain(name)
     if as_json:
-        json_forms.show(dict(story))
+        json_forms.show(dict(explanation))
     else:
-        tables.show(explain.render(story))
+        tables.show(explain.render(explanation))
 
 
 COMMANDS: Final = (status, ps, hosts, plugins, explain)

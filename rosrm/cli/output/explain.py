@@ -8,8 +8,8 @@ from typing import Any, Final
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from rosrm.cli.output import formats, tables
-from rosrm.wording import counted, listed
+from rosrm.cli.output import tables
+from rosrm.wording import amount, counted, duration, listed, size, words
 
 #: Wording of each decision of the master about a process.
 _DECIDED: Final = {
@@ -23,79 +23,77 @@ _STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "ful
 _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 
 
-def render(story: Mapping[str, Any]) -> RenderableType:
+def render(explanation: Mapping[str, Any]) -> RenderableType:
     """Return the master's explanation of one process for a rich console."""
-    return Group(*_parts(story))
+    return Group(*_parts(explanation))
 
 
-def _parts(story: Mapping[str, Any]) -> Iterator[RenderableType]:
-    yield _headline(story)
-    if story.get("kept"):
-        yield _kept(story["kept"])
-    if story.get("checkpoint"):
-        yield _checkpoint(story["checkpoint"])
-    decision = story.get("decision")
+def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
+    yield _headline(explanation)
+    if explanation.get("kept"):
+        yield _kept(explanation["kept"])
+    if explanation.get("checkpoint"):
+        yield _checkpoint(explanation["checkpoint"])
+    decision = explanation.get("decision")
     if decision:
         yield Text()
-        yield _sentence(story["process"], decision)
+        yield _sentence(explanation["process"], decision)
         yield _needs(decision.get("need") or {})
         if decision.get("hosts"):
             yield _hosts(decision["hosts"])
         for reason, count in (decision.get("omitted") or {}).items():
             if count:
                 yield Text(f"and {counted(count, 'more host')} {reason}", "dim")
-    history = story.get("history") or ()
+    history = explanation.get("history") or ()
     yield Text()
     if not history or history[0]["kind"] != "submitted":
-        name = story["process"]
+        name = explanation["process"]
         yield Text(f"Older events are left out: `rosrm events --process {name}`", "dim")
     for entry in history:
-        ago = f"{formats.duration(entry['elapsed'])} ago"
+        ago = f"{duration(entry['elapsed'])} ago"
         yield tables.entry(f"{ago:>14}", entry["kind"], entry["message"])
 
 
-def _headline(story: Mapping[str, Any]) -> Text:
-    text = tables.sentence(story["process"], story["state"])
-    if story.get("host"):
-        text.append(f" on {story['host']}")
-    if story.get("reason"):
-        text.append(f": {story['reason']}")
+def _headline(explanation: Mapping[str, Any]) -> Text:
+    text = tables.sentence(explanation["process"], explanation["state"])
+    if explanation.get("host"):
+        text.append(f" on {explanation['host']}")
+    if explanation.get("reason"):
+        text.append(f": {explanation['reason']}")
     return text
 
 
 def _kept(replicas: list[Mapping[str, Any]]) -> Text:
     """Return the hosts with a replica of the snapshot, and the cycle of each."""
     places = [
-        f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
-        f"{formats.duration(one['elapsed'])} ago)"
+        f"{one['host']} (cycle {one['sequence']}, {size(one['size'])}, "
+        f"{duration(one['elapsed'])} ago)"
         for one in replicas
     ]
     return Text(f"Snapshots of its state are on {listed(places)}.")
 
 
-def _checkpoint(told: Mapping[str, Any]) -> Text:
+def _checkpoint(checkpoint: Mapping[str, Any]) -> Text:
     """Return the newest periodic checkpoint, and the failure of the next one, if any."""
-    if told["elapsed"] is None:
+    if checkpoint["elapsed"] is None:
         text = "No periodic checkpoint of its memory exists yet"
     else:
         text = (
-            f"The last periodic checkpoint is {formats.duration(told['elapsed'])} old "
-            f"({formats.size(told['size'])}; the process was paused for {told['pause']:.1f} s)"
+            f"The last periodic checkpoint is {duration(checkpoint['elapsed'])} old "
+            f"({size(checkpoint['size'])}; the process was paused for {checkpoint['pause']:.1f} s)"
         )
-    return Text(f"{text}: {told['trouble']}" if told["trouble"] else f"{text}.")
+    return Text(f"{text}: {checkpoint['trouble']}" if checkpoint["trouble"] else f"{text}.")
 
 
 def _sentence(name: str, decision: Mapping[str, Any]) -> Text:
-    ago = f" {formats.duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
-    said = _DECIDED.get(decision["kind"], "{process}: " + formats.words(decision["kind"]))
-    what = said.format(process=name, host=decision.get("chosen"), ago=ago)
+    ago = f" {duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
+    form = _DECIDED.get(decision["kind"], "{process}: " + words(decision["kind"]))
+    what = form.format(process=name, host=decision.get("chosen"), ago=ago)
     return Text(f"{what}. Scoring policy: {decision['policy'] or 'none'}; the lowest score wins.")
 
 
 def _needs(need: Mapping[str, float]) -> Text:
-    amounts = [
-        f"{name} {formats.amount(value, _UNITS.get(name, ''))}" for name, value in need.items()
-    ]
+    amounts = [f"{name} {amount(value, _UNITS.get(name, ''))}" for name, value in need.items()]
     return Text(f"Needs that were counted: {', '.join(amounts) or 'none'}.")
 
 

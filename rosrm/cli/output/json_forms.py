@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 import typer
@@ -13,22 +14,15 @@ from rosrm.model.codec import to_plain
 from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
 
 
-def host_form(row: HostRow) -> dict[str, Any]:
-    """Return a host as one object: its description and its state."""
-    plain = to_plain(row)
-    made: dict[str, Any] = _finite({**plain.pop("description"), **plain})
-    return made
+def form(row: HostRow | ProcessRow | EventRow | PluginRow) -> dict[str, Any]:
+    """Return a row as an object; that of a host has the members of its description."""
+    plain: dict[str, Any] = to_plain(row)
+    return {**plain.pop("description", {}), **plain}
 
 
-def form(row: ProcessRow | EventRow | PluginRow) -> dict[str, Any]:
-    """Return any other row as an object."""
-    made: dict[str, Any] = _finite(to_plain(row))
-    return made
-
-
-def forms(rows: Sequence[Any]) -> list[dict[str, Any]]:
+def forms(rows: Iterable[Any]) -> list[dict[str, Any]]:
     """Return the rows of a listing as objects."""
-    return [host_form(row) if isinstance(row, HostRow) else form(row) for row in rows]
+    return [form(row) for row in rows]
 
 
 def status_form(snapshot: Listing) -> dict[str, Any]:
@@ -38,9 +32,9 @@ def status_form(snapshot: Listing) -> dict[str, Any]:
         "uptime": snapshot.uptime,
         "last_sequence": snapshot.last_sequence,
         "trouble": snapshot.trouble,
-        "hosts": _counts(row.state for row in snapshot.hosts),
-        "processes": _counts(row.state for row in snapshot.processes),
-        "failing_plugins": [form(row) for row in snapshot.plugins],
+        "hosts": Counter(row.state for row in snapshot.hosts),
+        "processes": Counter(row.state for row in snapshot.processes),
+        "failing_plugins": forms(snapshot.plugins),
     }
 
 
@@ -52,13 +46,6 @@ def show(value: Any) -> None:
 def show_line(value: Any) -> None:
     """Print one JSON value on a line of its own."""
     typer.echo(json.dumps(_finite(value)))
-
-
-def _counts(states: Iterable[str]) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for state in states:
-        counts[state] = counts.get(state, 0) + 1
-    return counts
 
 
 def _finite(value: Any) -> Any:

@@ -11,8 +11,8 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from rosrm.cli.output import formats
 from rosrm.client.logs import LogChunk
+from rosrm.wording import size
 
 Marks = Sequence[tuple[float, int, int]]
 #: Output, and the unix time by which it was written; 0.0: not known.
@@ -61,7 +61,7 @@ class LogStream:
         begun = marks[0][0] if marks else 0.0
         starts = [(at, when) for when, at, pid in marks if pid and 0 <= at - offset < len(content)]
         if chunk.dropped:
-            self._say(f"{formats.size(chunk.dropped)} before this were dropped", begun)
+            self._say(f"{size(chunk.dropped)} before this were dropped", begun)
         if self._is_new and content and (not starts or starts[0][0] > offset):
             self._say(f"on {self._host}", begun)
         done = offset

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from rich.console import Group, RenderableType
 from rich.styled import Styled
 from rich.text import Text
 
-from rosrm.cli.output import formats, tables
+from rosrm.cli.output import tables
 from rosrm.model.rows import HostRow, Listing, PluginRow, ProcessRow
+from rosrm.wording import duration, words
 
 #: States of a process that need an operator's attention.
 _TROUBLE = ("stuck", "unreachable", "unknown", "failed", "set_aside", "backoff")
@@ -23,14 +24,14 @@ def render(snapshot: Listing) -> RenderableType:
 
 
 def _lines(snapshot: Listing) -> Iterator[RenderableType]:
-    yield Text(f"master     {snapshot.master}, up {formats.duration(snapshot.uptime)}")
+    yield Text(f"master     {snapshot.master}, up {duration(snapshot.uptime)}")
     yield Text(f"hosts      {_counted(row.state for row in snapshot.hosts)}{_set(snapshot.hosts)}")
     yield Text(f"processes  {_counted(row.state for row in snapshot.processes)}")
     if snapshot.hosts:
         yield Text()
         yield tables.hosts(snapshot.hosts)
-    yield from _troubles(snapshot.processes)
-    yield from _failing(snapshot.plugins)
+    yield from _first(list(_troubles(snapshot.processes)), "rosrm ps")
+    yield from _first(list(_failing(snapshot.plugins)), "rosrm plugins")
     if snapshot.events:
         yield Text()
         yield from (Styled(tables.event(event), "dim") for event in snapshot.events)
@@ -38,7 +39,7 @@ def _lines(snapshot: Listing) -> Iterator[RenderableType]:
 
 def _counted(states: Iterable[str]) -> str:
     counts = Counter(states)
-    return ", ".join(f"{n} {formats.words(word)}" for word, n in counts.most_common()) or "none"
+    return ", ".join(f"{n} {words(word)}" for word, n in counts.most_common()) or "none"
 
 
 def _set(hosts: Iterable[HostRow]) -> str:
@@ -54,25 +55,24 @@ def _set(hosts: Iterable[HostRow]) -> str:
     return f" ({', '.join(parts)})" if parts else ""
 
 
-def _troubles(processes: Iterable[ProcessRow]) -> Iterator[RenderableType]:
+def _troubles(processes: Iterable[ProcessRow]) -> Iterator[Text]:
     rows = [row for row in processes if row.state in _TROUBLE]
-    rows.sort(key=lambda row: _TROUBLE.index(row.state))
-    if rows:
-        yield Text()
-    for row in rows[:_MOST_NAMED]:
+    for row in sorted(rows, key=lambda row: _TROUBLE.index(row.state)):
         text = tables.sentence(row.name, row.state)
         yield text.append(f": {row.reason}" if row.reason else "")
-    if len(rows) > _MOST_NAMED:
-        yield Text(f"and {len(rows) - _MOST_NAMED} more; see rosrm ps")
 
 
-def _failing(plugins: Iterable[PluginRow]) -> Iterator[RenderableType]:
-    rows = list(plugins)
-    if rows:
-        yield Text()
-    for row in rows[:_MOST_NAMED]:
+def _failing(plugins: Iterable[PluginRow]) -> Iterator[Text]:
+    for row in plugins:
         place = f" on {row.host}" if row.host else ""
         text = Text(f"plugin {row.kind} {row.name}{place} is ")
         yield text.append_text(tables.state(row.state)).append(f": {row.reason}")
-    if len(rows) > _MOST_NAMED:
-        yield Text(f"and {len(rows) - _MOST_NAMED} more; see rosrm plugins")
+
+
+def _first(lines: Sequence[Text], command: str) -> Iterator[Text]:
+    """Yield a paragraph with the first lines, and the command that shows the others."""
+    if lines:
+        yield Text()
+    yield from lines[:_MOST_NAMED]
+    if len(lines) > _MOST_NAMED:
+        yield Text(f"and {len(lines) - _MOST_NAMED} more; see {command}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -11,9 +12,8 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rosrm.cli.output import formats
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
-from rosrm.wording import counted, standing
+from rosrm.wording import counted, duration, percent, size, standing, words
 
 #: Width of tables in a file or pipe, large enough that no line is cut or wrapped.
 _PIPE_WIDTH: Final = 100_000
@@ -75,7 +75,7 @@ def show(renderable: RenderableType) -> None:
 
 def state(word: str) -> Text:
     """Return a state in its colour."""
-    return Text(formats.words(word), style=STYLES.get(word, ""))
+    return Text(words(word), style=STYLES.get(word, ""))
 
 
 def sentence(name: str, word: str) -> Text:
@@ -94,9 +94,9 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
             Text(row.name),
             state(row.state),
             Text(row.host),
-            formats.duration(row.since),
+            duration(row.since),
             age(row, f"{row.cpu:.2f}") if runs else "",
-            age(row, formats.size(row.memory)) if runs else "",
+            age(row, size(row.memory)) if runs else "",
             Text(why(row)),
         )
     return made
@@ -145,7 +145,7 @@ def host_state(row: HostRow) -> Text:
 
 def usage(resource: ResourceRow) -> Text:
     """Return usage and limit in percent, e.g. `34/80`."""
-    text = f"{formats.percent(resource.usage)}/{formats.percent(resource.limit)}"
+    text = f"{percent(resource.usage)}/{percent(resource.limit)}"
     if resource.stale:
         return Text(f"?{text}", "dim")
     return Text(text, "red" if resource.usage > resource.limit else "")
@@ -161,18 +161,23 @@ def plugins(rows: Iterable[PluginRow]) -> Table:
     return made
 
 
+def clock(wall_time: float) -> str:
+    """Return a time of day in the local time zone."""
+    return time.strftime("%H:%M:%S", time.localtime(wall_time))
+
+
 def event_line(row: EventRow) -> str:
     """Return one line of the event record."""
-    return f"{formats.clock(row.wall_time)}  {formats.words(row.kind):<18} {row.message}"
+    return f"{clock(row.wall_time)}  {words(row.kind):<18} {row.message}"
 
 
 def event(row: EventRow) -> Table:
     """Return one event for a terminal; a long message wraps with a hanging indent."""
-    return entry(formats.clock(row.wall_time), row.kind, row.message)
+    return entry(clock(row.wall_time), row.kind, row.message)
 
 
 def entry(when: str, kind: str, message: str) -> Table:
     """Return time, kind and message of an event; a long message wraps with a hanging indent."""
     made = Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
-    made.add_row(Text(f"{when} "), Text(f"{formats.words(kind):<18}"), Text(message))
+    made.add_row(Text(f"{when} "), Text(f"{words(kind):<18}"), Text(message))
     return made

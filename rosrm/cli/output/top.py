@@ -18,8 +18,9 @@ from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.text import Text
 
-from rosrm.cli.output import formats, tables
+from rosrm.cli.output import tables
 from rosrm.model.rows import HostRow, Listing, ProcessRow, ResourceRow
+from rosrm.wording import duration, percent, size, words
 
 #: Most processes in a view, if the height of the terminal is unknown.
 ROWS: Final = 18
@@ -65,14 +66,23 @@ _RIGHT: Final = ("SINCE", "CPU", "MEMORY")
 
 @dataclass(frozen=True)
 class TopView:
-    """View of a listing, for a rich console of any width."""
+    """View of a listing, for a rich console of any width.
+
+    Attributes:
+        snapshot: listing with hosts and processes; its events are shown, if any.
+        rows: most processes shown.
+        events: most events shown.
+        note: text beside the title.
+        sort: order of the processes, a key of `SORTS`.
+        foot: the last line.
+    """
 
     snapshot: Listing
-    rows: int
-    events: int
-    note: str
-    sort: str
-    foot: str
+    rows: int = ROWS
+    events: int = 4
+    note: str = ""
+    sort: str = "state"
+    foot: str = ""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the parts from top to bottom."""
@@ -91,34 +101,14 @@ class TopView:
             yield Text(self.foot, "dim italic", no_wrap=True, overflow="ellipsis")
 
 
-def render(
-    snapshot: Listing, *, rows: int = ROWS, events: int = 4, note: str = "", sort: str = "state",
-    foot: str = "",
-) -> RenderableType:  # fmt: skip
-    """Return the view of a listing.
-
-    Args:
-        snapshot: listing with hosts and processes; its events are shown, if any.
-        rows: most processes shown.
-        events: most events shown.
-        note: text beside the title.
-        sort: order of the processes, a key of `SORTS`.
-        foot: the last line.
-    """
-    return TopView(snapshot, rows, events, note, sort, foot)
-
-
 def _title(snapshot: Listing, note: str, width: int) -> Iterator[Text]:
     """Yield the title; if it wraps, a number and its state stay on one line."""
     counts = Counter(row.state for row in snapshot.processes)
     states = sorted(counts, key=_rank)
-    parts = [
-        Text(f"{counts[word]} {formats.words(word)}", tables.STYLES.get(word, ""))
-        for word in states
-    ]
+    parts = [Text(f"{counts[word]} {words(word)}", tables.STYLES.get(word, "")) for word in states]
     if note:
         parts.append(Text(note, "bold yellow"))
-    line = Text(f"{snapshot.master}  {formats.duration(snapshot.uptime)}", "bold")
+    line = Text(f"{snapshot.master}  {duration(snapshot.uptime)}", "bold")
     for part in parts:
         if line.cell_len + 3 + part.cell_len > width:
             yield line
@@ -178,7 +168,7 @@ def bar(resource: ResourceRow, width: int = _BAR) -> Text:
             text.append("▒", style)
         else:
             text.append("░", "dim")
-    return text.append(f" {formats.percent(resource.usage):>3}%", style)
+    return text.append(f" {percent(resource.usage):>3}%", style)
 
 
 def _cells(fraction: float, width: int) -> int:
@@ -227,9 +217,9 @@ def _processes(
         "NAME": [Text(row.name) for row in shown],
         "STATE": [tables.state(row.state) for row in shown],
         "HOST": [Text(row.host) for row in shown],
-        "SINCE": [Text(formats.duration(row.since)) for row in shown],
+        "SINCE": [Text(duration(row.since)) for row in shown],
         "CPU": [tables.age(row, f"{row.cpu:.2f}" if row.pid else "") for row in shown],
-        "MEMORY": [tables.age(row, formats.size(row.memory) if row.pid else "") for row in shown],
+        "MEMORY": [tables.age(row, size(row.memory) if row.pid else "") for row in shown],
     }
     longest = max(cell_len(_why(row)) for row in shown)
     for column in _LEAVE:
@@ -261,8 +251,8 @@ def _reasons(rows: Sequence[ProcessRow], room: int) -> list[str]:
 def _without_beginning(row: ProcessRow, reasons: set[str], room: int) -> str:
     """Return a reason from the word on at which it differs visibly from the other reasons."""
     shared = max((_alike(row.reason, other) for other in reasons - {row.reason}), default=0)
-    said = _BEGINNINGS.get(row.state, "")
-    begin = len(said) if said and row.reason.startswith(said) else 0
+    beginning = _BEGINNINGS.get(row.state, "")
+    begin = len(beginning) if beginning and row.reason.startswith(beginning) else 0
     if shared > max(begin, room // 2):
         enough = max(0, len(row.reason) - room)  # from there on the rest fits
         begin = max(begin, row.reason.find(" ", min(shared - 1, enough)) + 1)

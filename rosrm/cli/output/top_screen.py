@@ -18,7 +18,6 @@ from rich.live import Live
 
 from rosrm.cli.output import tables, top
 from rosrm.errors import ConfigError, NoMaster
-from rosrm.extensions.units import Quantity
 from rosrm.model.rows import Listing
 
 #: Least seconds between two views.
@@ -30,14 +29,6 @@ _HINT: Final = "q quits; sort: s state, c CPU, m memory, n name"
 #: Lines that are not of hosts and processes: title (two), heads, events, hint and gaps.
 _OTHER_LINES: Final = 13
 _LEAST_ROWS: Final = 5
-
-
-def period_of(text: str) -> float:
-    """Return the option --period in seconds; raises `ConfigError`."""
-    try:
-        return Quantity("duration", low=LEAST_PERIOD).parse(text)
-    except ValueError as error:
-        raise ConfigError(f"--period: {error}") from None
 
 
 def sort_of(text: str) -> str:
@@ -63,7 +54,7 @@ def show(look: Callable[[], Listing], period: float, count: int, sort: str) -> N
     snapshot, note = look(), ""
     for shown in itertools.count(1):
         rows = top.ROWS if console.is_terminal else len(snapshot.processes)
-        console.print(top.render(snapshot, rows=rows, note=note, sort=sort))
+        console.print(top.TopView(snapshot, rows=rows, note=note, sort=sort))
         if shown == count:
             return
         time.sleep(period)
@@ -78,7 +69,7 @@ def _keep_up_to_date(
     with _keyboard() as key, Live(console=console, auto_refresh=False) as screen:
         for shown in itertools.count(1):
             rows = max(_LEAST_ROWS, console.height - _OTHER_LINES - len(snapshot.hosts))
-            picture = top.render(snapshot, rows=rows, note=note, sort=sort, foot=_HINT)
+            picture = top.TopView(snapshot, rows=rows, note=note, sort=sort, foot=_HINT)
             screen.update(picture, refresh=True)
             if shown == count:
                 return

@@ -21,14 +21,11 @@ class StepFailed:
 
     Attributes:
         reason: a sentence.
+        timed_out: True if the time-out of the step has passed.
     """
 
     reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class StepTimedOut(StepFailed):
-    """The current step of a plan was not done in time."""
+    timed_out: bool = False
 
 
 StepOutcome = StepProgress | StepFailed
@@ -41,7 +38,7 @@ def done_if(condition: bool) -> StepProgress:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A plan, a destination or a setting that was asked for is not available.
+    """A requested plan, destination or setting is not available.
 
     Attributes:
         reason: a sentence.

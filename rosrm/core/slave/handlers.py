@@ -7,38 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final
 
-from rosrm.core.slave import fencing
-from rosrm.core.slave.commands import (
-    Amend,
-    Command,
-    Fail,
-    Fence,
-    Forget,
-    Launch,
-    Remember,
-    Report,
-    Restart,
-    Settle,
-    Stop,
-)
-from rosrm.core.slave.events import (
-    AssignmentsReceived,
-    ContactConfirmed,
-    FenceOrdered,
-    LaunchRefused,
-    LookedAt,
-    MasterLost,
-    Registered,
-    ReportRequested,
-    RestartOrdered,
-    RestartPolicyRecorded,
-    RestartPolicySet,
-    SeenInGraph,
-    StopOrdered,
-    SupervisorReplaced,
-    SupervisorReported,
-    TimePassed,
-)
+from rosrm.core.slave import commands, events, fencing
 from rosrm.core.slave.health import InstanceHealth, watch_of
 from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph, qualified_name
 from rosrm.core.slave.watches import Awaited, Memo
@@ -49,10 +18,10 @@ REMEMBER_END: Final = 60.0
 #: Most remembered orders to stop an unknown instance.
 _TOMBSTONES: Final = 10_000
 
-_Commands = list[Command]
+_Commands = list[commands.Command]
 
 
-def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
+def _registered(state: SlaveState, event: events.Registered, now: float) -> _Commands:
     # Not the highest epoch so far: a master whose journal was lost begins at 1 again.
     state.epoch = event.epoch
     state.registered = True
@@ -64,15 +33,15 @@ def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
         return []
     state.report_unconfirmed = False
     # Not complete: a late report must not deny assignments made since.
-    return [Report(state.statuses())]
+    return [commands.Report(state.statuses())]
 
 
-def _master_lost(state: SlaveState, event: MasterLost, now: float) -> _Commands:
+def _master_lost(state: SlaveState, event: events.MasterLost, now: float) -> _Commands:
     state.registered = False
     return []
 
 
-def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Commands:
+def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) -> _Commands:
     refusals = []
     for assignment in event.assignments:
         instance = assignment.instance
@@ -91,7 +60,7 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
     for one in held:
         one.status = replace(one.status, message=state.why_wait())
     reports = refusals + [one.status for one in held]
-    return [*launches, Report(tuple(reports))] if reports else launches
+    return [*launches, commands.Report(tuple(reports))] if reports else launches
 
 
 def _refused(
@@ -127,7 +96,7 @@ def _start_waiting(state: SlaveState, now: float) -> _Commands:
         instance = next(iter(state.waiting))
         launches.append(state.waiting.pop(instance))
         state.held[instance].status = InstanceStatus(instance, InstanceState.STARTING)
-    return [*([Launch(tuple(launches))] if launches else []), *refused]
+    return [*([commands.Launch(tuple(launches))] if launches else []), *refused]
 
 
 def _refuse_late(state: SlaveState, now: float) -> _Commands:
@@ -138,7 +107,7 @@ def _refuse_late(state: SlaveState, now: float) -> _Commands:
         status = InstanceStatus(instance, InstanceState.FENCED, message=why)
         state.held[instance] = HeldInstance(status, ended_at=now)
         _bury(state, instance)
-    return [Report(tuple(state.held[one].status for one in late))] if late else []
+    return [commands.Report(tuple(state.held[one].status for one in late))] if late else []
 
 
 def _why_not(state: SlaveState, assignment: Assignment) -> str:
@@ -149,30 +118,36 @@ def _why_not(state: SlaveState, assignment: Assignment) -> str:
     return ""
 
 
-def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Commands:
+def _launch_refused(state: SlaveState, event: events.LaunchRefused, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is None:  # it ended with a supervisor that was killed
         return []
     held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
     held.ready_by, held.ended_at = None, now
     _bury(state, event.instance)
-    return [*_start_waiting(state, now), Report((held.status,))]
+    return [*_start_waiting(state, now), commands.Report((held.status,))]
 
 
-def _end_ordered(state: SlaveState, event: StopOrdered | FenceOrdered, now: float) -> _Commands:
+def _end_ordered(
+    state: SlaveState, event: events.StopOrdered | events.FenceOrdered, now: float
+) -> _Commands:
     instance = event.instance
     held = state.held.get(instance)
     if held is not None and held.status.state.ended:
-        return [Report((held.status,))]
+        return [commands.Report((held.status,))]
     if held is not None and instance not in state.waiting:
-        return [Fence(instance) if isinstance(event, FenceOrdered) else Stop(instance)]
+        return [
+            commands.Fence(instance)
+            if isinstance(event, events.FenceOrdered)
+            else commands.Stop(instance)
+        ]
     state.waiting.pop(instance, None)
     _bury(state, instance)
     status = InstanceStatus(
         instance, InstanceState.REFUSED, message="it was stopped before it was started"
     )
     state.held[instance] = HeldInstance(status, ended_at=now)
-    return [Report((status,))]
+    return [commands.Report((status,))]
 
 
 def _bury(state: SlaveState, instance: InstanceId) -> None:
@@ -181,34 +156,34 @@ def _bury(state: SlaveState, instance: InstanceId) -> None:
         del state.tombstones[next(iter(state.tombstones))]
 
 
-def _restart_ordered(state: SlaveState, event: RestartOrdered, now: float) -> _Commands:
+def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is None or held.status.state.ended:
-        return [] if held is None else [Report((held.status,))]
+        return [] if held is None else [commands.Report((held.status,))]
     if event.instance in state.waiting:
         return []  # it starts as soon as it can
     held.ready_by, held.unready = None, ""
-    return [Restart(event.instance)]
+    return [commands.Restart(event.instance)]
 
 
-def _restart_policy_set(state: SlaveState, event: RestartPolicySet, now: float) -> _Commands:
+def _restart_policy_set(state: SlaveState, event: events.RestartPolicySet, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is None:
         return [_not_held(event)]
     if held.status.state.ended:
-        return [Report((held.status,)), Settle(event.instance, event.restart)]
+        return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
     news = _pause_or_watch(held, event)
     waiting = state.waiting.get(event.instance)
     if waiting is not None:  # the supervisor does not know it yet
         spec = replace(waiting.spec, restart=event.restart)
         state.waiting[event.instance] = replace(waiting, spec=spec, shadow=False)
-        return [Report((held.status,)), Settle(event.instance, event.restart)]
+        return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
     held.unsettled += (event.restart,)
-    remember = [Remember(event.instance, held.memo)] if news else []
-    return [Amend(event.instance, event.restart), *remember]
+    remember = [commands.Remember(event.instance, held.memo)] if news else []
+    return [commands.Amend(event.instance, event.restart), *remember]
 
 
-def _pause_or_watch(held: HeldInstance, order: RestartPolicySet) -> bool:
+def _pause_or_watch(held: HeldInstance, order: events.RestartPolicySet) -> bool:
     """Pause or resume the health watch by the restart policy; return True if that changed.
 
     A migration turns the restarts off and on again. An instance that is never restarted shows no
@@ -223,38 +198,42 @@ def _pause_or_watch(held: HeldInstance, order: RestartPolicySet) -> bool:
     return paused != watch.paused
 
 
-def _not_held(order: RestartPolicySet) -> Settle:
+def _not_held(order: events.RestartPolicySet) -> commands.Settle:
     never = f"{order.instance} is not known here: it never ran on this host, or ended long ago"
-    return Settle(order.instance, order.restart, never)
+    return commands.Settle(order.instance, order.restart, never)
 
 
 def _restart_policy_recorded(
-    state: SlaveState, event: RestartPolicyRecorded, now: float
+    state: SlaveState, event: events.RestartPolicyRecorded, now: float
 ) -> _Commands:
     held = state.held.get(event.instance)
     if held is None:
-        return [Settle(event.instance, event.restart)]
+        return [commands.Settle(event.instance, event.restart)]
     if event.restart in held.unsettled:
         at = held.unsettled.index(event.restart)
         held.unsettled = held.unsettled[:at] + held.unsettled[at + 1 :]
-    return [Report((held.status,)), Settle(event.instance, event.restart)]
+    return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
 
 
-def _report_requested(state: SlaveState, event: ReportRequested, now: float) -> _Commands:
-    return [Report(state.statuses(), complete=True)]
+def _report_requested(state: SlaveState, event: events.ReportRequested, now: float) -> _Commands:
+    return [commands.Report(state.statuses(), complete=True)]
 
 
-def _supervisor_reported(state: SlaveState, event: SupervisorReported, now: float) -> _Commands:
+def _supervisor_reported(
+    state: SlaveState, event: events.SupervisorReported, now: float
+) -> _Commands:
     changed = [
         status
         for reported in event.statuses
         if (status := _follow(state, reported, now)) is not None
     ]
     # Starts first, because the report of an end is less urgent.
-    return [*_start_waiting(state, now), *([Report(tuple(changed))] if changed else [])]
+    return [*_start_waiting(state, now), *([commands.Report(tuple(changed))] if changed else [])]
 
 
-def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: float) -> _Commands:
+def _supervisor_replaced(
+    state: SlaveState, event: events.SupervisorReplaced, now: float
+) -> _Commands:
     known = {status.instance for status in event.statuses}
     again: _Commands = []
     for instance, held in list(state.held.items()):
@@ -264,7 +243,7 @@ def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: floa
             _bury(state, instance)
         held.judgement = None  # its order may be lost
         again += [
-            _amend_again(RestartPolicySet(instance, restart), held, lost=lost)
+            _amend_again(events.RestartPolicySet(instance, restart), held, lost=lost)
             for restart in held.unsettled
         ]
     for status in event.statuses:
@@ -273,15 +252,17 @@ def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: floa
         state.held[instance].fenced = True
     return [
         *fencing.renew(state, now), *again, *_start_waiting(state, now),
-        Report(state.statuses(), complete=True),
+        commands.Report(state.statuses(), complete=True),
     ]  # fmt: skip
 
 
-def _amend_again(order: RestartPolicySet, held: HeldInstance, *, lost: bool) -> Command:
+def _amend_again(
+    order: events.RestartPolicySet, held: HeldInstance, *, lost: bool
+) -> commands.Command:
     """Return the command that repeats an order which may be lost with the supervisor."""
     if held.status.state.ended:
-        return Settle(order.instance, order.restart)
-    return _not_held(order) if lost else Amend(order.instance, order.restart)
+        return commands.Settle(order.instance, order.restart)
+    return _not_held(order) if lost else commands.Amend(order.instance, order.restart)
 
 
 def _follow(
@@ -323,7 +304,7 @@ def _with_unready(held: HeldInstance, reported: InstanceStatus) -> InstanceStatu
     return replace(reported, state=InstanceState.FAILED, message=held.unready)
 
 
-def _seen(state: SlaveState, event: SeenInGraph, now: float) -> _Commands:
+def _seen(state: SlaveState, event: events.SeenInGraph, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is None or held.ready_by is None or held.awaited is None:
         return []
@@ -331,11 +312,12 @@ def _seen(state: SlaveState, event: SeenInGraph, now: float) -> _Commands:
     held.status = replace(held.status, state=InstanceState.READY)
     held.awaited = replace(held.awaited, seen=held.status.pid)
     return [
-        *_start_waiting(state, now), Remember(event.instance, held.memo), Report((held.status,))
+        *_start_waiting(state, now), commands.Remember(event.instance, held.memo),
+        commands.Report((held.status,)),
     ]  # fmt: skip
 
 
-def _looked_at(state: SlaveState, event: LookedAt, now: float) -> _Commands:
+def _looked_at(state: SlaveState, event: events.LookedAt, now: float) -> _Commands:
     held = state.held.get(event.instance)
     watch = None if held is None else held.watched
     if held is None or watch is None or held.status.pid != event.pid:
@@ -346,15 +328,15 @@ def _looked_at(state: SlaveState, event: LookedAt, now: float) -> _Commands:
     if not reason:
         return []
     held.judgement = None  # judge again, in case the order is lost
-    return [Fail(event.instance, event.pid, reason, kill=event.look.stopped)]
+    return [commands.Fail(event.instance, event.pid, reason, kill=event.look.stopped)]
 
 
 def _may_be_discarded(state: SlaveState, held: HeldInstance, now: float) -> bool:
     return state.registered and now - held.ended_at >= REMEMBER_END
 
 
-def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
-    commands: _Commands = [*fencing.renew_in_time(state, now), *_refuse_late(state, now)]
+def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Commands:
+    orders: _Commands = [*fencing.renew_in_time(state, now), *_refuse_late(state, now)]
     forgotten = []
     for instance, held in state.held.items():
         awaited = held.awaited
@@ -364,15 +346,15 @@ def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
                 f"not ready within {awaited.timeout:g} s: no node {awaited.node_name} of "
                 f"this instance was seen in the ROS graph"
             )
-            commands.append(Stop(instance))
+            orders.append(commands.Stop(instance))
         elif held.status.state.ended and _may_be_discarded(state, held, now):
             forgotten.append(instance)
     if forgotten:
         for instance in forgotten:
             held = state.held.pop(instance)
-            commands += [Settle(instance, restart) for restart in held.unsettled]
-        commands.append(Forget(tuple(forgotten)))
-    return commands
+            orders += [commands.Settle(instance, restart) for restart in held.unsettled]
+        orders.append(commands.Forget(tuple(forgotten)))
+    return orders
 
 
 _Handler = Callable[[SlaveState, Any, float], _Commands]
@@ -380,21 +362,21 @@ _Handler = Callable[[SlaveState, Any, float], _Commands]
 #: The transition table.
 HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
     {
-        Registered: _registered,
-        MasterLost: _master_lost,
-        AssignmentsReceived: _assigned,
-        LaunchRefused: _launch_refused,
-        StopOrdered: _end_ordered,
-        FenceOrdered: _end_ordered,
-        ContactConfirmed: fencing.contact_confirmed,
-        RestartOrdered: _restart_ordered,
-        RestartPolicySet: _restart_policy_set,
-        RestartPolicyRecorded: _restart_policy_recorded,
-        ReportRequested: _report_requested,
-        SupervisorReported: _supervisor_reported,
-        SupervisorReplaced: _supervisor_replaced,
-        SeenInGraph: _seen,
-        LookedAt: _looked_at,
-        TimePassed: _time_passed,
+        events.Registered: _registered,
+        events.MasterLost: _master_lost,
+        events.AssignmentsReceived: _assigned,
+        events.LaunchRefused: _launch_refused,
+        events.StopOrdered: _end_ordered,
+        events.FenceOrdered: _end_ordered,
+        events.ContactConfirmed: fencing.contact_confirmed,
+        events.RestartOrdered: _restart_ordered,
+        events.RestartPolicySet: _restart_policy_set,
+        events.RestartPolicyRecorded: _restart_policy_recorded,
+        events.ReportRequested: _report_requested,
+        events.SupervisorReported: _supervisor_reported,
+        events.SupervisorReplaced: _supervisor_replaced,
+        events.SeenInGraph: _seen,
+        events.LookedAt: _looked_at,
+        events.TimePassed: _time_passed,
     }
 )

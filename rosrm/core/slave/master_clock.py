@@ -26,7 +26,7 @@ class BeatClock:
         """Forget the difference of the clocks: a new or returned master may have another clock."""
         self._ahead = None
 
-    def said_at(self, beat: float, now: float) -> float:
+    def sent_at(self, beat: float, now: float) -> float:
         """Return the send time of a beat that arrives `now`; seconds, by master's and own clock."""
         ahead = now - beat
         if self._ahead is not None:

@@ -2,43 +2,25 @@
 
 from __future__ import annotations
 
-from rosrm.core.slave.events import (
-    AssignmentsReceived,
-    Event,
-    FenceOrdered,
-    ReportRequested,
-    RestartOrdered,
-    RestartPolicySet,
-    StopOrdered,
-)
-from rosrm.model.orders import (
-    FenceInstance,
-    InstanceOrder,
-    ReportInstances,
-    RestartInstance,
-    SetRestartPolicy,
-    StartInstance,
-    StopInstance,
-)
+from rosrm.core.slave import events
+from rosrm.model import orders
 
 
-def event_of(order: InstanceOrder, given_at: float | None = None) -> Event:
-    """Return the event of an order.
+def event_of(order: orders.InstanceOrder, given_at: float | None = None) -> events.Event:
+    """Return the event of an order; all other orders are for the slave's runtime.
 
-    Args:
-        order: for the core; all other orders are for the slave's runtime.
-        given_at: earliest time of the order, by the slave's clock; None: just now.
+    `given_at` is the earliest time of the order, by the slave's clock; None: just now.
     """
     match order:
-        case StartInstance(assignment):
-            return AssignmentsReceived((assignment,), given_at)
-        case StopInstance(instance):
-            return StopOrdered(instance)
-        case FenceInstance(instance):
-            return FenceOrdered(instance)
-        case RestartInstance(instance):
-            return RestartOrdered(instance)
-        case SetRestartPolicy(instance, restart):
-            return RestartPolicySet(instance, restart)
-        case ReportInstances():
-            return ReportRequested()
+        case orders.StartInstance(assignment):
+            return events.AssignmentsReceived((assignment,), given_at)
+        case orders.StopInstance(instance):
+            return events.StopOrdered(instance)
+        case orders.FenceInstance(instance):
+            return events.FenceOrdered(instance)
+        case orders.RestartInstance(instance):
+            return events.RestartOrdered(instance)
+        case orders.SetRestartPolicy(instance, restart):
+            return events.RestartPolicySet(instance, restart)
+        case orders.ReportInstances():
+            return events.ReportRequested()

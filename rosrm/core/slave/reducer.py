@@ -1,28 +1,29 @@
 """The slave's reducer: (state, event, now) -> commands. Each kind of event is one row below.
 
 ======================  =========================================================================
-what happened           what the core does
+event                   what the core does
 ======================  =========================================================================
-Registered              remembers the master's epoch; older ones are refused from now on; reports
-                        again, if something went unheard meanwhile
-MasterLost              forgets no end until a master has taken this host in again
-AssignmentsReceived     has them launched, once, or holds them until a slot is free and those that
-                        are being started are ready; one that was stopped before is refused
-LaunchRefused           reports that the host cannot run it, and why
-StopOrdered             has it stopped; one never heard of will never be started
+Registered              stores the master's epoch, and refuses older ones from then on; repeats a
+                        report that may have reached no master
+MasterLost              keeps every end until a master has registered this host again
+AssignmentsReceived     launches each once, or holds it until a slot is free and those that are
+                        starting are ready; refuses one that was stopped before
+LaunchRefused           reports that the host cannot run the instance, and why
+StopOrdered             stops the instance; an unknown one will never be started
 FenceOrdered            the same, but at once
-ContactConfirmed        tells the supervisor, where there is a fence that this renews
-RestartOrdered          has it stopped and started again here
-RestartPolicySet        has the supervisor keep it, unless it has ended or is not known: settled
-RestartPolicyRecorded   the supervisor has it in its record: settled
+ContactConfirmed        sends the contact to the supervisor, where there is a fence to renew
+RestartOrdered          stops the instance, and starts it again here
+RestartPolicySet        has the supervisor record the policy; for an instance that has ended or is
+                        not known, the order is settled
+RestartPolicyRecorded   settles the order
 ReportRequested         reports everything
-SupervisorReported      follows the instance; a new run must become ready anew
-SupervisorReplaced      the same; what the new one does not know is gone; reports everything, and
-                        orders again what may have been lost with the former one
-SeenInGraph             the instance is ready; a later run of this slave shall know
-LookedAt                one that has been unhealthy for too long is ended as failed
-TimePassed              an instance that is not ready in time is stopped; one whose fence passed
-                        before its start is refused; old ends are forgotten
+SupervisorReported      follows the instances; a new run must become ready again
+SupervisorReplaced      the same; drops the instances that the new supervisor does not know,
+                        reports everything, and repeats orders that may be lost
+SeenInGraph             the instance is ready, also for a later run of this slave
+LookedAt                ends an instance as failed if it has been unhealthy for too long
+TimePassed              stops an instance that is not ready in time, refuses one whose fence passed
+                        before its start, and drops old ends
 ======================  =========================================================================
 """
 
@@ -37,12 +38,9 @@ from rosrm.core.slave.state import SlaveState
 
 
 def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
-    """Handle one event.
+    """Handle one event, and change the state in place.
 
-    Args:
-        state: changed in place.
-        event: what happened.
-        now: seconds by the slave's monotonic clock; never less than before.
+    `now` is the slave's monotonic clock, in seconds; never less than before.
     """
     commands = HANDLERS[type(event)](state, event, now)
     if not state.registered and any(isinstance(command, Report) for command in commands):

@@ -148,7 +148,7 @@ def under_limits(
 def awaits_graph(spec: ProcessSpec) -> bool:
     """Return True if an instance is ready when seen in the ROS graph, not as soon as it runs."""
     kind = spec.readiness.kind
-    return kind == "graph" or (kind == "auto" and spec.ros)
+    return kind == "graph" or (kind == "auto" and bool(spec.ros))
 
 
 def qualified_name(namespace: str, node_name: str) -> str:

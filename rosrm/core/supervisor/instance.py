@@ -29,7 +29,6 @@ THEN_RESTART: Final = "restart"
 THEN_POLICY: Final = "policy"
 
 STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-_KILL: Final = len(STEPS) - 1
 #: Seconds between one SIGKILL and the next, for child processes forked in between.
 KILL_AGAIN: Final = 1.0
 #: SIGKILLs after which a shutdown no longer waits (a process stuck in the kernel).
@@ -61,33 +60,11 @@ class Instance:
     """
 
     __slots__ = (
-        "cpu_time",
-        "deadline",
-        "exit_code",
-        "exit_signal",
-        "fault",
-        "fence",
-        "fenced",
-        "heard",
-        "key",
-        "kill_by",
-        "kills",
-        "message",
-        "peak_memory",
-        "phase",
-        "pid",
-        "recent",
-        "restart",
-        "restarts",
-        "run_time",
-        "started",
-        "step",
-        "stop",
-        "stop_began",
-        "then",
-        "trail",
+        "cpu_time", "deadline", "exit_code", "exit_signal", "fault", "fence", "fenced", "heard",
+        "key", "kill_by", "kills", "message", "peak_memory", "phase", "pid", "recent", "restart",
+        "restarts", "run_time", "started", "step", "stop", "stop_began", "then", "trail",
         "withdrawn",
-    )
+    )  # fmt: skip
 
     def __init__(self, key: Key, restart: RestartRule, stop: StopRule) -> None:
         self.key = key

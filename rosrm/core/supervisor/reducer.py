@@ -15,7 +15,7 @@
               FencePassed      Unspawn (one in hand is stopped later)        starting
               FenceOrdered     Unspawn (one in hand is killed later)         starting
               Resumed          Spawn (the supervisor was restarted)          starting
-              AmendOrdered     - (its policy is another from now on)         starting
+              AmendOrdered     - (the new policy holds from now on)          starting
     running   Exited           by policy                                     exited, failed, backoff
                                others of its session live: SIGINT            stopping
               StopOrdered      SIGINT                                        stopping
@@ -25,16 +25,16 @@
               FailOrdered      SIGINT, or SIGKILL at once; then by policy    stopping
               AmendOrdered     -                                             running
     stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
-              Exited           as was meant (end, restart, policy)           exited, starting, ...
+              Exited           as intended (end, restart, policy)            exited, starting, ...
                                others of its session live: -                 stopping
-              SessionEnded     as was meant (end, restart, policy)           exited, starting, ...
-              StopOrdered      now it is meant to end                        stopping
-              FencePassed      now it is meant to end, in the grace          stopping
+              SessionEnded     as intended (end, restart, policy)            exited, starting, ...
+              StopOrdered      from now on to end it                         stopping
+              FencePassed      the same, within the grace                    stopping
               FenceOrdered     the same; SIGKILL                             stopping
-              RestartOrdered   unless it is meant to end: to start again     stopping
+              RestartOrdered   unless it is to end: to start again           stopping
               AmendOrdered     -                                             stopping
     backoff   TimePassed       Spawn                                         starting
-              RestartOrdered   Spawn, the count of restarts afresh           starting
+              RestartOrdered   Spawn, with the restarts at 0                 starting
               StopOrdered      -                                             exited
               FencePassed      -                                             fenced
               FenceOrdered     -                                             fenced
@@ -65,22 +65,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from rosrm.core.supervisor import events
 from rosrm.core.supervisor.commands import Command, Drop, Leave, ReportStatus, Spawn
-from rosrm.core.supervisor.events import (
-    AmendOrdered,
-    ClientLost,
-    ContactReported,
-    Event,
-    FailOrdered,
-    FenceOrdered,
-    FencePassed,
-    RestartOrdered,
-    ShutdownOrdered,
-    StartOrdered,
-    StatusStored,
-    StopOrdered,
-    TimePassed,
-)
 from rosrm.core.supervisor.instance import BACKOFF, MOST_KILLS, REFUSED, THEN_END, Instance, end
 from rosrm.core.supervisor.rules import Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS
@@ -92,10 +78,11 @@ MOST_TOMBSTONES: Final = 2000
 MOST_RESTARTS: Final = 8
 RESTART_SPAN: Final = 1.0
 
-_ORDERS: Final = (
-    StartOrdered, StopOrdered, FenceOrdered, RestartOrdered, AmendOrdered, FailOrdered, StatusStored
+_OrderForUnknown = (
+    events.StartOrdered | events.StopOrdered | events.FenceOrdered | events.RestartOrdered
+    | events.AmendOrdered
 )  # fmt: skip
-_OrderForUnknown = StartOrdered | StopOrdered | FenceOrdered | RestartOrdered | AmendOrdered
+_Order = _OrderForUnknown | events.FailOrdered | events.StatusStored
 
 
 class SupervisorState:
@@ -128,40 +115,40 @@ class SupervisorState:
         """Return True if no instance runs, and none will without an order."""
         return all(instance.ended for instance in self.instances.values())
 
-    def handle(self, event: Event, now: float) -> list[Command]:
+    def handle(self, event: events.Event, now: float) -> list[Command]:
         """Handle an event, and return the commands."""
         commands = list(self._follow(event, now))
         if self.closing and self._nothing_to_wait_for():
             commands.append(Leave())
         return commands
 
-    def _follow(self, event: Event, now: float) -> Iterator[Command]:
-        if isinstance(event, TimePassed):
+    def _follow(self, event: events.Event, now: float) -> Iterator[Command]:
+        if isinstance(event, events.TimePassed):
             due = [key for key, deadline in self._timed.items() if deadline <= now]
             for key in due:
                 yield from self._fence_in_time(self.instances[key], now)
                 if self._has_turn(self.instances[key], now):
                     yield from self._apply(self.instances[key], event, now)
-        elif isinstance(event, ContactReported):
+        elif isinstance(event, events.ContactReported):
             self._renew(min(event.at, now), min(event.alive, now))
-        elif isinstance(event, ShutdownOrdered):
+        elif isinstance(event, events.ShutdownOrdered):
             self.closing = True
             for instance in list(self.instances.values()):
                 instance.withdrawn |= not instance.ended and instance.then != THEN_END
-                yield from self._apply(instance, StopOrdered(instance.key), now)
-        elif isinstance(event, ClientLost):
+                yield from self._apply(instance, events.StopOrdered(instance.key), now)
+        elif isinstance(event, events.ClientLost):
             return
         elif event.instance in self.instances:
             yield from self._known(self.instances[event.instance], event, now)
         elif isinstance(event, _OrderForUnknown):
             yield from self._unknown(event, now)
 
-    def _renew(self, heard: float, alive: float) -> None:
+    def _renew(self, at: float, alive: float) -> None:
         """Renew the fences; instances that are fenced already stay so."""
         for instance in self.instances.values():
             if instance.fence is None or instance.fence_at is None:
                 continue
-            newest = max(heard, alive) if instance.fence.alive else heard
+            newest = max(at, alive) if instance.fence.alive else at
             if instance.heard < newest:
                 instance.heard = newest
                 self._watch_deadline(instance)
@@ -170,7 +157,7 @@ class SupervisorState:
         at = instance.fence_at
         if at is None or now < at:
             return []
-        return self._apply(instance, FencePassed(instance.key), now)
+        return self._apply(instance, events.FencePassed(instance.key), now)
 
     def _has_turn(self, instance: Instance, now: float) -> bool:
         """Return True if its step is due and a restart may begin; otherwise it is due later."""
@@ -186,18 +173,18 @@ class SupervisorState:
         self._watch_deadline(instance)
         return False
 
-    def _known(self, instance: Instance, event: Event, now: float) -> Iterator[Command]:
-        if isinstance(event, StatusStored) and instance.ended:
+    def _known(self, instance: Instance, event: events.Event, now: float) -> Iterator[Command]:
+        if isinstance(event, events.StatusStored) and instance.ended:
             yield self._bury(instance)
             return
         commands = self._apply(instance, event, now)
         yield from commands
-        if not commands and isinstance(event, _ORDERS):
+        if not commands and isinstance(event, _Order):
             yield ReportStatus(instance.key)
 
     def _unknown(self, event: _OrderForUnknown, now: float) -> Iterator[Command]:
         name, number = event.instance
-        if isinstance(event, StartOrdered):
+        if isinstance(event, events.StartOrdered):
             instance = Instance(event.instance, event.restart, event.stop)
             instance.fence = event.fence
             slave_counts = event.fence is not None and event.fence.alive
@@ -208,7 +195,7 @@ class SupervisorState:
         self.instances[instance.key] = instance
         if number <= self.dead.get(name, -1):
             end(instance, REFUSED, f"{name}#{number} or a later one has ended and was forgotten")
-        elif not isinstance(event, StartOrdered):
+        elif not isinstance(event, events.StartOrdered):
             end(instance, REFUSED, "it was never started here")
         elif self.closing:
             end(instance, REFUSED, "the supervisor of this host is shutting down")
@@ -217,7 +204,7 @@ class SupervisorState:
         if not instance.ended:
             yield Spawn(instance.key)
 
-    def _apply(self, instance: Instance, event: Event, now: float) -> list[Command]:
+    def _apply(self, instance: Instance, event: events.Event, now: float) -> list[Command]:
         transition = TRANSITIONS.get((instance.phase, type(event)))
         if transition is None:
             return []

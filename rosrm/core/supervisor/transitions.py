@@ -7,22 +7,8 @@ import zlib
 from collections.abc import Callable
 from typing import Final
 
+from rosrm.core.supervisor import events
 from rosrm.core.supervisor.commands import Command, ReportStatus, Signal, Spawn, Unspawn
-from rosrm.core.supervisor.events import (
-    AmendOrdered,
-    Event,
-    Exited,
-    FailOrdered,
-    FenceOrdered,
-    FencePassed,
-    RestartOrdered,
-    Resumed,
-    SessionEnded,
-    Spawned,
-    SpawnFailed,
-    StopOrdered,
-    TimePassed,
-)
 from rosrm.core.supervisor.instance import (
     BACKOFF,
     EXITED,
@@ -53,11 +39,11 @@ _KILL: Final = len(STEPS) - 1
 #: start together.
 _JITTER: Final = 0.2
 
-Transition = Callable[[Instance, "Event", float], list[Command]]
+Transition = Callable[[Instance, events.Event, float], list[Command]]
 
 
-def _spawned(instance: Instance, event: Event, now: float) -> list[Command]:
-    assert isinstance(event, Spawned)
+def _spawned(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    assert isinstance(event, events.Spawned)
     instance.phase = RUNNING
     instance.pid = event.pid
     instance.started = now
@@ -67,8 +53,8 @@ def _spawned(instance: Instance, event: Event, now: float) -> list[Command]:
     return [ReportStatus(instance.key)]
 
 
-def _spawn_failed(instance: Instance, event: Event, now: float) -> list[Command]:
-    assert isinstance(event, SpawnFailed)
+def _spawn_failed(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    assert isinstance(event, events.SpawnFailed)
     instance.run_time = instance.cpu_time = instance.peak_memory = 0.0
     if instance.then == THEN_END:
         _end_as_meant(instance, "stopped before it was started")
@@ -79,19 +65,19 @@ def _spawn_failed(instance: Instance, event: Event, now: float) -> list[Command]
     return [ReportStatus(instance.key)]
 
 
-def _stop_before_spawn(instance: Instance, event: Event, now: float) -> list[Command]:
+def _stop_before_spawn(instance: Instance, event: events.Event, now: float) -> list[Command]:
     if instance.then == THEN_END:
         return []
     instance.then = THEN_END
     return [ReportStatus(instance.key), Unspawn(instance.key)]
 
 
-def _spawn(instance: Instance, event: Event, now: float) -> list[Command]:
+def _spawn(instance: Instance, event: events.Event, now: float) -> list[Command]:
     return _start_again(instance)
 
 
-def _exited(instance: Instance, event: Event, now: float) -> list[Command]:
-    assert isinstance(event, Exited)
+def _exited(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    assert isinstance(event, events.Exited)
     instance.pid = 0
     instance.exit_code = event.code
     instance.exit_signal = event.signal
@@ -106,27 +92,27 @@ def _exited(instance: Instance, event: Event, now: float) -> list[Command]:
     return _begin_stop(instance, THEN_POLICY, now)
 
 
-def _cleared(instance: Instance, event: Event, now: float) -> list[Command]:
+def _cleared(instance: Instance, event: events.Event, now: float) -> list[Command]:
     return [] if instance.pid else _when_nothing_is_left(instance, now)
 
 
-def _stop(instance: Instance, event: Event, now: float) -> list[Command]:
+def _stop(instance: Instance, event: events.Event, now: float) -> list[Command]:
     return _begin_stop(instance, THEN_END, now)
 
 
-def _restart(instance: Instance, event: Event, now: float) -> list[Command]:
+def _restart(instance: Instance, event: events.Event, now: float) -> list[Command]:
     return _begin_stop(instance, THEN_RESTART, now)
 
 
-def _fail(instance: Instance, event: Event, now: float) -> list[Command]:
-    assert isinstance(event, FailOrdered)
+def _fail(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    assert isinstance(event, events.FailOrdered)
     if event.pid != instance.pid:
         return []  # that run has already ended
     instance.fault = event.reason
     return _begin_stop(instance, THEN_POLICY, now, _KILL if event.kill else 0)
 
 
-def _mean_to_end(instance: Instance, event: Event, now: float) -> list[Command]:
+def _mean_to_end(instance: Instance, event: events.Event, now: float) -> list[Command]:
     if instance.then == THEN_END:
         return []
     instance.then = THEN_END
@@ -134,7 +120,7 @@ def _mean_to_end(instance: Instance, event: Event, now: float) -> list[Command]:
     return [ReportStatus(instance.key)]
 
 
-def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Command]:
+def _mean_to_restart(instance: Instance, event: events.Event, now: float) -> list[Command]:
     if instance.then != THEN_POLICY or instance.fenced:
         return []  # it is meant to end, or to start again already
     instance.then = THEN_RESTART
@@ -142,7 +128,7 @@ def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Comma
     return [ReportStatus(instance.key)]
 
 
-def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
+def _escalate(instance: Instance, event: events.Event, now: float) -> list[Command]:
     """Take the next step of a stop; after SIGKILL only SIGKILL again."""
     instance.step = _KILL if _must_be_gone(instance, now) else min(instance.step + 1, _KILL)
     number = STEPS[instance.step]
@@ -156,33 +142,33 @@ def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
     return [ReportStatus(instance.key), Signal(instance.key, number)]
 
 
-def _restart_due(instance: Instance, event: Event, now: float) -> list[Command]:
+def _restart_due(instance: Instance, event: events.Event, now: float) -> list[Command]:
     instance.restarts += 1
     instance.recent.append(now)
     return _start_again(instance)
 
 
-def _restart_now(instance: Instance, event: Event, now: float) -> list[Command]:
+def _restart_now(instance: Instance, event: events.Event, now: float) -> list[Command]:
     instance.recent.clear()
     return _start_again(instance)
 
 
-def _stop_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+def _stop_in_backoff(instance: Instance, event: events.Event, now: float) -> list[Command]:
     _end_as_meant(instance, f"stopped while it waited for its restart ({ending(instance)})")
     return [ReportStatus(instance.key)]
 
 
-def _fence_before_spawn(instance: Instance, event: Event, now: float) -> list[Command]:
+def _fence_before_spawn(instance: Instance, event: events.Event, now: float) -> list[Command]:
     _take_fence(instance, event, now)
     return _stop_before_spawn(instance, event, now)
 
 
-def _fence(instance: Instance, event: Event, now: float) -> list[Command]:
+def _fence(instance: Instance, event: events.Event, now: float) -> list[Command]:
     _take_fence(instance, event, now)
     return _begin_stop(instance, THEN_END, now)
 
 
-def _fence_while_it_stops(instance: Instance, event: Event, now: float) -> list[Command]:
+def _fence_while_it_stops(instance: Instance, event: events.Event, now: float) -> list[Command]:
     _take_fence(instance, event, now)
     if instance.then == THEN_RESTART:
         instance.then = THEN_END
@@ -194,21 +180,21 @@ def _fence_while_it_stops(instance: Instance, event: Event, now: float) -> list[
     return [ReportStatus(instance.key)]
 
 
-def _fence_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+def _fence_in_backoff(instance: Instance, event: events.Event, now: float) -> list[Command]:
     _take_fence(instance, event, now)
     _end_as_meant(instance, f"it waited for its restart ({ending(instance)})")
     return [ReportStatus(instance.key)]
 
 
-def _amend(instance: Instance, event: Event, now: float) -> list[Command]:
-    assert isinstance(event, AmendOrdered)
+def _amend(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    assert isinstance(event, events.AmendOrdered)
     if instance.restart == event.restart:
         return []
     instance.restart = event.restart
     return [ReportStatus(instance.key)]
 
 
-def _amend_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+def _amend_in_backoff(instance: Instance, event: events.Event, now: float) -> list[Command]:
     commands = _amend(instance, event, now)
     rule = instance.restart
     if commands and (rule.when == "never" or _recent_restarts(instance, now) >= rule.attempts):
@@ -217,34 +203,34 @@ def _amend_in_backoff(instance: Instance, event: Event, now: float) -> list[Comm
 
 
 TRANSITIONS: Final[dict[tuple[Phase, type], Transition]] = {
-    (STARTING, Spawned): _spawned,
-    (STARTING, SpawnFailed): _spawn_failed,
-    (STARTING, StopOrdered): _stop_before_spawn,
-    (STARTING, FencePassed): _fence_before_spawn,
-    (STARTING, FenceOrdered): _fence_before_spawn,
-    (STARTING, Resumed): _spawn,
-    (STARTING, AmendOrdered): _amend,
-    (RUNNING, Exited): _exited,
-    (RUNNING, StopOrdered): _stop,
-    (RUNNING, FencePassed): _fence,
-    (RUNNING, FenceOrdered): _fence,
-    (RUNNING, RestartOrdered): _restart,
-    (RUNNING, AmendOrdered): _amend,
-    (RUNNING, FailOrdered): _fail,
-    (STOPPING, TimePassed): _escalate,
-    (STOPPING, Exited): _exited,
-    (STOPPING, SessionEnded): _cleared,
-    (STOPPING, StopOrdered): _mean_to_end,
-    (STOPPING, FencePassed): _fence_while_it_stops,
-    (STOPPING, FenceOrdered): _fence_while_it_stops,
-    (STOPPING, RestartOrdered): _mean_to_restart,
-    (STOPPING, AmendOrdered): _amend,
-    (BACKOFF, TimePassed): _restart_due,
-    (BACKOFF, RestartOrdered): _restart_now,
-    (BACKOFF, StopOrdered): _stop_in_backoff,
-    (BACKOFF, FencePassed): _fence_in_backoff,
-    (BACKOFF, FenceOrdered): _fence_in_backoff,
-    (BACKOFF, AmendOrdered): _amend_in_backoff,
+    (STARTING, events.Spawned): _spawned,
+    (STARTING, events.SpawnFailed): _spawn_failed,
+    (STARTING, events.StopOrdered): _stop_before_spawn,
+    (STARTING, events.FencePassed): _fence_before_spawn,
+    (STARTING, events.FenceOrdered): _fence_before_spawn,
+    (STARTING, events.Resumed): _spawn,
+    (STARTING, events.AmendOrdered): _amend,
+    (RUNNING, events.Exited): _exited,
+    (RUNNING, events.StopOrdered): _stop,
+    (RUNNING, events.FencePassed): _fence,
+    (RUNNING, events.FenceOrdered): _fence,
+    (RUNNING, events.RestartOrdered): _restart,
+    (RUNNING, events.AmendOrdered): _amend,
+    (RUNNING, events.FailOrdered): _fail,
+    (STOPPING, events.TimePassed): _escalate,
+    (STOPPING, events.Exited): _exited,
+    (STOPPING, events.SessionEnded): _cleared,
+    (STOPPING, events.StopOrdered): _mean_to_end,
+    (STOPPING, events.FencePassed): _fence_while_it_stops,
+    (STOPPING, events.FenceOrdered): _fence_while_it_stops,
+    (STOPPING, events.RestartOrdered): _mean_to_restart,
+    (STOPPING, events.AmendOrdered): _amend,
+    (BACKOFF, events.TimePassed): _restart_due,
+    (BACKOFF, events.RestartOrdered): _restart_now,
+    (BACKOFF, events.StopOrdered): _stop_in_backoff,
+    (BACKOFF, events.FencePassed): _fence_in_backoff,
+    (BACKOFF, events.FenceOrdered): _fence_in_backoff,
+    (BACKOFF, events.AmendOrdered): _amend_in_backoff,
 }
 
 
@@ -267,12 +253,12 @@ def _begin_stop(instance: Instance, then: Then, now: float, first: int = 0) -> l
     instance.kills = 0
     instance.stop_began = now
     instance.trail = ""
-    return _escalate(instance, TimePassed(), now)
+    return _escalate(instance, events.TimePassed(), now)
 
 
-def _take_fence(instance: Instance, event: Event, now: float) -> None:
+def _take_fence(instance: Instance, event: events.Event, now: float) -> None:
     """Fence an instance: it ends in time; one that was to end anyway ends as ordered."""
-    if isinstance(event, FenceOrdered) or instance.fence is None:
+    if isinstance(event, events.FenceOrdered) or instance.fence is None:
         why, by = "it has a successor", now
     else:
         after, grace, alive = instance.fence

@@ -92,11 +92,7 @@ class InputBuffer:
         self._track(topic).mixed = True
 
     def add(self, topic: str, sent: Sent, item: Any, now: float, size: int = 0) -> bool:
-        """Add a message, unless a state covers it already.
-
-        Returns:
-            False: the buffer has no room for it.
-        """
+        """Add a message, unless a state covers it already; return False if there is no room."""
         track = self._track(topic)
         track.arrived_at = now
         _note_order(track, sent)
@@ -114,11 +110,8 @@ class InputBuffer:
         """Record that a state covers these messages; drop them now, or when they arrive.
 
         Args:
-            topic: of the input.
-            stamps: source time stamps, ns.
             single: the topic has one publisher. So its stamps are in order, and the source skipped
                 any message older than the newest covered one.
-            now: monotonic seconds.
         """
         track = self._track(topic)
         stamps = list(stamps)

@@ -6,27 +6,16 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from rosrm.ros.qos import HANDOFF, latched
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport
 
-
-def _latched(depth: int) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )  # fmt: skip
-
-
-STATE_CONFIG: Final = _latched(100)
-CHANNEL: Final = _latched(20)
-STATE: Final = _latched(1)
+STATE: Final = latched(depth=1)
 #: For a follower of a state of several parts, because a newer message of one part must not replace
 #: the one that belongs to the other parts.
-STATE_FOLLOWED: Final = _latched(10)
-MARK: Final = _latched(100)
-
+STATE_FOLLOWED: Final = latched(depth=10)
+MARK: Final = latched(depth=100)
 
 #: Entities that are created and destroyed with a handoff have no event handlers. Otherwise an rclpy
 #: executor of several threads raises InvalidHandle if a handler is destroyed as the executor
@@ -44,30 +33,25 @@ class Channel:
         destination: instance number that names the handoff.
         instance: this node's own number.
         peer: instance number of the other side.
-        heard: called with each report of the other side.
+        take_report: called with each report of the other side.
     """
 
     def __init__(
-        self,
-        plain: Any,
-        topic: str,
-        destination: int,
-        instance: int,
-        peer: int,
-        heard: Callable[[HandoffReport], None],
-    ) -> None:
+        self, plain: Any, topic: str, destination: int, instance: int, peer: int,
+        take_report: Callable[[HandoffReport], None],
+    ) -> None:  # fmt: skip
         self._plain = plain
         self._destination = destination
         self._instance = instance
         self._peer = peer
-        self._take_report = heard
+        self._take_report = take_report
         self._last: HandoffReport | None = None
         self.topic = topic
         self._publisher = plain.create_publisher(
-            HandoffReport, topic, CHANNEL, event_callbacks=NO_PUBLISHER_EVENTS
+            HandoffReport, topic, HANDOFF, event_callbacks=NO_PUBLISHER_EVENTS
         )
         self._subscription = plain.create_subscription(
-            HandoffReport, topic, self._take, CHANNEL, event_callbacks=NO_SUBSCRIPTION_EVENTS
+            HandoffReport, topic, self._take, HANDOFF, event_callbacks=NO_SUBSCRIPTION_EVENTS
         )
 
     def _take(self, report: HandoffReport) -> None:
@@ -75,7 +59,7 @@ class Channel:
         if theirs and report.protocol_version == PROTOCOL_VERSION:
             self._take_report(report)
 
-    def say(self, phase: int, sequence: int = 0, message: str = "") -> None:
+    def report(self, phase: int, sequence: int = 0, message: str = "") -> None:
         """Publish a report, unless it repeats the last one."""
         last = self._last
         if last is not None and (last.phase, last.message) == (phase, message):

@@ -8,13 +8,13 @@ from functools import partial
 from math import inf
 from typing import Any, Final
 
-from rosrm.node.entities import waiting
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.snapshot_assembler import Cut, CutAssembler
-from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
+from rosrm.ros.polling import waiting
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
@@ -32,22 +32,12 @@ _REVIEW: Final = 0.1
 
 
 class Destination:
-    """The role of a shadow until it is active.
-
-    Args:
-        entities: the node.
-        parts: of its state.
-        mark_topic: fully qualified.
-        activated: called when the node is active.
-    """
+    """The role of a shadow until it is active; then `activated` is called."""
 
     def __init__(
-        self,
-        entities: NodeEntities,
-        parts: list[StateTopic],
-        mark_topic: str,
+        self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str,
         activated: Callable[[], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._entities = entities
         self._parts = parts
         self._mark_topic = mark_topic
@@ -83,7 +73,7 @@ class Destination:
             self.close()
         elif self._ended:
             if config.phase == StateConfig.ABORT and not self._active:
-                channel.say(HandoffReport.ABORTED, self._sequence(), self._fault)
+                channel.report(HandoffReport.ABORTED, self._sequence(), self._fault)
         elif config.phase == StateConfig.SWITCH:
             self._may_switch = True
             self._review()
@@ -100,7 +90,7 @@ class Destination:
             config.source, self._take_report,
         )  # fmt: skip
         if self._ended:
-            channel.say(HandoffReport.FAILED, 0, self._fault)
+            channel.report(HandoffReport.FAILED, 0, self._fault)
             return channel
         self._assembler = CutAssembler()
         # Marks first, also in `_catch_up`: they name the parts that are worth keeping.
@@ -147,7 +137,7 @@ class Destination:
             elif report.phase == HandoffReport.SILENT:
                 self._silent_at = report.sequence
             elif report.phase == HandoffReport.FAILED:
-                self._end(HandoffReport.FAILED, f"the source cannot go on: {report.message}")
+                self._end(HandoffReport.FAILED, f"the source failed: {report.message}")
             self._go_on()
 
     def _came(self, take: Callable[[Any], None], message: Any) -> None:
@@ -184,15 +174,14 @@ class Destination:
             )
         if self._run and mark.run != self._run:
             return "the source was started again, and its state is a new one"
-        theirs = {part.topic: part.type for part in mark.parts}
-        ours = {part.topic: part.type_name for part in self._parts}
-        for topic in sorted(ours.keys() | theirs.keys()):
-            if theirs.get(topic) != ours.get(topic):
-                return (
-                    f"the state on {topic} is {theirs.get(topic, 'none')} at the source, and "
-                    f"{ours.get(topic, 'none')} here: both must be the same program"
-                )
-        return ""
+        differing = differing_part(self._parts, mark)
+        if differing is None:
+            return ""
+        topic, ours, theirs = differing
+        return (
+            f"the state on {topic} is {theirs} at the source, and {ours} here: both must be the "
+            f"same program"
+        )
 
     # --- following -------------------------------------------------------------------------
 
@@ -218,12 +207,8 @@ class Destination:
             self._end(HandoffReport.FAILED, str(error))
             return False
         self._cut = cut
-        now = time.monotonic()
         for mark in (*cut.passed, cut.mark):
-            for covered in mark.inputs:
-                self._entities.buffer.cover(
-                    covered.topic, covered.covered, single=covered.publishers <= 1, now=now
-                )
+            self._entities.cover(mark.inputs)
         return True
 
     def _review(self) -> None:
@@ -236,16 +221,16 @@ class Destination:
         if not self._was_ready:
             missing = self._still_missing()
             if missing:
-                self._channel.say(HandoffReport.SHADOWING, 0, f"waits {missing}")
+                self._channel.report(HandoffReport.SHADOWING, 0, f"waits {missing}")
                 return
             self._was_ready = True
-            self._channel.say(HandoffReport.READY, self._sequence())
+            self._channel.report(HandoffReport.READY, self._sequence())
         if not self._may_switch:
             return
         if self._cut is not None and self._is_last(self._cut):
             self._activate_if_complete()
         else:
-            self._channel.say(HandoffReport.SWITCHING, self._sequence())
+            self._channel.report(HandoffReport.SWITCHING, self._sequence())
 
     def _is_last(self, cut: Cut) -> bool:
         """Return True for this handoff's last state; an earlier handoff's may be latched too."""
@@ -336,23 +321,22 @@ class Destination:
             return
         self._ended = self._active = True
         entities.sequence = self._sequence()
-        for covered in cut.mark.inputs:
-            entities.inherit(covered.topic, covered.covered)
-        passed = time.monotonic() - cut.arrived
-        due = [None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due]
+        entities.inherit(cut.mark.inputs)
         # Buffered messages are served first, because `_unfollow` and `_activated` take time.
-        entities.become_active(due, self._say_active, (self._unfollow, self._activated))
+        entities.become_active(
+            cut.mark.timers_due, cut.arrived, self._report_active, (self._unfollow, self._activated)
+        )
 
-    def _say_active(self) -> None:
+    def _report_active(self) -> None:
         if self._channel is not None:
-            self._channel.say(HandoffReport.ACTIVE, self._sequence())
+            self._channel.report(HandoffReport.ACTIVE, self._sequence())
 
     def _end(self, phase: int, message: str) -> None:
         """Give up for good; this process then runs until its slave stops it."""
         self._ended, self._fault = True, message
         self._entities.node.get_logger().warning(f"will not take over: {message}")
         if self._channel is not None:
-            self._channel.say(phase, self._sequence(), message)
+            self._channel.report(phase, self._sequence(), message)
         self._unfollow()
 
     def _overflowed(self, topic: str) -> None:

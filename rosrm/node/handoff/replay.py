@@ -11,7 +11,7 @@ from rosrm.node.steady_timer import steady_timer
 #: Seconds of one slice; a callback that has begun is finished.
 _SLICE: Final = 0.02
 #: Marks the end of the steps.
-_OVER: Final = object()
+_END: Final = object()
 
 
 class InputReplay:
@@ -29,7 +29,7 @@ class InputReplay:
         self._serve_next = serve_next
         self._timer: Any = None
         self._beside: Iterator[None] = iter(())
-        self._then: Callable[[], None] = _nothing
+        self._then: Callable[[], None] = lambda: None
         self._counted = 0
 
     @property
@@ -38,10 +38,9 @@ class InputReplay:
         return self._timer is not None
 
     def begin(self, beside: Iterator[None]) -> None:
-        """Serve all buffered messages, from the executor's next round on.
+        """Serve all buffered messages, in slices, from the executor's next round on.
 
-        Args:
-            beside: further work, advanced by one step after each slice.
+        After each slice `beside`, further work, is advanced by one step.
         """
         self._beside = beside
         self._start()
@@ -62,9 +61,9 @@ class InputReplay:
             try:
                 more = self._serve_until(time.monotonic() + _SLICE)
             finally:
-                steps = next(self._beside, _OVER) is not _OVER
+                steps = next(self._beside, _END) is not _END
             if not more or self._counted <= 0:
-                then, self._then = self._then, _nothing
+                then, self._then = self._then, lambda: None
                 then()
             if not (more or steps):
                 self._plain.destroy_timer(self._timer)
@@ -77,7 +76,3 @@ class InputReplay:
             if self._counted == 0 or time.monotonic() >= end:
                 return True
         return False
-
-
-def _nothing() -> None:
-    """Do nothing, because no caller waits."""

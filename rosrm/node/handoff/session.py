@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.destination import Destination
 from rosrm.node.handoff.source import HandoffSource
 from rosrm.node.handoff.state_parts import ParametersPart, StateTopic
 from rosrm.node.identity import NodeIdentity
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.snapshots.restore import SnapshotRestore, newest_snapshot
+from rosrm.ros.qos import STATE_CONFIG
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
 
@@ -22,10 +22,7 @@ _PARAMETERS: Final = "_rosrm/parameters"
 class HandoffSession:
     """The handoffs of one node: first perhaps as a destination, later as a source.
 
-    Args:
-        node: the author's.
-        plain: rclpy's own methods of it.
-        identity: given by rosrm to this process.
+    `plain` has rclpy's own methods of the node.
     """
 
     def __init__(self, node: Any, plain: Any, identity: NodeIdentity) -> None:
@@ -55,7 +52,7 @@ class HandoffSession:
         else:
             self._become_source()
         self._subscription = self.entities.plain.create_subscription(
-            StateConfig, self.identity.state_config, self._configured, topics.STATE_CONFIG
+            StateConfig, self.identity.state_config, self._configured, STATE_CONFIG
         )
 
     def _own(self, path: str) -> str:

@@ -14,27 +14,21 @@ from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.state_parts import StateError, StateTopic
 from rosrm.node.managed_node import Mode, NodeEntities
-from rosrm.node.snapshots.writer import LARGEST_PART, SnapshotSaver
+from rosrm.node.snapshots.writer import SnapshotSaver
 from rosrm.node.steady_timer import steady_timer
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
+from rosrm_msgs.msg import HandoffReport, MatchedOutput, StateConfig, StateMark
 
 #: Seconds that a silent source waits until its last outputs are acknowledged; by default Fast DDS
 #: sends its readers a heartbeat every 3 s.
-_LAST_WORDS: Final = 4.0
+_ACK_PATIENCE: Final = 4.0
 #: Seconds between two checks for acknowledgements.
 _LOOK: Final = 0.05
 _AT_ONCE: Final = Duration(nanoseconds=0)
 
 
 class HandoffSource:
-    """The role of the active node towards a successor.
-
-    Args:
-        entities: the node.
-        parts: of its state.
-        mark_topic: fully qualified.
-    """
+    """The role of the active node towards a successor."""
 
     def __init__(self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str) -> None:
         self._entities = entities
@@ -48,7 +42,7 @@ class HandoffSource:
         self._fault = ""
         self._timers_due: list[int] = []
         self._silent_since = 0.0
-        self._look_again: Any = None
+        self._release_timer: Any = None
         plain = entities.plain
         self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
         for part in parts:
@@ -82,12 +76,11 @@ class HandoffSource:
     def _show(self, *, last: bool = False) -> bool:
         """Publish the state between two cycles, and the mark that lists the covered inputs.
 
-        Returns:
-            False: the state cannot be published; the master has received the reason.
+        Returns False if that fails; the master has received the reason.
         """
         try:
             for part in self._parts:
-                part.publish(LARGEST_PART)
+                part.publish()
         except StateError as error:
             self._failed(str(error))
             return False
@@ -98,7 +91,7 @@ class HandoffSource:
         for part in self._parts:
             if part.has_reader():
                 try:
-                    part.publish(LARGEST_PART)
+                    part.publish()
                 except StateError as error:
                     self._entities.node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
@@ -108,7 +101,7 @@ class HandoffSource:
             self._entities.node.get_logger().error(f"{fault}. This node stays where it is")
         self._fault = fault
         if self._channel is not None:
-            self._channel.say(HandoffReport.FAILED, self._entities.sequence, fault)
+            self._channel.report(HandoffReport.FAILED, self._entities.sequence, fault)
 
     def _mark(self, *, last: bool) -> StateMark:
         entities = self._entities
@@ -116,13 +109,7 @@ class HandoffSource:
         return StateMark(
             protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence, last=last,
             parts=[part.described() for part in self._parts],
-            inputs=[
-                CoveredInput(
-                    topic=one.key, publishers=one.subscription.get_publisher_count(),
-                    covered=array("q", one.covered),
-                )
-                for one in entities.inputs if one.buffered
-            ],
+            inputs=entities.covered_inputs(lambda one: one.subscription.get_publisher_count()),
             outputs=[
                 MatchedOutput(
                     topic=one.topic_name, subscriptions=one.get_subscription_count()
@@ -178,7 +165,7 @@ class HandoffSource:
             return
         self._attached = True
         if self._show():
-            self._channel.say(HandoffReport.ATTACHED, self._entities.sequence)
+            self._channel.report(HandoffReport.ATTACHED, self._entities.sequence)
 
     def _switch(self) -> None:
         """Fall silent, once both the master and the destination have requested it."""
@@ -196,43 +183,44 @@ class HandoffSource:
         self._timers_due = entities.fall_silent()
         self._silent_since = time.monotonic()
         if not self._show(last=True):
-            self._go_on(_nothing)
+            self._reactivate(lambda: None)  # the failure has been reported
             return
-        self._channel.say(HandoffReport.SILENT, entities.sequence)
-        self._look_again = steady_timer(entities.plain, _LOOK, self._release_when_heard)
+        self._channel.report(HandoffReport.SILENT, entities.sequence)
+        self._release_timer = steady_timer(entities.plain, _LOOK, self._release)
 
-    def _release_when_heard(self) -> None:
+    def _release(self) -> None:
         """Report RELEASED when all outputs are acknowledged (a stop loses others) or time is up."""
         with self._entities.turn:
-            heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
-            if heard or time.monotonic() - self._silent_since >= _LAST_WORDS:
-                self._look_no_more()
+            received = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
+            if received or time.monotonic() - self._silent_since >= _ACK_PATIENCE:
+                self._stop_release()
                 if self._channel is not None:
-                    self._channel.say(HandoffReport.RELEASED, self._entities.sequence)
+                    self._channel.report(HandoffReport.RELEASED, self._entities.sequence)
 
-    def _look_no_more(self) -> None:
-        if self._look_again is not None:
-            self._entities.plain.destroy_timer(self._look_again)
-            self._look_again = None
+    def _stop_release(self) -> None:
+        if self._release_timer is not None:
+            self._entities.plain.destroy_timer(self._release_timer)
+            self._release_timer = None
+
+    def _call_off(self) -> None:
+        self._may_switch = self._asked = self._attached = self._finishing = False
+        self._stop_release()
 
     def _resume(self) -> None:
-        self._may_switch = self._asked = self._attached = self._finishing = False
-        self._look_no_more()
+        self._call_off()
         if self._entities.mode is Mode.SILENT:
             # Otherwise the shadow of a later handoff would take the last mark for its own.
             self._marks.publish(self._mark(last=False))
-            self._go_on(self._say_resumed)
+            self._reactivate(self._report_resumed)
         else:
-            self._say_resumed()
+            self._report_resumed()
 
-    def _say_resumed(self) -> None:
+    def _report_resumed(self) -> None:
         if self._channel is not None:
-            self._channel.say(HandoffReport.RESUMED, self._entities.sequence)
+            self._channel.report(HandoffReport.RESUMED, self._entities.sequence)
 
-    def _go_on(self, announce: Callable[[], None]) -> None:
-        passed = time.monotonic() - self._silent_since
-        due = [None if ns < 0 else ns / 1e9 - passed for ns in self._timers_due]
-        self._entities.become_active(due, announce)
+    def _reactivate(self, announce: Callable[[], None]) -> None:
+        self._entities.become_active(self._timers_due, self._silent_since, announce)
 
     def _overflowed(self, topic: str) -> None:
         self._entities.node.get_logger().error(
@@ -243,8 +231,7 @@ class HandoffSource:
     def close(self) -> None:
         """Leave the channel of a finished handoff."""
         self._fault = ""
-        self._look_no_more()
-        self._may_switch = self._asked = self._attached = self._finishing = False
+        self._call_off()
         if self._channel is not None:
             self._channel.close()
             self._channel = None
@@ -253,7 +240,3 @@ class HandoffSource:
         """Store the last snapshot, because the node is destroyed."""
         if self._keeper is not None:
             self._keeper.close()
-
-
-def _nothing() -> None:
-    """Do nothing, because the failure has been reported."""

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, Final
 
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.node.handoff.snapshot_assembler import PartKey, part_key
-from rosrm.snapshots import Block
-from rosrm_msgs.msg import StatePart
+from rosrm.snapshots.format import Block
+from rosrm_msgs.msg import StateMark, StatePart
+
+#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to serialise 200 MB.
+LARGEST_PART: Final = 256 << 20
 
 
 class StateError(Exception):
@@ -19,24 +22,14 @@ class StateError(Exception):
 
 
 class StateTopic:
-    """One topic of a node's state.
-
-    Args:
-        topic: fully qualified.
-        message_type: of the topic.
-        save: returns the message, or None: unchanged since the last time.
-        restore: takes the message, and overwrites the node's state.
+    """One topic of a node's state; the arguments are those of `Migratable.keep_state`.
 
     Attributes:
         retained: the saved message is held after publishing too, because snapshots store it.
     """
 
     def __init__(
-        self,
-        topic: str,
-        message_type: Any,
-        save: Callable[[], Any],
-        restore: Callable[[Any], None],
+        self, topic: str, message_type: Any, save: Callable[[], Any], restore: Callable[[Any], None]
     ) -> None:
         self.topic = topic
         self.message_type = message_type
@@ -55,51 +48,51 @@ class StateTopic:
         """Return True if the topic has a subscriber."""
         return self.publisher is not None and self.publisher.get_subscription_count() > 0
 
-    def publish(self, largest: int) -> None:
+    def publish(self) -> None:
         """Publish the part, if it has changed.
-
-        Args:
-            largest: bytes of one message.
 
         Raises:
             StateError: the part cannot be saved, or is too large.
         """
-        self.refresh(largest)
+        self.refresh()
         if self._key != self._published:
             self.publisher.publish(self._data)
             self._published = self._key
         if not self.retained:
             self._data = None
 
-    def refresh(self, largest: int) -> None:
-        """Save the part, if it has changed; arguments and errors as those of `publish`."""
+    def refresh(self) -> None:
+        """Save the part, if it has changed; raises the errors of `publish`."""
         try:
-            data = self._saved(largest)
+            data = self._saved()
         except StateError as error:
             self._key = self._data = None  # a later "unchanged" would refer to a state never saved
             self._refused = self._refused or str(error)
             raise
         if data is not None:
             self._refused = ""
-        if data is not None:
             key = part_key(data)
             if key != self._key or self._data is None:
                 self._key, self._data = key, data
 
-    def _saved(self, largest: int) -> bytes | None:
+    def _saved(self) -> bytes | None:
         """Return the current state, serialised; None: unchanged since the last time."""
         try:
             message = self._save()
             self._check(message)
-            if message is None:
-                return None
-            return self._sized(bytes(serialize_message(message)), largest)
+            data = None if message is None else bytes(serialize_message(message))
         except StateError:
             raise
         except Exception as error:  # the author's code may raise anything
             raise StateError(
                 f"saving {self.topic} raised {type(error).__name__}: {error}"
             ) from error
+        if data is not None and len(data) > LARGEST_PART:
+            raise StateError(
+                f"the state on {self.topic} has {len(data)} bytes, more than the {LARGEST_PART} "
+                f"that may travel in one message: split it in several topics, or keep less"
+            )
+        return data
 
     def _check(self, message: Any) -> None:
         if message is None and self._key is None:
@@ -112,14 +105,6 @@ class StateTopic:
             raise StateError(
                 f"saving {self.topic} returned a {type(message).__name__}, not a {self.type_name}"
             )
-
-    def _sized(self, data: bytes, largest: int) -> bytes:
-        if len(data) > largest:
-            raise StateError(
-                f"the state on {self.topic} has {len(data)} bytes, more than the {largest} that "
-                f"may travel in one message: split it in several topics, or keep less"
-            )
-        return data
 
     def block(self) -> Block:
         """Return the part's block of a snapshot; the part must be refreshed and retained."""
@@ -152,6 +137,16 @@ class StateTopic:
         self._key, self._data, self._published = key, data, None
 
 
+def differing_part(parts: Iterable[StateTopic], mark: StateMark) -> tuple[str, str, str] | None:
+    """Return topic, own type and marked type of a part that differs; a missing one is "none"."""
+    ours = {part.topic: part.type_name for part in parts}
+    marked = {part.topic: part.type for part in mark.parts}
+    for topic in sorted(ours.keys() | marked.keys()):
+        if ours.get(topic) != marked.get(topic):
+            return topic, ours.get(topic, "none"), marked.get(topic, "none")
+    return None
+
+
 def type_name(message_type: Any) -> str:
     """Return the ROS name of a Python message class, such as `std_msgs/msg/Int64`."""
     package, kind = message_type.__module__.split(".")[:2]
@@ -159,12 +154,7 @@ def type_name(message_type: Any) -> str:
 
 
 class ParametersPart(StateTopic):
-    """The parameters of a node, with values set at run time.
-
-    Args:
-        topic: fully qualified.
-        node: rclpy's.
-    """
+    """The parameters of a node, with values set at run time."""
 
     def __init__(self, topic: str, node: Any) -> None:
         super().__init__(topic, ParameterEvent, self._all, self._take_over)

@@ -9,11 +9,12 @@ from typing import Final
 
 from rclpy.serialization import deserialize_message
 
-from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part
 from rosrm.node.identity import NodeIdentity
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
-from rosrm.snapshots import Listing, newest
+from rosrm.snapshots.format import Listing
+from rosrm.snapshots.reader import newest
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 
@@ -47,12 +48,9 @@ class SnapshotRestore:
     """
 
     def __init__(
-        self,
-        entities: NodeEntities,
-        parts: Sequence[StateTopic],
-        snapshot: Listing,
+        self, entities: NodeEntities, parts: Sequence[StateTopic], snapshot: Listing,
         done: Callable[[], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._entities = entities
         self._parts = parts
         self._snapshot = snapshot
@@ -73,7 +71,7 @@ class SnapshotRestore:
                 message = f"the snapshot {self._snapshot.path} cannot be restored: {fault}"
                 self._entities.node.get_logger().error(f"{message}. {_REMEDY}")
                 raise StateError(message) from fault
-            self._go_on(mark)
+            self._start(mark)
 
     def _is_incomplete(self) -> bool:
         """Return True if the author's constructor spins and has not named all parts yet."""
@@ -104,31 +102,26 @@ class SnapshotRestore:
                 f"it has {len(self._snapshot.blocks) - 1} parts, but its mark lists "
                 f"{len(mark.parts)}"
             )
-        theirs = {part.topic: part.type for part in mark.parts}
-        ours = {part.topic: part.type_name for part in self._parts}
-        for topic in sorted(ours.keys() | theirs.keys()):
-            if theirs.get(topic) != ours.get(topic):
-                return (
-                    f"its part on {topic} is {theirs.get(topic, 'none')}, and this program's "
-                    f"{ours.get(topic, 'none')}: it is of another version of the program"
-                )
-        return ""
+        differing = differing_part(self._parts, mark)
+        if differing is None:
+            return ""
+        topic, ours, theirs = differing
+        return (
+            f"its part on {topic} is {theirs}, and this program's {ours}: it is of another version "
+            f"of the program"
+        )
 
-    def _go_on(self, mark: StateMark) -> None:
+    def _start(self, mark: StateMark) -> None:
         entities = self._entities
         entities.sequence = int(mark.sequence)
-        for covered in mark.inputs:
-            entities.buffer.cover(
-                covered.topic, covered.covered, single=covered.publishers <= 1, now=time.monotonic()
-            )
-            entities.inherit(covered.topic, covered.covered)
-        due = [None if ns < 0 else ns / 1e9 for ns in mark.timers_due]
+        entities.cover(mark.inputs)
+        entities.inherit(mark.inputs)
         try:
-            entities.become_active(due, self._say)
+            entities.become_active(mark.timers_due, time.monotonic(), self._announce)
         finally:
             self._done()
 
-    def _say(self) -> None:
+    def _announce(self) -> None:
         head = self._snapshot.head
         self._entities.node.get_logger().info(
             f"continues from the snapshot of {head.process}#{head.instance}, cycle {head.sequence}"

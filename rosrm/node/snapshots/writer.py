@@ -19,18 +19,17 @@ from rclpy.serialization import serialize_message
 from rosrm.node.handoff.state_parts import StateError, StateTopic
 from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.steady_timer import steady_timer
-from rosrm.snapshots import LARGEST, Block, SlotWriter
+from rosrm.snapshots.format import LARGEST, Block
+from rosrm.snapshots.writer import SlotWriter
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import CoveredInput, StateMark
+from rosrm_msgs.msg import StateMark
 
-#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to serialise 200 MB.
-LARGEST_PART: Final = 256 << 20
 #: Share of a node's time for saving its state; `keep_every` may require a larger one.
 _SHARE: Final = 0.02
 #: Seconds for the last snapshot at the end, first for its lock, then for its writing.
-_LAST_WORDS: Final = 5.0
+_CLOSE_PATIENCE: Final = 5.0
 #: Seconds between two log lines about the same fault.
-_TOLD_EVERY: Final = 60.0
+_LOGGED_EVERY: Final = 60.0
 
 
 class SnapshotSaver:
@@ -93,7 +92,7 @@ class SnapshotSaver:
         except StateError as error:
             self._next = now + self._every
             self._entities.node.get_logger().error(
-                f"no snapshot was written: {error}", throttle_duration_sec=_TOLD_EVERY
+                f"no snapshot was written: {error}", throttle_duration_sec=_LOGGED_EVERY
             )
             return
         self._kept = self._entities.sequence
@@ -103,7 +102,7 @@ class SnapshotSaver:
 
     def _blocks(self) -> list[Block]:
         for part in self._parts:
-            part.refresh(LARGEST_PART)
+            part.refresh()
         mark = bytes(serialize_message(self._mark()))
         blocks = [Block(mark, zlib.crc32(mark)), *(part.block() for part in self._parts)]
         size = sum(len(block.data) for block in blocks)
@@ -117,13 +116,7 @@ class SnapshotSaver:
             protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence,
             last=False,
             parts=[part.described() for part in self._parts],
-            inputs=[
-                CoveredInput(
-                    topic=one.key, publishers=self._publishers_of(one),
-                    covered=array("q", one.covered),
-                )
-                for one in entities.inputs if one.buffered
-            ],
+            inputs=entities.covered_inputs(self._publishers_of),
             timers_due=array("q", self._timers_due()),
         )  # fmt: skip
 
@@ -148,7 +141,7 @@ class SnapshotSaver:
         self._closed = True
         atexit.unregister(self.close)
         # Another thread of the executor may be stuck in a callback: waiting for it has a limit.
-        if self._entities.turn.acquire(timeout=_LAST_WORDS):
+        if self._entities.turn.acquire(timeout=_CLOSE_PATIENCE):
             try:
                 if self._may_keep():
                     self._keep(time.monotonic())
@@ -175,7 +168,7 @@ class _Writer:
             self._waiting = sequence, blocks
             self._changed.notify()
         if self._thread is None:  # not sooner, because it would delay a successor's announcement
-            self._thread = threading.Thread(target=self._work, name="rosrm keeper", daemon=True)
+            self._thread = threading.Thread(target=self._work, name="rosrm snapshots", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
@@ -185,7 +178,7 @@ class _Writer:
         with self._changed:
             self._ending = True
             self._changed.notify()
-        self._thread.join(_LAST_WORDS)
+        self._thread.join(_CLOSE_PATIENCE)
 
     def _work(self) -> None:
         while True:

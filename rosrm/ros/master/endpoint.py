@@ -43,12 +43,9 @@ class MasterEndpoint:
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        identity: MasterIdentity,
-        queries: Queries,
+        self, participant: Participant, identity: MasterIdentity, queries: Queries,
         control: ControlSettings,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._identity = identity
         self._guard = participant.guard
         self.events: list[happened.Event] = []
@@ -65,13 +62,13 @@ class MasterEndpoint:
         self._subscriptions = SlaveSubscriptions(
             participant, self.links, self.events.append, refuse
         )
-        self._say(participant)
+        self._open_topics(participant)
         self.services = MasterServices(
             participant, self.links, identity, queries,
             control=control, handle=self.events.append, refuse=refuse,
         )  # fmt: skip
 
-    def _say(self, participant: Participant) -> None:
+    def _open_topics(self, participant: Participant) -> None:
         node, path = participant.node, names.Names(participant.settings.namespace)
         topic = path(names.MASTER_BEAT)
         node.create_subscription(
@@ -109,8 +106,7 @@ class MasterEndpoint:
         """Publish the master's beat, and its load at most once a second.
 
         Args:
-            uptime: seconds.
-            unheard: numbers of the hosts whose messages it does not receive.
+            unheard: numbers of the hosts whose messages the master does not receive.
             journal: sequence of the newest written record.
         """
         identity = self._identity
@@ -123,22 +119,22 @@ class MasterEndpoint:
         )  # fmt: skip
         if uptime - self._load_at >= _LOAD_EVERY:
             self._load_at = uptime
-            self._say_load(uptime)
+            self._publish_load(uptime)
 
-    def _say_load(self, uptime: float) -> None:
+    def _publish_load(self, uptime: float) -> None:
         """Publish statistics that show if the master keeps up with its slaves' messages."""
-        ledger = self.links.reading_stats
-        hosts, _ = ledger.ages(time.monotonic())
+        stats = self.links.reading_stats
+        hosts, _ = stats.ages(time.monotonic())
         oldest, self._oldest = self._oldest, []
         facts = {
-            "hosts": hosts, "cycles": ledger.cycles, "missed": ledger.missed,
+            "hosts": hosts, "cycles": stats.cycles, "missed": stats.missed,
             "cpu_s": time.process_time(), "oldest_reading_s": [round(age, 4) for age in oldest],
         }  # fmt: skip
         self._loads.publish(
             msg.Event(
                 wall_time=time.time(), elapsed=uptime, kind="load", data=json.dumps(facts),
-                message=f"{hosts} hosts are heard, {ledger.missed} of "
-                f"{ledger.cycles + ledger.missed} cycles were missed, the oldest reading is "
+                message=f"{hosts} hosts report, {stats.missed} of "
+                f"{stats.cycles + stats.missed} cycles were missed, the oldest reading is "
                 f"{max(oldest, default=0.0):.2f} s old",
             )
         )  # fmt: skip

@@ -19,21 +19,15 @@ class HandoffEndpoint:
     """Sends messages to the nodes of a handoff, and receives theirs until it is done.
 
     Args:
-        participant: of the master.
         cluster: the master's name.
-        epoch: of this run of it.
         take: called with each event.
         refuse: called with a refused peer and the reason.
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        cluster: str,
-        epoch: int,
-        take: Callable[[Event], None],
+        self, participant: Participant, cluster: str, epoch: int, take: Callable[[Event], None],
         refuse: Callable[[str, str], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant = participant
         self._names = names.Names(participant.settings.namespace)
         self._cluster = cluster

@@ -62,11 +62,7 @@ class ReadingStats:
             self._last_contact[host_id] = -np.inf
 
     def take(self, runs: Runs, now: float) -> npt.NDArray[np.int64]:
-        """Enter a batch; skip runs that are not registered.
-
-        Returns:
-            The ids of the hosts that sent readings.
-        """
+        """Enter a batch, skip unregistered runs, and return the ids of the hosts that reported."""
         known = (runs.host_id > 0) & (runs.host_id < len(self.beat))
         at = np.where(known, runs.host_id, 0)
         known &= self._incarnation[at] == runs.incarnation

@@ -44,15 +44,10 @@ class Queries(Protocol):
 
 
 class MasterServices:
-    """All services of the master.
+    """All services of the master; requests become events for `handle`.
 
     Args:
-        participant: offers the services.
-        links: to the slaves.
-        identity: of this master.
-        queries: answers read-only requests.
         control: greatest age of a request, and the beat period for slaves.
-        handle: receives the events.
         refuse: receives refused peers, and reasons.
     """
 

@@ -70,21 +70,15 @@ class HostLinks:
     """The links to all slaves that have registered.
 
     Args:
-        participant: sends the orders.
         sender: of the orders, for messages.
-        epoch: of this master.
         order_timeout: seconds beyond an order's own time for its answer.
         handle: receives the events.
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        sender: str,
-        epoch: int,
-        order_timeout: float,
+        self, participant: Participant, sender: str, epoch: int, order_timeout: float,
         handle: Callable[[happened.Event], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._participant = participant
         self._epoch = epoch
         self._order_timeout = order_timeout
@@ -141,17 +135,12 @@ class HostLinks:
                 order.send()
 
     def after_first_reading(
-        self,
-        link: HostLink,
-        send: Callable[[], None],
-        deadline: float = math.inf,
+        self, link: HostLink, send: Callable[[], None], deadline: float = math.inf,
         done: Callable[[None], None] = lambda _: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Call `send` now, or when the first beat of the slave has come.
 
-        Args:
-            deadline: monotonic seconds.
-            done: called with None when the deadline passes first.
+        If the deadline (monotonic seconds) passes first, `done` is called with None instead.
         """
         if self.reading_stats.beat[link.host_id]:
             send()
@@ -179,11 +168,7 @@ class HostLinks:
             self._with_work.add(link.host_id)
 
     def flush(self, journal: int) -> None:
-        """Answer the open requests of hosts that have assignments.
-
-        Args:
-            journal: sequence of the newest written record.
-        """
+        """Answer the open requests of hosts that have assignments, with the journal's watermark."""
         while self._with_work:
             link = self._links[self._with_work.pop()]
             if not link.outbox or link.poll is None:

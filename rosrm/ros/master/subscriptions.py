@@ -14,6 +14,7 @@ from rosrm.ros import convert, names, qos
 from rosrm.ros.control import version_refusal
 from rosrm.ros.master.slave_links import HostLinks
 from rosrm.ros.participant import Participant
+from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
 from rosrm_msgs import msg
 
@@ -23,11 +24,7 @@ _MOST_REFUSALS: Final = 1000
 
 
 class Refusals:
-    """Records refused peers, but not ten times a second.
-
-    Args:
-        handle: receives the events.
-    """
+    """Records refused peers, but not ten times a second."""
 
     def __init__(self, handle: Callable[[happened.Event], None]) -> None:
         self._handle = handle
@@ -45,30 +42,25 @@ class Refusals:
 
 
 class SlaveSubscriptions:
-    """The subscriptions to the messages of slaves.
+    """The subscriptions to the messages of slaves, as events for `handle`.
 
     Args:
-        participant: creates the subscriptions.
         links: receives the ids of hosts whose readings arrived.
-        handle: receives the events.
         refuse: receives refused peers, and reasons.
     """
 
     def __init__(
-        self,
-        participant: Participant,
-        links: HostLinks,
-        handle: Callable[[happened.Event], None],
+        self, participant: Participant, links: HostLinks, handle: Callable[[happened.Event], None],
         refuse: Callable[[str, str], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._links = links
         self._handle = handle
         self._refuse = refuse
         node, path = participant.node, names.Names(participant.settings.namespace)
         # Thousands of readings arrive: they are taken raw, in batches, without the executor.
         intake = participant.unwatched_node(f"{node.get_name()}_intake")
-        self._readings = intake.create_subscription(
-            msg.ResourceInfo, path(names.RESOURCE_INFO), _never_called, qos.READINGS, raw=True
+        self._readings = polled_subscription(
+            intake, msg.ResourceInfo, path(names.RESOURCE_INFO), qos.READINGS
         )
         for kind, topic, take in (
             (msg.ProcessStatusBatch, names.PROCESS_STATUS, self._take_statuses),
@@ -79,12 +71,7 @@ class SlaveSubscriptions:
 
     def poll_readings(self) -> happened.ReadingsReceived | None:
         """Take all received readings; None: there are none."""
-        handle, kind = self._readings.handle, self._readings.msg_type
-        taken = []
-        with handle:
-            take = handle.take_message
-            while (message := take(kind, True)) is not None:
-                taken.append(message[0])
+        taken = [message for message, _ in waiting(self._readings, qos.READINGS.depth)]
         if not taken:
             return None
         batch = decode(taken)
@@ -103,22 +90,16 @@ class SlaveSubscriptions:
             return
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
-            failing = {one: _failing(message, one) for one in ("probe", "migration", "launcher")}
         except Refused as refusal:
             self._refuse(who, str(refusal))
             return
+        failing = (_failing(message, one) for one in ("probe", "migration", "launcher"))
         self._handle(
             happened.StatusesReceived(
-                message.host_id,
-                message.incarnation,
-                message.sequence,
-                message.complete,
-                statuses,
-                failing["probe"],
-                failing["migration"],
-                failing["launcher"],
+                message.host_id, message.incarnation, message.sequence, message.complete, statuses,
+                *failing,
             )
-        )
+        )  # fmt: skip
 
     def _take_usage(self, message: msg.ProcessUsage) -> None:
         sizes = {len(message.numbers), len(message.cpu), len(message.memory)}
@@ -146,7 +127,3 @@ class SlaveSubscriptions:
 
 def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:
     return {row.name: row.reason for row in message.failing if row.kind == kind}
-
-
-def _never_called(_message: object) -> None:
-    raise AssertionError("readings are polled, never called back")

@@ -34,8 +34,8 @@ _PATIENCE: Final = 3.0
 #: Seconds after which a long poll is repeated, because it may have been lost. The first poll after
 #: a registration is repeated sooner, because it may have been sent before DDS discovery was
 #: complete; the interval then doubles.
-_POLL_ANEW: Final = 30.0
-_FIRST_POLL_ANEW: Final = 1.0
+_POLL_AGAIN: Final = 30.0
+_FIRST_POLL_AGAIN: Final = 1.0
 #: Seconds between a refused request for work and the next one.
 _ASK_AGAIN: Final = 0.2
 #: Seconds for which registration is retried while the name is taken: the former run of this slave
@@ -45,7 +45,7 @@ _NAME_TAKEN: Final = 5.0
 #: `liveness.suspect` has noticed its end.
 _NAME_TAKEN_BY_FORMER: Final = 60.0
 #: Seconds for the last statuses to reach the master.
-_LAST_WORDS: Final = 2.0
+_ACK_PATIENCE: Final = 2.0
 #: Missed beats after which a master counts as gone; and missed beats before another run without a
 #: newer epoch is accepted: of two masters at once the younger gives way.
 _MISSED_BEATS: Final = 10
@@ -66,11 +66,9 @@ class SlaveEndpoint:
     """The slave's publishers, subscriptions and requests to its master.
 
     Args:
-        participant: of this slave.
-        description: of this host.
         state: instances of the slave; read-only here.
         take: takes events for the core.
-        kept_states: returns all snapshots on this host.
+        snapshots: returns all snapshots on this host.
         seen: newest journal records of the masters that this host knows.
 
     Attributes:
@@ -86,11 +84,11 @@ class SlaveEndpoint:
     def __init__(
         self, participant: Participant, description: HostDescription, state: SlaveState, *,
         take: Callable[[events.Event], None],
-        kept_states: Callable[[], Sequence[SnapshotReport]] = tuple,
+        snapshots: Callable[[], Sequence[SnapshotReport]] = tuple,
         seen: JournalWatermark | None = None,
     ) -> None:  # fmt: skip
         self._participant = participant
-        self._state, self._take, self._kept_states = state, take, kept_states
+        self._state, self._take, self._snapshots = state, take, snapshots
         self._description = description
         self._seen = seen or JournalWatermark()
         self.link = MasterLink.SEARCHING
@@ -115,7 +113,7 @@ class SlaveEndpoint:
         self._leaves: Sequence[InstanceStatus] | None = None  # left running when the slave leaves
         self._poll: Call | None = None
         self._poll_at = 0.0
-        self._poll_anew = _FIRST_POLL_ANEW
+        self._poll_again = _FIRST_POLL_AGAIN
         self._status_sequence = 0
         self._control = ControlClient(participant, f"slave {description.name}")
         self._names = names.Names(participant.settings.namespace)
@@ -143,7 +141,9 @@ class SlaveEndpoint:
         self._usages = node.create_publisher(
             msg.ProcessUsage, path(names.PROCESS_USAGE), qos.STATUSES
         )
-        self._kept = node.create_publisher(msg.KeptStates, path(names.KEPT_STATES), qos.STATUSES)
+        self._snapshot_reports = node.create_publisher(
+            msg.KeptStates, path(names.KEPT_STATES), qos.STATUSES
+        )
         node.create_subscription(
             msg.MasterBeat, path(names.MASTER_BEAT),
             self._participant.counted(self._take_beat), qos.BEAT_IN,
@@ -151,7 +151,7 @@ class SlaveEndpoint:
 
     # --- finding the master --------------------------------------------------------------
 
-    def go_on(self, now: float) -> None:
+    def advance(self, now: float) -> None:
         """Take the next step towards a registration; called in every cycle."""
         self._control.expire(now)
         if self.link is MasterLink.SEARCHING and self._clients[srv.Handshake].service_is_ready():
@@ -199,7 +199,7 @@ class SlaveEndpoint:
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._state.statuses()],
-            kept=[convert.snapshot_to_msg(one) for one in self._kept_states()],
+            kept=[convert.snapshot_to_msg(one) for one in self._snapshots()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
         self._incarnation = beat.incarnation
@@ -231,7 +231,7 @@ class SlaveEndpoint:
         self._registered_with, self.epoch = self._incarnation, answer.epoch
         self._beat_period = response.beat_period
         self._beat_at = now
-        self._poll_anew = _FIRST_POLL_ANEW
+        self._poll_again = _FIRST_POLL_AGAIN
         self._reporter.begin(self.host_id, self._beat_period)
         self.link = MasterLink.REGISTERED
         self._take(events.ContactConfirmed(self._asked_at))
@@ -249,7 +249,7 @@ class SlaveEndpoint:
         self.link = MasterLink.SEARCHING
         if self._waits_since is None:
             self._waits_since = now
-            _log.info("the master takes no host in, asking on: %s", why)
+            _log.info("the master is not accepting hosts; retrying: %s", why)
 
     def _turned_down(self, answer: msg.Answer, now: float) -> None:
         """Retry for a while if the name is taken, as a former run of this slave may hold it."""
@@ -287,11 +287,11 @@ class SlaveEndpoint:
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
-        said_at = self._note_beat(beat.beat, now)
+        sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))
         if self.link is MasterLink.REGISTERED and self.host_id not in beat.unheard:
-            self._take(events.ContactConfirmed(said_at))
+            self._take(events.ContactConfirmed(sent_at))
         if self.link is MasterLink.LISTENING:
             self._register_if_known()
 
@@ -303,7 +303,7 @@ class SlaveEndpoint:
         """Store a beat; return the time of its sending by this host's clock."""
         self._master_beat, self._beat_at = beat, now
         self._reporter.note_master(beat)
-        return self._beat_clock.said_at(beat / 1e9, now)
+        return self._beat_clock.sent_at(beat / 1e9, now)
 
     # --- asking for work -----------------------------------------------------------------
 
@@ -316,8 +316,8 @@ class SlaveEndpoint:
         """
         if now < self._poll_at or self.link is not MasterLink.REGISTERED:
             return
-        self._poll_at = now + self._poll_anew
-        self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
+        self._poll_at = now + self._poll_again
+        self._poll_again = min(2.0 * self._poll_again, _POLL_AGAIN)
         if self._poll is not None:
             self._poll.deadline = now + _PATIENCE
         request = srv.RequestProcess.Request(
@@ -331,7 +331,7 @@ class SlaveEndpoint:
     def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
         if response is None:
             return  # the request was renewed, and the former one was lost
-        self._poll_at, self._poll_anew = 0.0, _POLL_ANEW
+        self._poll_at, self._poll_again = 0.0, _POLL_AGAIN
         answer = response.answer
         if not answer.accepted:
             self._poll_at = time.monotonic() + _ASK_AGAIN  # not in every round of the loop
@@ -342,7 +342,7 @@ class SlaveEndpoint:
         try:
             work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
         except Refused as refusal:
-            _log.info("an assignment that makes no sense was refused: %s", refusal)
+            _log.info("an invalid assignment was refused: %s", refusal)
             return
         given_at = response.slave_beat / 1e9 if response.slave_beat else None
         self._take(events.AssignmentsReceived(work, given_at))
@@ -387,7 +387,7 @@ class SlaveEndpoint:
         readings must already include that load.
         """
         if self.link is MasterLink.REGISTERED:
-            self._reporter.tell()
+            self._reporter.publish()
             self._usages.publish(
                 msg.ProcessUsage(
                     protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
@@ -396,11 +396,11 @@ class SlaveEndpoint:
                 )
             )  # fmt: skip
 
-    def publish_kept(self, states: Sequence[SnapshotReport]) -> bool:
+    def publish_snapshots(self, states: Sequence[SnapshotReport]) -> bool:
         """Publish all snapshots that this host holds; False: it is not registered."""
         if self.link is not MasterLink.REGISTERED:
             return False
-        self._kept.publish(
+        self._snapshot_reports.publish(
             msg.KeptStates(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                 incarnation=self._description.incarnation,
@@ -409,20 +409,22 @@ class SlaveEndpoint:
         )  # fmt: skip
         return True
 
-    def wait_until_heard(self) -> None:
+    def wait_until_received(self) -> None:
         """Wait until the last statuses are acknowledged: others are lost when this slave leaves."""
         if self.link is not MasterLink.REGISTERED:
             return
-        if not self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS)):
-            _log.info("the master did not acknowledge the last statuses within %g s", _LAST_WORDS)
+        if not self._statuses.wait_for_all_acked(Duration(seconds=_ACK_PATIENCE)):
+            _log.info(
+                "the master did not acknowledge the last statuses within %g s",
+                _ACK_PATIENCE,
+            )
 
     def leave(self, done: Callable[[], None], kept: Sequence[InstanceStatus] = ()) -> None:
-        """Report that this slave stops; `done` is called when the master knows, or is silent.
+        """Report that this slave stops; `done` is called once, when the master knows or is silent.
 
         A master that this slave finds after that is informed as well.
 
         Args:
-            done: called once.
             kept: all instances, if the slave leaves them running; (): it stops them.
         """
         self._leaves = kept

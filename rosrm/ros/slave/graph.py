@@ -36,12 +36,9 @@ class GraphWatch:
         return frozenset(gid for owner, gid in self._all() if owner == name)
 
     def sees(self, name: str, pids: Iterable[int], before: frozenset[bytes]) -> bool:
-        """Return True if the instance that runs as one of `pids` has a node of this name.
+        """Return True if the instance that runs as one of `pids` has a node of this full name.
 
-        Args:
-            name: fully qualified.
-            pids: of the instance.
-            before: endpoints of that name when the instance was started.
+        `before` are the endpoints of that name when the instance was started.
         """
         own = {pid & 0xFFFF for pid in pids}
         return any(self._belongs(gid, own, before) for gid in self.endpoints(name))

@@ -15,15 +15,11 @@ from importlib import import_module
 from typing import Any, Final
 
 from rclpy.node import Node
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_profile_services_default,
-)
+from rclpy.qos import qos_profile_services_default
 
 from rosrm.core.slave.watches import NO_ANSWER, Watch
+from rosrm.ros import qos
+from rosrm.ros.polling import message_type, polled_subscription, waiting
 from rosrm.ros.slave.graph import GraphWatch
 
 #: Seconds between two checks of the graph while a topic is subscribed.
@@ -39,26 +35,14 @@ _MOST_KEPT: Final = 1000
 
 
 class HealthMonitor:
-    """Checks the health of one run of one instance.
-
-    Args:
-        node: outside every executor.
-        graph: finds the process of a publisher.
-        watch: the required health.
-        now: monotonic seconds.
-    """
+    """Checks the health of one run of one instance; the node is outside every executor."""
 
     def __init__(self, node: Node, graph: GraphWatch, watch: Watch, now: float) -> None:
         self._topic = _TopicMonitor(node, graph, watch) if watch.topics else None
         self._state = _StateMonitor(node, watch, now) if watch.services else None
 
     def topic(self, pids: Iterable[int], now: float) -> tuple[int | None, str]:
-        """Return the messages since the last check, or None and why the topic cannot be checked.
-
-        Args:
-            pids: of the instance.
-            now: monotonic seconds.
-        """
+        """Return the messages since the last check, or None and why the topic cannot be checked."""
         return (None, "") if self._topic is None else self._topic.look(pids, now)
 
     def state(self, now: float) -> str | None:
@@ -77,13 +61,9 @@ class _TopicMonitor:
         self._node, self._graph = node, graph
         self._names = watch.topics
         kept = math.ceil(_KEPT * watch.checks.rate) + 1
-        self._qos = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST, depth=min(kept, _MOST_KEPT),
-            reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE,
-        )  # fmt: skip
+        self._depth = min(kept, _MOST_KEPT)
         self._subscription: Any = None
         self._source = ("", "")  # subscribed topic and its type
-        self._kind: Any = None
         self._last = 0
         self._looked_at_graph = -math.inf
         self._trouble = ""
@@ -117,9 +97,8 @@ class _TopicMonitor:
         if (name, type_name) == self._source:
             return
         self.close()
-        self._kind = _message_type(type_name)
-        self._subscription = self._node.create_subscription(
-            self._kind, name, _never_called, self._qos, raw=True
+        self._subscription = polled_subscription(
+            self._node, message_type(type_name), name, qos.best_effort(depth=self._depth)
         )
         self._source = (name, type_name)
 
@@ -135,14 +114,10 @@ class _TopicMonitor:
     def _take(self) -> int:
         """Return the messages since the last check, with lost ones as far as numbers show them."""
         alone = self._subscription.get_publisher_count() == 1
-        count, handle = 0, self._subscription.handle
-        with handle:
-            for _ in range(self._qos.depth):
-                taken = handle.take_message(self._kind, True)
-                if taken is None:
-                    break
-                count += self._since_last(int(taken[1]["publication_sequence_number"]), alone)
-        return count
+        return sum(
+            self._since_last(int(info["publication_sequence_number"]), alone)
+            for _, info in waiting(self._subscription, self._depth)
+        )
 
     def _since_last(self, number: int, alone: bool) -> int:
         """Return 1 and the gap in the publisher's numbers; those of several have no order."""
@@ -197,12 +172,3 @@ class _StateMonitor:
         for client in self._clients:
             self._node.destroy_client(client)
         self._clients.clear()
-
-
-def _message_type(name: str) -> Any:
-    package, _, kind = name.partition("/msg/")
-    return getattr(import_module(f"{package}.msg"), kind)
-
-
-def _never_called(_message: object) -> None:
-    raise AssertionError("the topic is polled, never called back")

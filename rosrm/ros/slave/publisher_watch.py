@@ -9,19 +9,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any, Final
 
 import rclpy
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from rosrm.ros import qos
+from rosrm.ros.polling import message_type, polled_subscription, waiting
+
 #: The weakest requirements: they match every publisher.
-_ANY: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE,
-)  # fmt: skip
+_ANY: Final = qos.best_effort(depth=1000)
 #: The graph's name of a node of which only the endpoints are known.
 _UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"
 #: Seconds between two polls.
@@ -37,13 +35,12 @@ def await_second_publisher(
         topic: absolute name.
         type_name: as "std_msgs/msg/Int64".
         source, destination: names of their nodes, without namespace.
-        timeout: seconds.
 
     Returns:
         The number of messages received, and the seconds that passed.
 
     Raises:
-        TimeoutError: the message says what was received instead.
+        TimeoutError: the message describes the messages received instead.
         ValueError: another node publishes there too, or there is no such type.
     """
     begun = time.monotonic()
@@ -72,21 +69,17 @@ def _listen(
     node: Node, topic: str, kind: Any, names: frozenset[str], deadline: float
 ) -> tuple[int, bool]:
     """Return the number of messages received, and True if they came from both publishers."""
-    subscription = node.create_subscription(kind, topic, _never_called, _ANY, raw=True)
+    subscription = polled_subscription(node, kind, topic, _ANY)
     received, last, two = 0, 0, False
-    handle = subscription.handle
     while time.monotonic() < deadline:
-        with handle:
-            taken = handle.take_message(kind, True)
-        if taken is None:
-            time.sleep(_EVERY)
-            continue
-        received += 1
-        count = int(taken[1]["publication_sequence_number"])
-        two = two or count <= last
-        last = count
+        for _, info in waiting(subscription):
+            received += 1
+            count = int(info["publication_sequence_number"])
+            two = two or count <= last
+            last = count
         if two and _are_alone(node, topic, names):
             return received, True
+        time.sleep(_EVERY)
     return received, False
 
 
@@ -96,8 +89,8 @@ def _are_alone(node: Node, topic: str, names: frozenset[str]) -> bool:
     others = sorted(found - names - {_UNKNOWN})
     if others:
         raise ValueError(
-            f"{topic} is also published by {', '.join(others)}, so that nobody can tell whether "
-            f"the destination speaks: with `protocol: paper` only the node itself may publish its "
+            f"{topic} is also published by {', '.join(others)}, so messages of the destination "
+            f"cannot be told apart: with `protocol: paper` only the node itself may publish its "
             f"state"
         )
     return found == names
@@ -105,22 +98,17 @@ def _are_alone(node: Node, topic: str, names: frozenset[str]) -> bool:
 
 def _missing(node: Node, topic: str, type_name: str, received: int) -> str:
     if received:
-        return f"only one publisher of {topic} was heard ({received} messages)"
+        return f"only one publisher of {topic} sent messages ({received} received)"
     types = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
     if not types:
-        return f"nobody publishes {topic}"
+        return f"no node publishes {topic}"
     if type_name not in types:
         return f"{topic} is published as {', '.join(sorted(types))}, not {type_name}"
-    return f"{topic} is published, and nothing was heard on it"
+    return f"{topic} is published, but no message on it was received"
 
 
 def _type_of(name: str) -> Any:
-    package, _, kind = name.partition("/msg/")
     try:
-        return getattr(import_module(f"{package}.msg"), kind)
+        return message_type(name)
     except (AttributeError, ImportError, ValueError) as error:
         raise ValueError(f"there is no message type {name!r} on this host: {error}") from error
-
-
-def _never_called(_message: object) -> None:
-    raise AssertionError("the topic is polled, never called back")

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, NamedTuple, Protocol
 from rosrm.ros import names, qos
 from rosrm.ros.control import ControlClient, accepted, refused, version_refusal
 from rosrm.ros.participant import OpenRequest, Participant
-from rosrm.snapshots import TransferPart
+from rosrm.snapshots.format import TransferPart
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import srv
 
@@ -53,12 +53,7 @@ class _Peer:
 
 
 class ReplicationEndpoint:
-    """The replication services of one slave, and its clients.
-
-    Args:
-        participant: creates services and clients.
-        name: of the host.
-    """
+    """The replication services of the slave of one host, and its clients."""
 
     def __init__(self, participant: Participant, name: str) -> None:
         self._participant = participant
@@ -105,7 +100,7 @@ class ReplicationEndpoint:
 
     # --- requests to other slaves --------------------------------------------------------
 
-    def finds_keeper(self, host: str, now: float) -> bool:
+    def finds_receiver(self, host: str, now: float) -> bool:
         """Return True if a host's slave is discovered and can receive a replica."""
         return bool(self._peer(srv.KeepState, names.KEEP_STATE, host, now).service_is_ready())
 

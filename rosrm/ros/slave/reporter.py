@@ -30,7 +30,6 @@ class Reporter:
 
     Args:
         send: publishes a serialised `ResourceInfo`.
-        incarnation: of this run of the slave.
         period: seconds from one cycle to the next.
     """
 
@@ -48,12 +47,7 @@ class Reporter:
         self._published_over = np.zeros(0, np.bool_)
 
     def begin(self, host_id: int, beat_period: float) -> None:
-        """Start reporting to a master that accepted this host; the next reading is always sent.
-
-        Args:
-            host_id: the number under which this host reports.
-            beat_period: seconds, of that master.
-        """
+        """Start reporting to a master that accepted this host; the next reading is always sent."""
         self._row["host_id"] = host_id
         # The summand rounds up, because three periods of 0.1 s are slightly less than 0.3 s.
         self._every = min(max(1, int(beat_period / self._period + 1e-6)), MOST_QUIET + 1)
@@ -66,19 +60,14 @@ class Reporter:
     def cycle(
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], facts: _Facts
     ) -> None:
-        """Enter one cycle of the slave; send its reading if that brings news or is due.
-
-        Args:
-            usage, limit: (slots,) fractions.
-            facts: accepting, processes, present, stale, newest status sequence.
-        """
+        """Enter one cycle of the slave; send its reading if that brings news or is due."""
         row = self._row
         row["sequence"] += 1
         row["usage"], row["limit"] = usage, limit
         self._facts = facts
         self._unpublished += 1
         if self._unpublished >= self._every or self._has_news(usage, limit):
-            self.tell()
+            self.publish()
 
     def _has_news(self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32]) -> bool:
         """Return True if a decision may differ between this reading and the last published one."""
@@ -90,7 +79,7 @@ class Reporter:
             or (limit != self._published_limit).any()
         )
 
-    def tell(self) -> None:
+    def publish(self) -> None:
         """Send the newest reading, unless it has been sent."""
         if not self._unpublished:
             return

@@ -20,25 +20,17 @@ from rosrm.supervisor.client_values import LaunchOrder
 
 
 def launch_order(
-    assignment: Assignment,
-    base_environment: Mapping[str, str],
-    python: str,
-    *,
-    where: ProcessLocation,
-    state_directory: Path,
-    launchers: Launchers,
-    heard: float = 0.0,
-) -> LaunchOrder:
+    assignment: Assignment, base_environment: Mapping[str, str], python: str, *,
+    where: ProcessLocation, state_directory: Path, launchers: Launchers, last_contact: float = 0.0,
+) -> LaunchOrder:  # fmt: skip
     """Return the supervisor's order for an assignment, and write its parameters to a file.
 
     Args:
-        assignment: to start.
         base_environment: environment of the slave, with its ROS settings.
         python: the interpreter for modules.
         where: host and cluster of the instance.
         state_directory: of this host's supervisor; the parameters are beside the instance's log.
-        launchers: of this host.
-        heard: monotonic time of the master's last contact with this host, seconds; 0.0: now.
+        last_contact: of the master with this host, monotonic seconds; 0.0: now.
 
     Raises:
         LaunchError: the program was not found, with the searched places; or another error of the
@@ -47,7 +39,7 @@ def launch_order(
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
     command = _command(spec, environment, python)
-    if spec.ros_node:
+    if spec.ros:
         parameters_file = _write_parameters(assignment, state_directory)
         ros = ros_arguments(spec, assignment.node_name, parameters_file)
         arguments = join_arguments(spec.arguments, ros)
@@ -65,7 +57,7 @@ def launch_order(
         restart=RestartPolicy("never") if assignment.on_trial else spec.restart,
         stop=spec.stop,
         fence=assignment.fence,
-        heard=heard,
+        last_contact=last_contact,
     )
 
 

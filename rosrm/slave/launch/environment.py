@@ -21,17 +21,9 @@ KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
 #: Variables that identify a process. A slave that was itself started by rosrm passes none of them
 #: on.
 _IDENTITY: Final = (
-    "ROSRM_PROCESS",
-    "ROSRM_INSTANCE",
-    "ROSRM_HOST",
-    "ROSRM_NODE",
-    "ROSRM_STATE_CONFIG",
-    "ROSRM_MASTER",
-    "ROSRM_EPOCH",
-    SHADOW,
-    KEEP,
-    KEEP_EVERY,
-)
+    "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
+    "ROSRM_MASTER", "ROSRM_EPOCH", SHADOW, KEEP, KEEP_EVERY,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +51,13 @@ def snapshot_directory(kept: Path, process: str) -> Path:
 
 
 def process_environment(
-    assignment: Assignment,
-    base: Mapping[str, str],
-    where: ProcessLocation,
+    assignment: Assignment, base: Mapping[str, str], where: ProcessLocation,
     not_inherited: Sequence[str] = (),
-) -> dict[str, str]:
+) -> dict[str, str]:  # fmt: skip
     """Return all variables of an instance; those of its spec take precedence.
 
     Args:
-        assignment: of the instance.
         base: environment of the slave, with its ROS settings (ROS_DOMAIN_ID, ...).
-        where: host and cluster of the instance.
         not_inherited: variables that launchers set, so those of the slave do not count.
     """
     spec = assignment.spec
@@ -82,7 +70,7 @@ def process_environment(
     environment["ROSRM_STATE_CONFIG"] = where.state_config
     environment["ROSRM_MASTER"] = where.cluster
     environment["ROSRM_EPOCH"] = str(assignment.epoch)
-    if spec.ros_node:  # the name without the alias
+    if spec.ros:  # the name without the alias
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:
         environment[SHADOW] = "1"

@@ -34,15 +34,8 @@ class Starter:
     """Conversion of assignments into orders for the supervisor, after their snapshots arrived.
 
     Attributes:
-        config: of the host.
         kept: directory of the snapshots.
         state: instances of the slave; read-only here.
-        supervisor: executes the orders.
-        endpoint: reports to the master.
-        replication: fetches snapshots.
-        graph: shows the nodes of the ROS graph.
-        sessions: process tree of each instance.
-        launchers: of this host.
         take: takes events for the core.
     """
 
@@ -83,10 +76,8 @@ class Starter:
         """Apply a command to an instance that still waits for its snapshot.
 
         Stop and fence cancel the start; a restart has no effect, because the start follows anyway.
-
-        Returns:
-            False if the command is another one, or the instance does not wait; then the supervisor
-            has to execute the command.
+        Returns False if the supervisor has to execute the command: it is another one, or the
+        instance does not wait.
         """
         if not isinstance(command, commands.Stop | commands.Fence | commands.Restart):
             return False
@@ -136,7 +127,7 @@ class Starter:
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
                     state_directory=self.supervisor.state, launchers=self.launchers,
-                    heard=self.state.last_contact,
+                    last_contact=self.state.last_contact,
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:

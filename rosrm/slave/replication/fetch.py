@@ -9,7 +9,7 @@ from typing import Final
 
 from rosrm.model.values import Assignment
 from rosrm.ros.slave.replication import NotStored, ReplicationEndpoint
-from rosrm.snapshots import Head, TransferPart
+from rosrm.snapshots.format import Head, TransferPart
 
 #: Seconds for the discovery of a slave, or its answer; then the next host is asked.
 PATIENCE: Final = 3.0
@@ -46,7 +46,7 @@ class Fetch:
         now = time.monotonic()
         self._deadline, self._host_by = now + LONGEST, now + PATIENCE
 
-    def go_on(self, now: float) -> None:
+    def advance(self, now: float) -> None:
         """Ask for the next part, or try the next host if this one does not answer."""
         if self._has_ended:
             return
@@ -89,7 +89,7 @@ class Fetch:
         else:
             self._wanted = part._replace(offset=part.offset + len(part.data), data=b"")
             self._waits = False
-            self.go_on(now)
+            self.advance(now)
 
     def _next_host(self, why: str, now: float, *, last: bool = False) -> None:
         self._failures.append(f"{self._hosts.pop(0)}: {why}" if self._hosts else why)
@@ -99,7 +99,7 @@ class Fetch:
         if last or not self._hosts:
             self._end("")
         else:
-            self.go_on(now)
+            self.advance(now)
 
     def _end(self, good: str) -> None:
         self._has_ended = True

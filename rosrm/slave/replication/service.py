@@ -16,13 +16,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import SnapshotStore
-from rosrm.snapshots import Head, TransferPart
+from rosrm.snapshots.format import Head, TransferPart
+from rosrm.snapshots.reader import newest_head, snapshot_files
+from rosrm.snapshots.writer import drop_snapshots
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -36,7 +37,7 @@ _PART_TIMEOUT: Final = 1.0
 #: Seconds after which a transfer to a host that refused a snapshot is retried.
 _AGAIN: Final = 3.0
 #: Codes of failures of the network alone.
-_LOST_WORDS: Final = frozenset({"timeout", "order"})
+_TRANSIENT: Final = frozenset({"timeout", "order"})
 
 
 #: Answer for a part that could not be written because of an unexpected error.
@@ -84,9 +85,6 @@ class ReplicationService:
 
     Args:
         root: directory of all snapshots.
-        host: name of this host.
-        settings: limits.
-        endpoint: exchanges messages with other slaves.
         post: schedules a call in the loop; may be called from any thread.
         publish: reports the snapshots to the master; returns False if there is no master.
     """
@@ -112,7 +110,7 @@ class ReplicationService:
         self._next_scan = 0.0
         self._budget = float(settings.max_rate)
         self._budget_at = time.monotonic()
-        threading.Thread(target=self._work, name="kept states", daemon=True).start()
+        threading.Thread(target=self._work, name="snapshots", daemon=True).start()
         endpoint.serve(self)
 
     # --- the thread ----------------------------------------------------------------------
@@ -124,12 +122,9 @@ class ReplicationService:
     def _in_thread(
         self, work: Callable[[], Any], then: Callable[[Any], None], otherwise: Any = None
     ) -> None:
-        """Run a call in the thread.
+        """Run `work` in the thread, then `then` in the loop with its result.
 
-        Args:
-            work: called in the thread.
-            then: called in the loop with the result.
-            otherwise: result if `work` raised; the exception is logged.
+        If `work` raises, the exception is logged, and the result is `otherwise`.
         """
 
         def job() -> None:
@@ -186,10 +181,10 @@ class ReplicationService:
         for shipment in list(self._shipments.values()):
             self._begin_due(shipment, now)
         for transfer in list(self._transfers.values()):
-            self._go_on(transfer, now)
+            self._send_part(transfer, now)
         for fetch in list(self._preparing.values()):
             if fetch is not None:
-                fetch.go_on(now)
+                fetch.advance(now)
 
     def states(self) -> tuple[SnapshotReport, ...]:
         """Return the snapshots on this host, as of the last scan."""
@@ -217,7 +212,7 @@ class ReplicationService:
             return
         # The host that waits longest comes first, so a host without an answer delays no other.
         for host in sorted(shipment.hosts, key=lambda name: shipment.due.get(name, 0.0)):
-            if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_keeper(host, now):
+            if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_receiver(host, now):
                 shipment.due[host] = now + shipment.every
                 transfer = self._transfers[process] = _Transfer(shipment, host)
                 sent = shipment.sent.get(host, (0, 0))
@@ -236,9 +231,9 @@ class ReplicationService:
             return
         transfer.head, transfer.content, transfer.digest = found
         transfer.waits = False
-        self._go_on(transfer, time.monotonic())
+        self._send_part(transfer, time.monotonic())
 
-    def _go_on(self, transfer: _Transfer, now: float) -> None:
+    def _send_part(self, transfer: _Transfer, now: float) -> None:
         """Send the next part, as soon as the limit of the sending rate allows it."""
         head = transfer.head
         if transfer.waits or head is None or self._budget <= 0.0:
@@ -267,7 +262,7 @@ class ReplicationService:
             shipment.refusals.pop(host, None)
             self._end(transfer)
         else:
-            self._go_on(transfer, now)
+            self._send_part(transfer, now)
 
     def _not_taken(
         self, shipment: _Shipment, host: str, head: Head, now: float, refusal: NotStored
@@ -276,7 +271,7 @@ class ReplicationService:
         if refusal.code == "newer":  # the acknowledgement of the last part may be lost
             shipment.sent[host] = head.age
             return
-        if refusal.code in _LOST_WORDS:
+        if refusal.code in _TRANSIENT:
             shipment.due[host] = now
         else:
             shipment.due[host] = now + max(_AGAIN, shipment.every)
@@ -313,11 +308,9 @@ class ReplicationService:
     # --- for a start ---------------------------------------------------------------------
 
     def prepare(self, assignment: Assignment, done: Callable[[Assignment], None]) -> bool:
-        """Fetch the newest snapshot before an instance starts.
+        """Fetch the newest snapshot before an instance starts; return True if it may start now.
 
-        Returns:
-            True if the instance may start now. Otherwise `done` is called when the snapshot has
-            arrived, or does not arrive in time.
+        Otherwise `done` is called when the snapshot has arrived, or does not arrive in time.
         """
         if not assignment.has_snapshots:
             return True
@@ -333,10 +326,10 @@ class ReplicationService:
         self._store.make()  # the node creates its own directory below
         directory = self._store.directory(assignment.spec.name)
         if not assignment.shadow and any(
-            head.instance < assignment.kept_from for _, head in snapshots.files(directory)
+            head.instance < assignment.kept_from for _, head in snapshot_files(directory)
         ):
-            snapshots.drop(directory, assignment.kept_from - 1)
-        return snapshots.newest_head(directory)
+            drop_snapshots(directory, assignment.kept_from - 1)
+        return newest_head(directory)
 
     def _looked(
         self, assignment: Assignment, here: Head | None, done: Callable[[Assignment], None]
@@ -359,7 +352,7 @@ class ReplicationService:
             assignment, tuple(name for name in hosts if name != self._host), self._endpoint,
             here=here, take=self._take_fetched, ended=ended,
         )  # fmt: skip
-        fetch.go_on(time.monotonic())
+        fetch.advance(time.monotonic())
 
     def _take_fetched(self, part: TransferPart, then: Callable[[NotStored | None], None]) -> None:
         self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)

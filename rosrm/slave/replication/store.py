@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm import snapshots
 from rosrm.model.values import InstanceId, SnapshotReport
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
-from rosrm.snapshots import TransferPart
+from rosrm.snapshots.format import LARGEST, Damaged, Head, TransferPart
+from rosrm.snapshots.reader import COPY, newest_content, newest_head
+from rosrm.snapshots.writer import CopyWriter, drop_snapshots
 
 #: Seconds for which a snapshot stays in memory between reads of its parts.
 _READ_FOR: Final = 10.0
@@ -22,13 +23,13 @@ _READ_FOR: Final = 10.0
 class _Incoming:
     age: tuple[int, int]
     total: int
-    writer: snapshots.CopyWriter
+    writer: CopyWriter
     digest: int = 0
 
 
 @dataclass(slots=True)
 class _BeingRead:
-    head: snapshots.Head
+    head: Head
     content: bytes
     digest: int
     until: float
@@ -70,39 +71,32 @@ class SnapshotStore:
             directories = sorted(path for path in self._root.iterdir() if path.is_dir())
         except OSError:
             return ()
-        heads = [head for one in directories if (head := snapshots.newest_head(one)) is not None]
+        heads = [head for one in directories if (head := newest_head(one)) is not None]
         return tuple(
             SnapshotReport(InstanceId(head.process, head.instance), head.sequence, head.size)
             for head in heads
         )
 
-    def newer_than(
-        self, process: str, age: tuple[int, int]
-    ) -> tuple[snapshots.Head, bytes, int] | None:
+    def newer_than(self, process: str, age: tuple[int, int]) -> tuple[Head, bytes, int] | None:
         """Return the newest complete snapshot with its CRC-32; None if none is newer than `age`."""
-        head = snapshots.newest_head(self.directory(process))
+        head = newest_head(self.directory(process))
         if head is None or head.age <= age:
             return None
-        found = snapshots.newest_content(self.directory(process))
+        found = newest_content(self.directory(process))
         if found is None or found[0].age <= age:
             return None
         return (*found, zlib.crc32(found[1]))
 
     def drop(self, process: str, up_to: int) -> None:
         """Delete the snapshots of instances up to a number."""
-        snapshots.drop(self.directory(process), up_to)
+        drop_snapshots(self.directory(process), up_to)
 
     # --- incoming snapshots --------------------------------------------------------------
 
     def take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
-        """Write a part of a snapshot; the last part completes the replica.
+        """Write a part of a snapshot; return why it was refused, or None. The last completes it.
 
-        Args:
-            part: of the snapshot.
-            bounded: True for a process of another host, whose replicas are limited by `max_bytes`.
-
-        Returns:
-            The reason of a refusal; None: the part was written.
+        With `bounded` it is of another host's process, and `max_bytes` limits all such replicas.
         """
         if part.offset == 0:
             refusal = self._begin(part, bounded=bounded)
@@ -119,29 +113,27 @@ class SnapshotStore:
         except OSError as error:
             self._abandon(part.process)
             return NotStored("full", f"it cannot be written: {error.strerror}")
-        except snapshots.Damaged as fault:
+        except Damaged as fault:
             return NotStored("damaged", str(fault))
         return None
 
     def _begin(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
         self._abandon(part.process)
         directory = self.directory(part.process)
-        newest = snapshots.newest_head(directory)
+        newest = newest_head(directory)
         if newest is not None and newest.age >= part.age:
             return NotStored(
                 "newer", f"{newest.process}#{newest.instance}, cycle {newest.sequence} is here"
             )
-        if part.total > snapshots.LARGEST:
-            return NotStored(
-                "full", f"it has {part.total} bytes; at most {snapshots.LARGEST} are kept"
-            )
+        if part.total > LARGEST:
+            return NotStored("full", f"it has {part.total} bytes; at most {LARGEST} are kept")
         if bounded and not self._has_room(part):
             return NotStored(
                 "full", f"with it there were more than {self._max_bytes} bytes (keep.max_bytes)"
             )
         self.make()
         try:
-            writer = snapshots.CopyWriter(directory)
+            writer = CopyWriter(directory)
         except OSError as error:
             return NotStored("full", f"it cannot be written: {error.strerror}")
         self._incoming[part.process] = _Incoming(part.age, part.total, writer)
@@ -155,18 +147,18 @@ class SnapshotStore:
             for directory in self._root.iterdir():
                 if directory != own:
                     with contextlib.suppress(OSError):
-                        used += (directory / snapshots.COPY).stat().st_size
+                        used += (directory / COPY).stat().st_size
         return used + part.total <= self._max_bytes
 
     def _finish(self, part: TransferPart, coming: _Incoming) -> None:
         del self._incoming[part.process]
         if coming.digest != part.digest:
             coming.writer.abandon()
-            raise snapshots.Damaged("what came does not match its checksum")
+            raise Damaged("what came does not match its checksum")
         head = coming.writer.finish()
         if head.process != part.process:
-            snapshots.drop(self.directory(part.process), head.instance)
-            raise snapshots.Damaged(f"it is a state of {head.process!r}")
+            drop_snapshots(self.directory(part.process), head.instance)
+            raise Damaged(f"it is a state of {head.process!r}")
 
     def _abandon(self, process: str) -> None:
         coming = self._incoming.pop(process, None)
@@ -180,12 +172,7 @@ class SnapshotStore:
     ) -> TransferPart | None:
         """Return a part of a snapshot; None: this host does not hold the snapshot (any more).
 
-        Args:
-            process: name of the process.
-            age: of the requested snapshot; (0, 0): the newest.
-            offset: of the part, bytes.
-            size: of the part, bytes.
-            now: monotonic seconds.
+        The age (0, 0) requests the newest snapshot.
         """
         for name in [name for name, one in self._being_read.items() if now >= one.until]:
             del self._being_read[name]

@@ -14,7 +14,7 @@ import pytest
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
-from rosrm_criu.engine.paths import checkpoint, checkpoint_numbers, checkpoint_ports, incoming
+from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
 from rosrm_criu.executors import artifacts, request
 from rosrm_criu.executors import checkpoint as steps
 from tests.criu_kit import TIMEOUT, eventually
@@ -114,14 +114,14 @@ def checkpointed(slave: Slave, counter: Any) -> list[int]:
 
 
 def nothing_left(slave: Slave) -> None:
-    assert checkpoint_numbers(slave.state) == []
+    assert numbers(slave.state, "kept") == []
     assert not list((slave.state / "images").glob("kept-*"))
 
 
-def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
+def test_a_process_continues_from_its_image_with_its_port(slave, counter):
     """A restored process loses and repeats no number, and its port stays reserved until then."""
     before, port = checkpointed(slave, counter), port_of(counter)
-    assert checkpoint_numbers(slave.state) == [1]
+    assert numbers(slave.state, "kept") == [1]
     assert not is_free(port)
     slave.ask("take", destination=3)
     restored = slave.shim(3)
@@ -133,7 +133,7 @@ def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
     eventually(lambda: is_free(port), "the port free")  # the restored process ends with its shim
 
 
-def test_it_can_be_checkpointed_again(slave, counter):
+def test_a_restored_process_can_be_checkpointed_again(slave, counter):
     """A restored process can be checkpointed as the instance of its shim."""
     before = checkpointed(slave, counter)
     slave.ask("take", destination=3)
@@ -157,9 +157,11 @@ def test_a_checkpoint_that_is_undone_lets_it_run_on(slave, counter):
     slave.ask("keep")
     assert slave.ask("keep") == slave.results["criu_keep"]
     assert process_tree.is_stopped(counter.pid)
+    printed = counter.numbers()
     slave.ask("run_on")
     slave.ask("run_on")
     counter.counts()
+    assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1)) > printed
     nothing_left(slave)
 
 
@@ -180,12 +182,12 @@ def test_an_undo_after_its_end_only_removes_the_image(slave, counter):
 
 
 def test_what_cannot_be_dumped_runs_on(slave, theatre):
-    """A process with an external pipe runs on, and the error names the file descriptor."""
+    """A process with an external pipe runs on; the error names descriptor and other end."""
     reading, writing = os.pipe()
     actor = theatre.start(COUNTER, pass_fds=(writing,))
     actor.counts()
     slave.pids["p#1"] = actor.pid
-    with pytest.raises(CriuError, match=rf"file descriptor {writing} .* is a pipe"):
+    with pytest.raises(CriuError, match=rf"descriptor {writing} .* is a pipe .*{os.getpid()}"):
         slave.ask("keep", destination=32)
     actor.counts()
     nothing_left(slave)
@@ -228,7 +230,7 @@ def test_an_image_that_changed_on_the_disk_is_not_restored(slave, counter):
         slave.ask("await_kept")
     failed.process.wait(TIMEOUT)
     assert slave.ask("put_back") == {}
-    assert checkpoint_numbers(slave.state) == [1]
+    assert numbers(slave.state, "kept") == [1]
     steps.drop({"numbers": [1], "here": {"state": str(slave.state)}})
 
 

@@ -64,7 +64,7 @@ print(json.dumps([code, restored.namespace, "".join(log.read_text() for log in l
 
 
 @pytest.mark.timeout(240)
-def test_an_ordinary_users_process_goes_on(criu, as_nobody, public):
+def test_a_process_of_an_unprivileged_user_is_restored(criu, as_nobody, public):
     """CRIU with capabilities alone restores twice in a row, without a lost number or exit code."""
     program = public / "criu"
     shutil.copy(Path(criu.command[0]).resolve(), program)

@@ -15,7 +15,8 @@ import pytest
 
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.compatibility import FACTS
-from rosrm_criu.engine.probe import ability, probe
+from rosrm_criu.engine.probe import criu_support, probe
+from tests.waiting import wait_until
 
 
 def test_one_that_works(criu):
@@ -41,7 +42,7 @@ def test_as_a_program_it_says_so_in_one_line(criu):
     ("suite", "version"), [("bookworm", "3.17"), ("trixie", "4.1")], ids=["3.17", "4.1"]
 )
 @pytest.mark.slow  # the packages are downloaded once
-def test_too_old_ones_are_told_apart(old, suite, version):
+def test_a_criu_that_is_too_old_is_reported(old, suite, version):
     """The probe rejects Debian 12's CRIU on current kernels, and Debian 13's at the socket."""
     found = old(suite)
     assert found.version.startswith(version)
@@ -55,11 +56,11 @@ def test_too_old_ones_are_told_apart(old, suite, version):
     assert able.facts["version"] == found.version
 
 
-def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
+def test_a_missing_criu_names_the_places_searched(tmp_path, monkeypatch):
     monkeypatch.delenv("ROSRM_CRIU", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("rosrm_criu.engine.binary._PLACES", str(tmp_path))
-    able = ability(tmp_path)
+    able = criu_support(tmp_path)
     assert (able.works, able.facts) == (False, {})
     assert able.reason == (
         f"there is no CRIU here (looked for: ROSRM_CRIU (not set), {tmp_path}/bin/criu, `criu` in "
@@ -174,11 +175,9 @@ def left_in(folder: Path, *expected: Path) -> list[str]:
 
 def assert_all_gone(folder: Path) -> None:
     """Check that no file is in the folder, and that no process of it is left."""
-    until = time.monotonic() + 15  # less than the lifetime of the child
-    while left_in(folder) or processes_of(folder):
-        told = f"{left_in(folder)}, {processes_of(folder)}"
-        assert time.monotonic() < until, f"15 s after its end there is still: {told}"
-        time.sleep(0.05)
+    lifetime = 15.0  # less than that of the child
+    wait_until(lambda: not (left_in(folder) or processes_of(folder)), "an empty folder", lifetime,
+               seen=lambda: (left_in(folder), processes_of(folder)))  # fmt: skip
 
 
 def processes_of(folder: Path) -> list[str]:

@@ -12,6 +12,7 @@ import pytest
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine.binary import CriuBinary, default_prefix, find, opened
+from tests.waiting import wait_until
 
 ANSWERS = 'if [ "$1" = --version ]; then echo "Version: {}"; exit; fi\n'
 
@@ -41,18 +42,18 @@ def test_the_variable_goes_before_the_prefix_and_that_before_path(tmp_path, monk
     assert find(tmp_path / "prefix") == CriuBinary((str(named),), "3.3")
 
 
-def test_it_is_found_where_debian_puts_it_although_a_user_s_path_leaves_that_out(tmp_path):
+def test_criu_is_found_where_debian_installs_it(tmp_path):
     debian = script(tmp_path / "sbin/criu")
     assert find(tmp_path / "prefix").command == (str(debian),)
 
 
-def test_one_that_does_not_start_is_passed_over(tmp_path):
+def test_a_criu_that_does_not_start_is_skipped(tmp_path):
     script(tmp_path / "prefix/bin/criu", "exit 127\n", version="").write_text("#!/bin/no-shell\n")
     script(tmp_path / "path/criu")
     assert find(tmp_path / "prefix").command == (str(tmp_path / "path/criu"),)
 
 
-def test_where_none_starts_each_one_is_told(tmp_path):
+def test_where_no_criu_starts_the_error_has_each_reason(tmp_path):
     script(tmp_path / "prefix/bin/criu").write_text("#!/bin/no-shell\n")
     script(tmp_path / "path/criu").write_text("#!/bin/sh\necho libz is missing >&2; exit 127\n")
     with pytest.raises(CriuError) as raised:
@@ -64,7 +65,7 @@ def test_where_none_starts_each_one_is_told(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder", "other"])
-def test_what_the_variable_names_has_to_be_one(kind, tmp_path, monkeypatch):
+def test_the_variable_must_name_a_working_criu(kind, tmp_path, monkeypatch):
     """An invalid ROSRM_CRIU fails, although another CRIU works, which the user did not name."""
     script(tmp_path / "path/criu")
     named = tmp_path / "named"
@@ -100,7 +101,7 @@ exit 1
 """
 
 
-def test_a_failure_tells_what_its_log_calls_the_cause(tmp_path):
+def test_a_failure_reports_the_cause_of_the_log(tmp_path):
     criu = opened(script(tmp_path / "criu", FAILS))
     log = tmp_path / "dump.log"
     with pytest.raises(CriuError) as raised:
@@ -118,7 +119,7 @@ def test_a_failure_tells_what_its_log_calls_the_cause(tmp_path):
         ("kill -9 $$", "it ended with code -9 and said nothing of the cause"),
     ],
 )
-def test_a_failure_without_a_log_tells_what_it_said(tmp_path, body, expected):
+def test_a_failure_without_a_log_reports_the_output(tmp_path, body, expected):
     log = tmp_path / "log"
     log.write_text("(00.1) Error (a.c:1): an older failure\n")
     with pytest.raises(CriuError, match=r"could not dump: ") as raised:
@@ -126,7 +127,7 @@ def test_a_failure_without_a_log_tells_what_it_said(tmp_path, body, expected):
     assert str(raised.value) == f"CRIU 4.2.1 could not dump: {expected} (its log: {log})"
 
 
-def test_one_that_hangs_is_ended_with_its_children(tmp_path):
+def test_a_hanging_criu_is_ended_with_its_children(tmp_path):
     body = f"echo $$ >{tmp_path}/pid; /bin/sleep 1000 & /bin/sleep 1000"
     criu = opened(script(tmp_path / "criu", body))
     began = time.monotonic()
@@ -134,9 +135,7 @@ def test_one_that_hangs_is_ended_with_its_children(tmp_path):
         criu.run(["dump"], timeout=1.0, log=tmp_path / "log")
     assert time.monotonic() - began < 60
     group = int((tmp_path / "pid").read_text())
-    until = time.monotonic() + 30
-    while members(group):
-        assert time.monotonic() < until, "30 s after its end its children are there"
+    wait_until(lambda: not members(group), "the end of its children")
 
 
 def members(group: int) -> list[int]:
@@ -152,7 +151,7 @@ def members(group: int) -> list[int]:
     return found
 
 
-def test_it_gets_the_files_that_it_is_given_and_no_input(tmp_path):
+def test_criu_inherits_only_the_given_files_and_no_input(tmp_path):
     read, write = os.pipe()
     try:
         criu = opened(
@@ -165,13 +164,13 @@ def test_it_gets_the_files_that_it_is_given_and_no_input(tmp_path):
         os.close(write)
 
 
-def test_it_asks_for_all_rights_only_where_it_has_them(tmp_path):
+def test_criu_runs_unprivileged_where_rights_are_missing(tmp_path):
     """`--unprivileged` depends on the capability, because root in a container may lack it."""
     told = tmp_path / "told"
     program = script(tmp_path / "criu", f'echo "$@" >{told}')
     code = (
-        "import sys; from pathlib import Path; from rosrm_criu.engine.binary import Criu\n"
-        "Criu((sys.argv[1],), '4.2').run(['dump'], timeout=30, log=Path(sys.argv[2]))"
+        "import sys; from pathlib import Path; from rosrm_criu.engine.binary import CriuBinary\n"
+        "CriuBinary((sys.argv[1],), '4.2').run(['dump'], timeout=30, log=Path(sys.argv[2]))"
     )
     words = [sys.executable, "-c", code, program, tmp_path / "log"]
     subprocess.run(words, check=True)

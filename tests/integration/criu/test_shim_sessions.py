@@ -2,7 +2,6 @@
 
 import os
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +11,7 @@ from rosrm.extensions.registry import MadeLauncher
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 from rosrm_criu.launcher import CriuLauncher
+from tests.waiting import wait_until
 
 #: Starts a child in another session, and waits for it.
 PROGRAM = """
@@ -21,7 +21,6 @@ subprocess.run(["sleep", "60"], start_new_session=True)
 ROUNDS = 5
 LAUNCHER = CriuLauncher(LauncherContext(Path("/nowhere"), sys.executable, 1))
 BY_CRIU = Launchers({"criu": MadeLauncher(LAUNCHER, ())})
-PATIENCE = 30.0
 
 
 @pytest.fixture
@@ -44,16 +43,14 @@ def spawn(tmp_path):
 
 
 def child_of(pid):
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end:
+    """Return the child of a process once it leads its own session."""
+
+    def leader():
         with open(f"/proc/{pid}/task/{pid}/children") as file:  # noqa: PTH123 - one read
-            found = file.read().split()
-        if found:
-            child = int(found[0])
-            if os.getsid(child) == child:
-                return child
-        time.sleep(0.01)
-    raise AssertionError(f"process {pid} has no child in a session of its own")
+            children = [int(child) for child in file.read().split()]
+        return [child for child in children if os.getsid(child) == child]
+
+    return wait_until(leader, f"a session below process {pid}")[0]
 
 
 def test_a_shim_is_known_as_one_however_early_it_was_added(spawn):

@@ -56,7 +56,7 @@ def test_a_short_demo_fills_the_hosts_maps_the_drive_and_migrates(start: Start) 
     assert len(json.loads((run.out / "samples.json").read_text())["samples"]) > 20
 
 
-def test_ctrl_c_ends_everything_and_says_nothing_but_so(start: Start) -> None:
+def test_ctrl_c_ends_everything_with_one_line(start: Start) -> None:
     run = start("--drive", "street:40", "--pieces", "4")
     run.wait_for("pieces")  # the first line
     run.wait_for("holder")  # the pieces run

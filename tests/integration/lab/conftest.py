@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,14 @@ def remains(lab: str) -> dict[str, set[str]]:
     }
 
 
+@contextmanager
+def leaves_nothing(lab: str) -> Iterator[None]:
+    """Check that a lab is gone after a block as if it had never been made."""
+    before = remains(lab)
+    yield
+    assert remains(lab) == before
+
+
 def _below(root: Path, start: str) -> set[str]:
     """Return the paths below a folder whose name starts with `start`."""
     # `os.walk` skips a folder of another lab that is removed during the walk; `rglob` raises.
@@ -85,10 +95,9 @@ def _text(path: Path) -> str:
 def name():
     """Yield the name of a lab; check after the test that nothing of the lab is left."""
     chosen = f"t-{uuid.uuid4().hex[:8]}"
-    before = remains(chosen)
-    yield chosen
-    Lab(chosen).down()
-    assert remains(chosen) == before
+    with leaves_nothing(chosen):
+        yield chosen
+        Lab(chosen).down()
 
 
 @pytest.fixture

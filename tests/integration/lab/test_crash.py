@@ -17,7 +17,7 @@ import pytest
 
 from rosrm.errors import LabError
 from rosrm_lab import MIB, Lab, all_labs, disks, store, uniform
-from tests.integration.lab.conftest import remains
+from tests.integration.lab.conftest import leaves_nothing, remains
 from tests.waiting import PATIENCE, wait_until
 
 ROSRM = Path(sys.executable).parent / "rosrm"
@@ -56,23 +56,24 @@ STEPS = [
 ]
 
 
-@pytest.mark.parametrize(("module", "function", "moment", "count"), STEPS)
-def test_a_killed_up_is_removed_wholly(name, module, function, moment, count):
-    """Both `down` and the next `up` remove what a `lab up` killed at any step left."""
-    before = remains(name)
+def killed_up(name: str, module: str, function: str, moment: str, count: int) -> None:
+    """Run an `up` that is killed at a call of this function."""
     command = [sys.executable, "-c", KILLED_AT, name, module, function, moment, str(count)]
     killed = subprocess.run(command, check=False, timeout=PATIENCE * 2)
     assert killed.returncode == -signal.SIGKILL
 
-    Lab(name).down()
 
-    assert remains(name) == before
+@pytest.mark.parametrize(("module", "function", "moment", "count"), STEPS)
+def test_a_killed_up_is_removed_wholly(name, module, function, moment, count):
+    """Both `down` and the next `up` remove what a `lab up` killed at any step left."""
+    with leaves_nothing(name):
+        killed_up(name, module, function, moment, count)
+        Lab(name).down()
 
 
 def test_a_second_up_removes_what_a_killed_one_left(name):
     """The second `up` also creates its own lab."""
-    command = [sys.executable, "-c", KILLED_AT, name, "rosrm_lab.host", "_last_words", "after", "1"]
-    subprocess.run(command, check=False, timeout=PATIENCE)
+    killed_up(name, "rosrm_lab.host", "_last_words", "after", 1)
     with pytest.raises(LabError, match="is incomplete: `rosrm lab up` makes it again"):
         Lab(name).status()
     assert name in {one.name for one in all_labs()}
@@ -106,10 +107,8 @@ def test_a_lab_that_fails_while_it_is_made_leaves_nothing(name, monkeypatch):
         real(image, host)
 
     monkeypatch.setattr(disks, "make", fails)
-    before = remains(name)
-    with pytest.raises(LabError, match="no room"):
+    with leaves_nothing(name), pytest.raises(LabError, match="no room"):
         Lab(name, uniform(2, disk=16 * MIB)).up()
-    assert remains(name) == before
 
 
 class Stopped(Exception):
@@ -155,10 +154,8 @@ REMOVAL = [
 @pytest.mark.parametrize(("module", "function", "moment"), REMOVAL)
 def test_a_signal_during_the_removal_leaves_nothing(name, stopped_at, module, function, moment):
     """The signal's exception is raised after the removal of the lab."""
-    before = remains(name)
-    with pytest.raises(Stopped), Lab(name, uniform(1, disk=16 * MIB)):
+    with leaves_nothing(name), pytest.raises(Stopped), Lab(name, uniform(1, disk=16 * MIB)):
         stopped_at(module, function, moment)
-    assert remains(name) == before
 
 
 def test_a_signal_while_a_failed_attempt_is_removed_leaves_nothing(name, stopped_at, monkeypatch):
@@ -178,8 +175,7 @@ def test_a_signal_while_a_failed_attempt_is_removed_leaves_nothing(name, stopped
 def test_what_a_killed_lab_holds_does_not_hinder_the_next(name, monkeypatch):
     """The old lab is removed before the memory check, even if that check fails afterwards."""
     before = remains(name)
-    command = [sys.executable, "-c", KILLED_AT, name, "rosrm_lab.host", "_last_words", "after", "1"]
-    subprocess.run(command, check=False, timeout=PATIENCE)
+    killed_up(name, "rosrm_lab.host", "_last_words", "after", 1)
     assert remains(name) != before
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=MIB))
     with pytest.raises(LabError, match="1 MiB are available on this machine"):
@@ -187,7 +183,7 @@ def test_what_a_killed_lab_holds_does_not_hinder_the_next(name, monkeypatch):
     assert remains(name) == before
 
 
-def test_a_lab_that_is_up_is_said_to_be_up(lab, monkeypatch):
+def test_a_second_up_of_a_lab_is_refused(lab, monkeypatch):
     """The error names the existing lab even if memory for a second one is missing."""
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=MIB))
     with pytest.raises(LabError, match="is up already"):
@@ -207,10 +203,11 @@ def test_a_file_that_cannot_be_written_is_one_clear_error(name, monkeypatch, cou
         real(record)
 
     monkeypatch.setattr(store, "write", full)
-    before = remains(name)
-    with pytest.raises(LabError, match=r"this machine refuses .*No space left on device"):
+    with (
+        leaves_nothing(name),
+        pytest.raises(LabError, match=r"this machine refuses .*No space left on device"),
+    ):
         Lab(name, uniform(1, disk=16 * MIB)).up()
-    assert remains(name) == before
 
 
 def test_a_kernel_without_bridges_is_one_clear_error(name, monkeypatch):
@@ -224,10 +221,11 @@ def test_a_kernel_without_bridges_is_one_clear_error(name, monkeypatch):
             return self.__getattr__("link")(command, **what)
 
     monkeypatch.setattr(network, "IPRoute", Without)
-    before = remains(name)
-    with pytest.raises(LabError, match=r"the bridge .* cannot be made: Operation not supported"):
+    with (
+        leaves_nothing(name),
+        pytest.raises(LabError, match=r"the bridge .* cannot be made: Operation not supported"),
+    ):
         Lab(name, uniform(1, disk=16 * MIB)).up()
-    assert remains(name) == before
 
 
 def test_a_host_that_cannot_boot_says_why(name, monkeypatch):
@@ -235,10 +233,11 @@ def test_a_host_that_cannot_boot_says_why(name, monkeypatch):
     monkeypatch.setattr(disks, "make", lambda image, host: (
         image.parent.mkdir(parents=True, exist_ok=True), image.write_bytes(bytes(MIB))
     ))  # fmt: skip
-    before = remains(name)
-    with pytest.raises(LabError, match=r"host1 .* could not be booted: mount -o loop"):
+    with (
+        leaves_nothing(name),
+        pytest.raises(LabError, match=r"host1 .* could not be booted: mount -o loop"),
+    ):
         Lab(name, uniform(1, disk=16 * MIB)).up()
-    assert remains(name) == before
 
 
 @pytest.mark.parametrize("damage", ["", "{", "not json"])
@@ -326,7 +325,7 @@ def test_the_command_line_from_up_to_down(name):
     assert rosrm("exec", "host1", "true")[0] == 1
 
 
-def test_an_ordinary_user_is_told_what_is_missing(name):
+def test_an_unprivileged_user_learns_what_is_missing(name):
     """The error shows the alternative without root; no traceback, nothing created."""
     nobody = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=-all"]
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""A node moves by CRIU between hosts of different addresses, and over a network that is cut."""
+"""Migrations by CRIU between hosts with different addresses, and over a cut network."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HOSTS = ("host1", "host2")
 
 @pytest.fixture
 def hosts(criu, name, tmp_path):
-    """Master and listener on a desk, and two hosts with a slave each."""
+    """Yield a lab with master and observer on one host, and a slave on two others."""
     with (
         Lab(name, [*uniform(2, disk=GIB), HostPlan("desk")]) as lab,
         parts(lab, tmp_path),
@@ -27,17 +27,17 @@ def hosts(criu, name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_node_counts_on_at_another_address(hosts):
-    """There and back: no count is heard twice, none of what it did is missing in its memory.
+def test_a_node_keeps_its_state_at_another_address(hosts):
+    """To and fro, no count is received twice, and the memory is the same.
 
-    Then the destination is cut off while the image is on its way: the node goes on where it is.
+    Then the destination is cut off during the transfer of the image: the source runs on.
     """
     slow = {"max_rate": 2_000_000, "transfer_timeout": 5.0}
-    asked = [
+    requests = [
         {"strategy": "criu", "mb": 1, "hops": 2},
         {"strategy": "criu", "mb": 1, "hops": 1, "options": slow},
     ]
-    hops = play(hosts, asked)
+    hops = play(hosts, requests)
     for _ in range(2):
         hop = next(hops)
         assert hop["end"] == "migrated", hop
@@ -57,12 +57,12 @@ def test_a_node_counts_on_at_another_address(hosts):
     assert next(hops, None) is None
     for host in HOSTS:
         left = hosts.outside(host, f"{DATA}/slave/images").rglob("*")
-        # That it was restored is known as long as it lives.
+        # The result of a restore stays as long as its instance.
         assert not [one.name for one in left if one.is_file() and one.name != restore_result.FILE]
 
 
 def cut_off_who_fetches(lab: Lab) -> None:
-    """As soon as some of an image has come."""
+    """Cut off the host that has received the first part of an image."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         for host in HOSTS:

@@ -34,7 +34,7 @@ def test_each_host_has_its_own_shared_memory_and_disk(lab):
         assert lab.outside("host1", path).exists()
 
 
-def test_hosts_reach_each_other_by_name_and_nobody_else(lab):
+def test_hosts_reach_only_each_other(lab):
     """There is no route out, and the switch is connected only to the hosts."""
     server = lab.popen("host1", [*PYTHON, ECHO], stdout=-1)
     assert server.stdout.readline() == b"ready\n"
@@ -70,7 +70,7 @@ s.sendall(b'hello'); print(s.recv(99).decode())
 """
 
 
-def test_who_takes_more_memory_than_the_host_has_is_killed(lab):
+def test_a_process_over_the_memory_of_its_host_is_killed(lab):
     """The kernel kills the process that exceeds the memory limit; the host stays up."""
     taken = "x = bytearray(%d << 20); print(len(x) >> 20)"
     assert lab.exec("host1", [*PYTHON, taken % 64]).stdout == "64\n"
@@ -171,7 +171,7 @@ def test_booting_a_host_that_is_up_is_refused(lab):
     sleeper.wait()
 
 
-def test_the_status_tells_what_there_is(lab):
+def test_the_status_has_state_and_usage_of_each_host(lab):
     """The status has the fields of `rosrm lab status --json`."""
     sleeper = lab.popen("host1", ["sleep", "1000"])
     wait_until(lambda: lab.status()[0].processes == 1, "the process is counted")
@@ -186,7 +186,7 @@ def test_the_status_tells_what_there_is(lab):
     sleeper.wait()
 
 
-def test_two_labs_live_side_by_side(lab, name):
+def test_two_labs_are_independent(lab, name):
     """Each lab has its own addresses, and neither reaches the other."""
     other = f"{name}-b"
     with Lab(other, uniform(1, disk=16 * MIB)) as second:

@@ -32,7 +32,8 @@ def test_a_probe_is_installed_and_chosen_by_name(environment):
 
     code = (
         "from pathlib import Path\n"
-        "from rosrm.config import HostConfig, load_host\n"
+        "from rosrm.config.host import load_host\n"
+        "from rosrm.config.settings import HostConfig\n"
         "from rosrm.extensions.registry import Registry\n"
         "from rosrm.testing import probe_context\n"
         "registry = Registry.discover()\n"
@@ -43,10 +44,7 @@ def test_a_probe_is_installed_and_chosen_by_name(environment):
         "print(absent['heat'])\n"
     )
     lines = environment.python(code).splitlines()
-    assert lines == [
-        "heat 1.0 Reading(resource='heat', usage=0.5)",
-        "no sensor at /nowhere",
-    ]
+    assert lines == ["heat 1.0 Reading(resource='heat', usage=0.5)", "no sensor at /nowhere"]
 
 
 def test_a_wrong_option_of_a_probe_is_refused_by_its_own_rules(environment):
@@ -70,7 +68,8 @@ def test_a_migration_strategy_is_installed_and_chosen_by_name(environment):
     ], said.stderr
 
     code = (
-        "from rosrm.config import ClusterConfig, load_cluster\n"
+        "from rosrm.config.cluster import load_cluster\n"
+        "from rosrm.config.settings import ClusterConfig\n"
         "from rosrm.model.plan import plan_fault\n"
         "from rosrm.extensions.registry import Registry\n"
         "from rosrm.testing import MigrationContract\n"

@@ -83,7 +83,8 @@ def test_the_tutorial_does_what_it_says(environment):
 
     code = (
         "from rosrm.extensions.registry import Registry\n"
-        "from rosrm.config import ClusterConfig, load_cluster\n"
+        "from rosrm.config.cluster import load_cluster\n"
+        "from rosrm.config.settings import ClusterConfig\n"
         "registry = Registry.discover()\n"
         "config = load_cluster('rosrm-fewest/cluster.yaml', registry)\n"
         "config = ClusterConfig.from_json(config.to_json())\n"

@@ -12,13 +12,22 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.core.supervisor.events import AmendOrdered
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor import instance_record, procfs
 from rosrm.supervisor.client import SupervisorClient, log_path
-from rosrm.supervisor.client_values import Amended, LaunchOrder
+from rosrm.supervisor.client_values import Amended, LaunchOrder, key_of, restart_rule
+from rosrm.supervisor.messages import Amend
 from tests.waiting import PATIENCE, command_of, wait_gone
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
+
+
+def kill(*pids: int) -> None:
+    """Kill processes with SIGKILL, and wait for their ends."""
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+        wait_gone(pid)
 
 
 class Host:
@@ -57,7 +66,12 @@ class Host:
                     continue
                 if status.instance == instance and status.state in states:
                     return status
-        pytest.fail(f"{instance} was in none of {states} within {PATIENCE} s; told: {seen}")
+        pytest.fail(f"{instance} was in none of {states} within {PATIENCE} s; reported: {seen}")
+
+    def sleeper(self, client, name: str, **options) -> int:
+        """Start a process that sleeps; return its pid once it runs."""
+        client.start([self.order(name, "sleep", "1000", **options)])
+        return self.running(client, name).pid
 
     def run(self, client, order: LaunchOrder):
         """Start an order and return its final status."""
@@ -71,17 +85,22 @@ class Host:
         final = tuple(state for state in InstanceState if state.ended)
         return self.wait(client, name, *final, number=number)
 
+    def ended_after_connect(self, client, name: str):
+        """Return the final status of an instance, which may have ended before the connection."""
+        found = next(one for one in client.instances if one.instance.process == name)
+        return found if found.state.ended else self.ended(client, name)
+
     def amend(self, client, name: str, restart: RestartPolicy) -> None:
         """Change the restart policy as the slave does; wait for the supervisor's record."""
         instance, deadline = InstanceId(name, 1), time.monotonic() + PATIENCE
-        client.amend(instance, restart, {"ROSRM_SHADOW": None})
-        wanted = Amended(instance, restart)
-        while wanted not in client.receive(max(0.0, deadline - time.monotonic())):
-            assert time.monotonic() < deadline, f"{wanted} was not told within {PATIENCE} s"
+        order = AmendOrdered(key_of(instance), restart_rule(restart))
+        client.send(Amend(order, {"ROSRM_SHADOW": None}))
+        amended = Amended(instance, restart)
+        while amended not in client.receive(max(0.0, deadline - time.monotonic())):
+            assert time.monotonic() < deadline, f"{amended} was not reported within {PATIENCE} s"
 
     def kill_supervisor(self, client) -> None:
-        os.kill(client.pid, signal.SIGKILL)
-        wait_gone(client.pid)
+        kill(client.pid)
         client.close()
 
     def replace_supervisor(self, client) -> SupervisorClient:
@@ -102,6 +121,13 @@ class Host:
             change(line)
         path.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
+    def cut_record(self, *, after_spawn: bool) -> None:
+        """End the record behind the note of its last spawn, or before that note."""
+        path = self.state / "instances.jsonl"
+        lines = path.read_text().splitlines(keepends=True)
+        last = max(i for i, line in enumerate(lines) if '"record":"spawning"' in line)
+        path.write_text("".join(lines[: last + after_spawn]))
+
     def alive(self) -> list[int]:
         """Return the pids of all processes of the supervisor and their descendants."""
         found = procfs.find_marked(str(self.state))
@@ -115,8 +141,7 @@ class Host:
             self.pids.add(int(lock.read_text() or 0))
         for pid in self.pids:
             if str(self.state) in command_of(pid):
-                os.kill(pid, signal.SIGKILL)
-                wait_gone(pid)
+                kill(pid)
         for pid in {*self.recorded(), *self.alive()}:
             os.kill(pid, signal.SIGKILL)
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
-import signal
 
 import pytest
 
+from rosrm.core.supervisor.events import RestartOrdered, StopOrdered
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
-from tests.waiting import wait_gone, wait_until
+from rosrm.supervisor.client_values import key_of
+from rosrm.supervisor.messages import Remember
+from tests.waiting import wait_until
+
+from .conftest import kill
 
 NEVER = RestartPolicy("never")
 ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
@@ -34,11 +38,10 @@ def amended(host, client, name: str, restart: RestartPolicy, killed: str):
     return client
 
 
-def kill(host, pid: int, name: str) -> None:
+def kill_after_output(host, pid: int, name: str) -> None:
     """Kill a run that has printed its output."""
     wait_until(lambda: host.log(name).exists() and host.log(name).read_text(), "it has spoken")
-    os.kill(pid, signal.SIGKILL)
-    wait_gone(pid)
+    kill(pid)
 
 
 @KILLS
@@ -47,7 +50,7 @@ def test_a_suspended_policy_lets_the_source_end(host, client, killed):
     client.start([host.order("source", *SAYS_WHAT_IT_IS, restart=ON_FAILURE)])
     pid = host.running(client, "source").pid
     client = amended(host, client, "source", NEVER, killed)
-    kill(host, pid, "source")
+    kill_after_output(host, pid, "source")
     status = host.ended(client, "source")
     assert (status.state, status.restarts) == (InstanceState.FAILED, 0)
 
@@ -58,7 +61,7 @@ def test_a_confirmed_shadow_is_restarted_as_none(host, client, killed):
     client.start([shadow(host, "copy")])
     pid = host.running(client, "copy").pid
     client = amended(host, client, "copy", ON_FAILURE, killed)
-    kill(host, pid, "copy")
+    kill_after_output(host, pid, "copy")
     status = host.wait(client, "copy", InstanceState.RUNNING)
     assert (status.restarts, status.pid != pid) == (1, True)
     said = "shadow: 1\nshadow:\n"
@@ -74,20 +77,18 @@ def test_an_end_while_no_supervisor_runs_follows_the_new_policy(host, client):
     client = host.reconnect(client)
     copy = next(one.pid for one in client.instances if one.instance.process == "copy")
     host.kill_supervisor(client)
-    for pid in (source, copy):
-        os.kill(pid, signal.SIGKILL)
-        wait_gone(pid)
+    kill(source, copy)
     client = host.connect()
     found = {one.instance.process: one.state for one in client.instances}
     assert found == {"copy": InstanceState.BACKOFF, "source": InstanceState.FAILED}
 
 
-def test_a_shadow_ends_for_good_whoever_is_killed(host, client):
+def test_an_unconfirmed_shadow_is_never_restarted(host, client):
     """An unconfirmed shadow does not restart, even after restarts of slave and supervisor."""
     client.start([shadow(host, "copy")])
     pid = host.running(client, "copy").pid
     client = host.replace_supervisor(client)
-    kill(host, pid, "copy")
+    kill_after_output(host, pid, "copy")
     assert host.ended(client, "copy").state is InstanceState.FAILED
     client = host.reconnect(client)
     assert [one.state for one in client.instances] == [InstanceState.FAILED]
@@ -99,13 +100,13 @@ def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
     host.running(client, "copy")
     wait_until(lambda: host.log("copy").read_text(), "it has spoken")
     host.amend(client, "copy", NEVER)
-    client.restart(InstanceId("copy", 1))
+    client.send(RestartOrdered(("copy", 1)))
     host.wait(client, "copy", InstanceState.STARTING)
     said = "shadow: 1\nshadow:\n"
     wait_until(lambda: host.log("copy").read_text() == said, "both runs have spoken")
 
 
-def test_what_is_to_be_remembered_is(host, client):
+def test_memos_outlive_slave_and_supervisor(host, client):
     """Memos outlive slave and supervisor (SIGKILL), and end with their instance."""
     kept, other = InstanceId("kept", 1), InstanceId("other", 1)
     orders = [host.order("kept", "sleep", "1000", memo="a"), host.order("other", "sleep", "1000")]
@@ -113,11 +114,11 @@ def test_what_is_to_be_remembered_is(host, client):
     host.running(client, "other")
     client = host.reconnect(client)
     assert client.memos == {kept: "a"}
-    client.remember(kept, "b")
-    client.remember(other, "c")
-    client.stop(kept)
+    client.send(Remember(key_of(kept), "b"))
+    client.send(Remember(key_of(other), "c"))
+    client.send(StopOrdered(key_of(kept)))
     host.ended(client, "kept")  # by then the supervisor has read the orders
-    client.remember(kept, "too late")
+    client.send(Remember(key_of(kept), "too late"))
     host.amend(client, "other", NEVER)
     client = host.replace_supervisor(client)
     assert client.memos == {other: "c"}

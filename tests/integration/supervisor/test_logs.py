@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from rosrm.core.supervisor.events import StatusStored, StopOrdered
 from rosrm.errors import Refused
 from rosrm.model.values import InstanceId
 from rosrm.slave.logs import newest_instance
 from rosrm.supervisor import log_index
 from rosrm.supervisor.logs import PROCESSES_AT_ONCE, LogLimits
+from rosrm.supervisor.messages import Forget
 from tests.waiting import wait_until
 
 KIB = 1024
@@ -32,7 +34,7 @@ def test_a_flood_is_bounded(host):
     wait_until(oldest.exists, "two rotations")
     first = oldest.stat().st_ino
     wait_until(lambda: oldest.stat().st_ino != first, "a third rotation")
-    client.stop(InstanceId("flood", 1))
+    client.send(StopOrdered(("flood", 1)))
     host.ended(client, "flood")
     files = [file for file in log.parent.iterdir() if file.suffix != ".times"]
     assert sorted(file.name for file in files) == ["flood.1.log", "flood.1.log.1", "flood.1.log.2"]
@@ -56,7 +58,7 @@ def test_logs_of_old_instances_are_pruned(host):
     for number in range(1, 6):
         host.log("many", number).with_suffix(".parameters.yaml").write_text("{}")
         host.run(client, host.order("many", "true", number=number))
-        client.forget([InstanceId("many", number)])
+        client.send(Forget((StatusStored(("many", number)),)))
     numbers = {file.name.split(".")[1] for file in host.log("many").parent.iterdir()}
     assert numbers == {"3", "4", "5"}
     assert newest_instance(host.state, "many") == InstanceId("many", 5)
@@ -67,7 +69,7 @@ def test_the_index_of_logs_survives_the_supervisor(host):
     client = host.connect(log=LogLimits(instances=2))
     for number in range(1, 3):
         host.run(client, host.order("many", "true", number=number))
-        client.forget([InstanceId("many", number)])
+        client.send(Forget((StatusStored(("many", number)),)))
     host.kill_supervisor(client)
     client = host.connect(log=LogLimits(instances=2))
     host.run(client, host.order("many", "true", number=3))
@@ -81,7 +83,7 @@ def test_logs_of_old_processes_are_pruned(host):
     client = host.connect(log=LogLimits(processes=10))
     for number in range(100):
         host.run(client, host.order(f"job{number}", "true", number=number))
-        client.forget([InstanceId(f"job{number}", number)])
+        client.send(Forget((StatusStored((f"job{number}", number)),)))
     left = list(host.log("any").parent.iterdir())
     assert len(left) < 2 * (10 + PROCESSES_AT_ONCE)
     assert newest_instance(host.state, "job99") == InstanceId("job99", 99)

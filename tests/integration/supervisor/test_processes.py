@@ -10,7 +10,8 @@ from functools import partial
 
 import pytest
 
-from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
+from rosrm.core.supervisor.events import FailOrdered, StopOrdered
+from rosrm.model.values import InstanceState, RestartPolicy
 from tests.waiting import wait_gone, wait_until
 
 IGNORES_ALL = """
@@ -43,7 +44,7 @@ def test_exit_status_usage_and_output_are_kept(host, client):
     assert host.log("short").read_text() == "out\nerr\n"
 
 
-def test_a_crash_is_told_by_its_signal(host, client):
+def test_a_crash_is_reported_with_its_signal(host, client):
     """A process killed by a foreign signal has failed, and the message names the signal."""
     status = host.run(client, host.order("crash", "sh", "-c", "kill -SEGV $$"))
     assert (status.state, status.exit_signal) == (InstanceState.FAILED, signal.SIGSEGV)
@@ -71,7 +72,7 @@ def test_a_process_starts_with_every_signal_at_its_default(host, client):
     assert int(ignored, 16) & ~own_to_glibc == 0
 
 
-def test_it_runs_in_its_environment_and_directory_alone(host, client, tmp_path):
+def test_a_process_has_only_its_own_environment_and_directory(host, client, tmp_path):
     """Environment and directory are those of the order, plus two marks of the supervisor."""
     order = host.order(
         "env", "/usr/bin/env", environment={"A": "1"}, working_directory=str(tmp_path)
@@ -107,7 +108,7 @@ def test_a_process_that_ignores_everything_is_killed(host, client):
     client.start([host.python("deaf", IGNORES_ALL)])
     pid = host.running(client, "deaf").pid
     wait_until(lambda: host.log("deaf").read_text(), "it said that it is deaf")
-    client.stop(InstanceId("deaf", 1))
+    client.send(StopOrdered(("deaf", 1)))
     told = []
     while not told or not told[-1].state.ended:
         told += client.receive(10)
@@ -129,7 +130,7 @@ def test_a_stop_reaches_the_whole_group(host, client):
     client.start([host.order("group", "sh", "-c", "sleep 1000 & sleep 1000 & wait")])
     host.running(client, "group")
     wait_until(lambda: len(host.alive()) == 3, "a shell and two sleeps run")
-    client.stop(InstanceId("group", 1))
+    client.send(StopOrdered(("group", 1)))
     host.ended(client, "group")
     assert host.alive() == []
 
@@ -199,7 +200,7 @@ def test_a_stopped_process_ends_and_starts_again(host, client, killed):
     client.start([host.order("hung", "sh", "-c", "sleep 1000; true", restart=again)])
     pid = host.running(client, "hung").pid
     os.kill(pid, signal.SIGSTOP)
-    client.fail(InstanceId("hung", 1), pid, "unhealthy: stopped for 5 s", kill=True)
+    client.send(FailOrdered(("hung", 1), pid, "unhealthy: stopped for 5 s", kill=True))
     if killed == "after":
         host.wait(client, "hung", InstanceState.STOPPING, InstanceState.BACKOFF)
         client = host.replace_supervisor(client)

@@ -128,7 +128,7 @@ def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
     assert not loop.ended
 
 
-def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, monkeypatch) -> None:
+def test_a_supervisor_that_reads_no_orders_is_reconnected(loop, monkeypatch) -> None:
     """The slave reconnects and repeats the orders that were not read: each process runs, once."""
     monkeypatch.setattr(send_buffer, "MOST_UNSENT", 300_000)
     os.kill(loop.pid, signal.SIGSTOP)

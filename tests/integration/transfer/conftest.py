@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm_criu.transfer import Fetcher, Sender
-from tests.integration.transfer.trees import Destination, fill
+from tests.integration.transfer.trees import PATIENCE, Destination, fill
 
 
 @pytest.fixture
@@ -36,3 +36,9 @@ def fetcher():
 @pytest.fixture
 def destination():
     return Destination()
+
+
+@pytest.fixture
+def offer(source, sender, destination):
+    """Return an offer of the source to the destination."""
+    return sender.offer(source, seconds=PATIENCE, to=destination.certificate)

@@ -12,7 +12,6 @@ import tarfile
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -26,11 +25,11 @@ from tests.integration.transfer.trees import (
     PATIENCE,
     Destination,
     digests,
+    fetching,
     listens,
     nothing_left,
     slowly,
     through,
-    until,
 )
 from tests.integration.transfer.wires import Fault, wire
 
@@ -38,9 +37,8 @@ from tests.integration.transfer.wires import Fault, wire
 
 
 @pytest.mark.parametrize("fault", [Fault(after=1_000_000), Fault(after=1_000_000, flips=True)])
-def test_a_broken_stream_fails_and_leaves_nothing(source, target, sender, destination, fault):
+def test_a_broken_stream_fails_and_leaves_nothing(offer, target, sender, destination, fault):
     """A cut or damaged stream ends the fetch and the offer; both sides keep nothing of it."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     why = rf"the transfer was cut: .*; \d{{5,}} of {offer.length} bytes had come"
     with wire(offer.port, fault) as broken, pytest.raises(TransferError, match=why):
         destination.fetch(through(offer, broken.port), target)
@@ -52,9 +50,7 @@ def test_a_broken_stream_fails_and_leaves_nothing(source, target, sender, destin
 def test_a_cut_that_ends_is_bridged(source, target, sender, destination):
     """A stream whose packets come late continues; nothing is sent twice."""
     offer = slowly(sender, source, destination.certificate)
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(destination.fetch, offer, target)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(destination, offer, target) as going:
         os.kill(sender._process.pid, signal.SIGSTOP)
         time.sleep(1.0)
         os.kill(sender._process.pid, signal.SIGCONT)
@@ -65,10 +61,8 @@ def test_a_cut_that_ends_is_bridged(source, target, sender, destination):
 def test_a_silent_source_is_given_up_in_time(source, target, sender, destination):
     """The fetch gives up a source that is stopped, and neither sends nor closes."""
     offer = slowly(sender, source, destination.certificate)
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(destination.fetch, offer, target, timeout=3.0)
+    with fetching(destination, offer, target, timeout=3.0) as going:
         try:
-            until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
             os.kill(sender._process.pid, signal.SIGSTOP)
             with pytest.raises(TransferError, match=r"took longer than 3 s"):
                 going.result(PATIENCE)
@@ -84,9 +78,8 @@ def test_a_transfer_that_takes_too_long_is_given_up(source, target, sender, dest
     assert nothing_left(target)
 
 
-def test_nobody_at_any_address(source, target, sender, destination):
+def test_a_server_at_no_address_is_an_error(offer, target, sender, destination):
     """The error names all addresses that refused."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     sender.close()
     with pytest.raises(TransferError) as caught:
         destination.fetch(offer, target)
@@ -111,18 +104,14 @@ def test_an_offer_that_ends_in_mid_transfer(source, target, sender, destination)
     assert nothing_left(target)
 
 
-def test_files_that_changed_since_they_were_offered_are_refused(
-    source, target, sender, destination
-):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
+def test_files_that_changed_since_they_were_offered_are_refused(offer, source, target, destination):
     (source / "pages" / "1.img").write_bytes(b"other")
     with pytest.raises(TransferError, match=r"refuses .*1\.img has changed since it was offered"):
         destination.fetch(offer, target)
     assert nothing_left(target)
 
 
-def test_a_directory_that_is_gone_since_it_was_offered(source, target, sender, destination):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
+def test_a_directory_that_is_gone_since_it_was_offered(offer, source, target, destination):
     source.rename(source.with_name("elsewhere"))
     with pytest.raises(TransferError, match=r"refuses .* is gone"):
         destination.fetch(offer, target)
@@ -189,9 +178,8 @@ def test_a_part_that_is_too_large_is_refused(source, target, monkeypatch):
 # --- disks -----------------------------------------------------------------------------------
 
 
-def test_what_has_no_room_is_not_begun(source, sender, tmp_path, destination):
+def test_what_has_no_room_is_not_begun(offer, tmp_path, destination):
     """The offer still stands after a refusal for lack of space, so another place can fetch it."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with small_disk(tmp_path / "disk") as disk:
         with pytest.raises(TransferError, match=r"do not fit .* the file system .*/disk has"):
             destination.fetch(offer, disk.place / "target", reserve=0)
@@ -199,16 +187,14 @@ def test_what_has_no_room_is_not_begun(source, sender, tmp_path, destination):
     destination.fetch(offer, tmp_path / "target")
 
 
-def test_a_disk_that_is_full_meanwhile(sender, tmp_path, destination):
+def test_a_disk_that_becomes_full_during_the_transfer(sender, tmp_path, destination):
     """A disk that others fill during the fetch fails it; the error names the file system."""
     source = tmp_path / "source"
     source.mkdir()
     (source / "pages").write_bytes(random.Random(7).randbytes(600_000))
     with small_disk(tmp_path / "disk") as disk:
         offer = sender.offer(source, seconds=PATIENCE, max_rate=200e3, to=destination.certificate)
-        with ThreadPoolExecutor() as threads:
-            going = threads.submit(destination.fetch, offer, disk.place / "target", reserve=0)
-            until("something has come", lambda: list(disk.place.glob(".rosrm-fetch-*/*")))
+        with fetching(destination, offer, disk.place / "target", reserve=0) as going:
             disk.fill()
             with pytest.raises(TransferError, match=r"No space left on device; the file system"):
                 going.result(PATIENCE)

@@ -6,22 +6,28 @@ import json
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from rosrm.errors import TransferError
 from rosrm_criu.transfer import Fetcher, Offer, OfferResult, Sender
-from tests.integration.transfer.trees import PATIENCE, digests, listens, nothing_left, slowly, until
+from tests.integration.transfer.trees import (
+    PATIENCE,
+    digests,
+    fetching,
+    listens,
+    nothing_left,
+    slowly,
+    wait_until_begun,
+)
+from tests.waiting import wait_until
 
 
 def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fetcher, destination):
     """A killed fetch leaves only a hidden directory, which the next fetch beside it removes."""
     offer = slowly(sender, source, fetcher.introduce())
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(fetcher, offer, target, timeout=PATIENCE) as going:
         fetcher._process.kill()
         with pytest.raises(TransferError, match="ended with status -9 and no answer"):
             going.result(PATIENCE)
@@ -38,20 +44,16 @@ def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fe
 def test_a_fetch_can_be_stopped(source, target, sender, fetcher):
     """A fetch can be stopped from another thread, and leaves nothing."""
     offer = slowly(sender, source, fetcher.introduce())
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(fetcher, offer, target, timeout=PATIENCE) as going:
         fetcher.close()
-        with pytest.raises(TransferError, match="stopped before all had come"):
+        with pytest.raises(TransferError, match="stopped before everything was received"):
             going.result(PATIENCE)
     assert nothing_left(target)
 
 
 def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender, fetcher):
     offer = slowly(sender, source, fetcher.introduce())
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(fetcher, offer, target, timeout=PATIENCE) as going:
         assert sender.close().outcome == "withdrawn"
         assert not listens(offer.port)
         with pytest.raises(TransferError, match=r"the transfer was cut"):
@@ -59,7 +61,7 @@ def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender, fetch
     assert nothing_left(target)
 
 
-def test_what_was_stopped_before_it_began_says_so(source, target, sender):
+def test_a_transfer_stopped_before_its_start_is_reported(source, target, sender):
     fetcher = Fetcher()
     offer = sender.offer(source, seconds=PATIENCE, to=fetcher.introduce())
     fetcher.close()
@@ -100,7 +102,7 @@ def test_an_offer_ends_with_the_process_that_made_it(source, destination):
         serving = Path(f"/proc/{owner.stdout.readline().strip()}")
         assert listens(offer.port)
         owner.kill()
-        until("its process has ended", lambda: not serving.exists() or is_dead(serving))
+        wait_until(lambda: not serving.exists() or is_dead(serving), "its end")
         assert not listens(offer.port)
 
 
@@ -111,9 +113,9 @@ def test_a_fetch_ends_with_the_process_that_asked_for_it(source, target, sender)
         fetching = Path(f"/proc/{pid}")
         owner.stdin.write(json.dumps(slowly(sender, source, certificate).as_json()) + "\n")
         owner.stdin.flush()
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+        wait_until_begun(target)
         owner.kill()
-        until("its process has ended", lambda: not fetching.exists() or is_dead(fetching))
+        wait_until(lambda: not fetching.exists() or is_dead(fetching), "its end")
     assert nothing_left(target)
 
 
@@ -125,7 +127,7 @@ def is_dead(process: Path) -> bool:
         return True
 
 
-def test_a_sender_that_is_killed_says_so(source, sender, destination):
+def test_a_killed_sender_is_reported(source, sender, destination):
     sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     sender._process.kill()
     assert sender.wait(PATIENCE) == OfferResult("failed", 0)
@@ -142,9 +144,8 @@ def test_closing_twice_and_from_several_threads_does_no_harm(source, destination
     assert sender.close() == OfferResult("withdrawn", 0)
 
 
-def test_a_destination_that_was_not_introduced_fetches_nothing(source, target, sender, destination):
+def test_a_destination_that_was_not_introduced_fetches_nothing(offer, target):
     """A fetch without `introduce` fails at once, because the source would refuse it."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with Fetcher() as fetcher, pytest.raises(TransferError, match="was not introduced"):
         fetcher.fetch(offer, target, timeout=PATIENCE)
     assert nothing_left(target)

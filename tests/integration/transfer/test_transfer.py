@@ -8,7 +8,6 @@ import json
 import socket
 import ssl
 import stat
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import psutil
@@ -20,11 +19,11 @@ from tests.integration.transfer.trees import (
     PATIENCE,
     Destination,
     digests,
+    fetching,
     fill,
     listens,
     nothing_left,
     slowly,
-    until,
 )
 
 # --- successful transfers --------------------------------------------------------------------
@@ -74,10 +73,7 @@ def test_a_rate_is_kept(source, target, sender, destination):
 # --- access control --------------------------------------------------------------------------
 
 
-def test_a_wrong_token_is_refused_and_the_right_one_still_works(
-    source, target, sender, destination
-):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
+def test_a_wrong_token_is_refused_and_the_right_one_still_works(offer, source, target, destination):
     with pytest.raises(TransferError, match=r"refuses .*: the token is not the one of this offer"):
         destination.fetch(dataclasses.replace(offer, token="guessed"), target)
     assert nothing_left(target)
@@ -85,8 +81,7 @@ def test_a_wrong_token_is_refused_and_the_right_one_still_works(
     assert digests(target) == digests(source)
 
 
-def test_an_offer_is_taken_once(source, target, sender, tmp_path, destination):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
+def test_an_offer_is_taken_once(offer, target, tmp_path, destination):
     destination.fetch(offer, target)
     with pytest.raises(TransferError, match=r"cannot be reached: .*its offer.* may be over"):
         destination.fetch(offer, tmp_path / "second")
@@ -95,18 +90,17 @@ def test_an_offer_is_taken_once(source, target, sender, tmp_path, destination):
 def test_a_second_reader_is_refused(source, target, sender, tmp_path, destination):
     """While one reader fetches, another one with the token learns only that it was used."""
     offer = slowly(sender, source, destination.certificate)
-    with ThreadPoolExecutor() as threads:
-        going = threads.submit(destination.fetch, offer, target)
-        until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
+    with fetching(destination, offer, target) as going:
         with pytest.raises(TransferError, match="another reader fetches it already"):
             destination.fetch(offer, tmp_path / "second")
         going.result(PATIENCE)
     assert not (tmp_path / "second").exists()
 
 
-def test_a_destination_that_was_introduced_is_the_only_one(source, target, sender, destination):
+def test_a_destination_that_was_introduced_is_the_only_one(
+    offer, source, target, sender, destination
+):
     """An intercepted offer, including its token, is useless with another key."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     other = Destination()
     with pytest.raises(TransferError, match="is for another destination than this one"):
         other.fetch(offer, target)
@@ -119,9 +113,8 @@ def test_a_destination_that_was_introduced_is_the_only_one(source, target, sende
     assert sender.wait(PATIENCE) == OfferResult("taken", fetched.received)
 
 
-def test_who_shows_no_certificate_is_not_spoken_with(source, sender, destination):
+def test_a_client_without_certificate_is_refused(offer):
     """A client without a certificate gets no byte of an answer, even with a valid token."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     answer = b""
     with (
         socket.create_connection(("127.0.0.1", offer.port), timeout=PATIENCE) as plain,
@@ -147,9 +140,8 @@ def test_an_introduction_that_is_none_is_refused(source, sender, to):
         sender.offer(source, seconds=PATIENCE, to=to)
 
 
-def test_another_server_is_told_nothing(source, target, sender, destination):
+def test_a_server_with_another_certificate_receives_nothing(offer, source, target, destination):
     """A server with another certificate does not even get the token."""
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     with Sender() as other:
         elsewhere = other.offer(source, seconds=PATIENCE, to=destination.certificate)
         mistaken = dataclasses.replace(offer, port=elsewhere.port)
@@ -174,9 +166,8 @@ def test_what_travels_is_no_plain_text(source, target, sender, tmp_path, destina
 
 
 def test_the_token_is_in_no_command_line_environment_or_output(
-    source, target, sender, capfd, destination
+    offer, target, sender, capfd, destination
 ):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     place = Path(f"/proc/{sender._process.pid}")
     seen = (place / "cmdline").read_bytes() + (place / "environ").read_bytes()
     destination.fetch(offer, target)
@@ -187,8 +178,7 @@ def test_the_token_is_in_no_command_line_environment_or_output(
     assert err == ""
 
 
-def test_a_stranger_that_says_nothing_hinders_nobody(source, target, sender, destination):
-    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
+def test_a_silent_client_does_not_block_others(offer, target, sender, destination):
     strangers = [
         socket.create_connection(("127.0.0.1", offer.port), timeout=PATIENCE) for _ in range(20)
     ]

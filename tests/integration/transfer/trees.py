@@ -6,12 +6,15 @@ import dataclasses
 import hashlib
 import random
 import socket
-import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
-from rosrm_criu.transfer import DEFAULT_RESERVE, Fetched, Offer, Sender
+from rosrm_criu.transfer import DEFAULT_RESERVE, Fetched, Fetcher, Offer, Sender
 from rosrm_criu.transfer.certificate import new_identity
 from rosrm_criu.transfer.receiving import receive
+from tests.waiting import wait_until
 
 #: Seconds; generous for a busy machine.
 PATIENCE = 60.0
@@ -71,11 +74,18 @@ def listens(port: int) -> bool:
     return True
 
 
-def until(what: str, condition) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f"not within {PATIENCE} s: {what}"
-        time.sleep(0.02)
+def wait_until_begun(target: Path) -> None:
+    """Wait until the first files of a fetch have arrived beside its target."""
+    wait_until(lambda: list(target.parent.glob(".rosrm-fetch-*/*")), "the first files")
+
+
+@contextmanager
+def fetching(by: Destination | Fetcher, offer: Offer, target: Path, **more) -> Iterator[Future]:
+    """Fetch in another thread; yield the running fetch once its first files have arrived."""
+    with ThreadPoolExecutor() as threads:
+        going = threads.submit(by.fetch, offer, target, **more)
+        wait_until_begun(target)
+        yield going
 
 
 def nothing_left(target: Path) -> bool:

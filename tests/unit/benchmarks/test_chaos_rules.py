@@ -44,7 +44,7 @@ CUT = Disturbance("host_cut", 12.0, 19.0, frozenset({"host1"}), hides=True)
 OFF = Disturbance("host_off", 20.0, 25.0, frozenset({"host1"}), kills=True, hides=True)
 
 
-def test_nobody_may_end_to_whom_nothing_was_done():
+def test_a_process_without_a_disturbance_must_not_end():
     """Only a killed process, or one on a host that lost its power, may end."""
     plain = Guarantees()
     assert kinds(plain, [FIRST, SECOND], []) == (["touched"], {})
@@ -88,7 +88,7 @@ def test_an_overloaded_machine_explains_what_nothing_else_does():
     assert kinds(elsewhere, [late, beside], [overload, CUT])[0] == ["doubled"]
 
 
-def test_who_comes_back_for_a_moment_does_not_end_the_owner():
+def test_an_instance_that_returns_for_a_moment_does_not_end_the_owner():
     """A lost host has its power again, and starts a process that has a successor by now."""
     old, owner = run(last=20.0), run("a#2", "host2", 24.0, 40.0)
     back = run("a#1", "host1", 25.5, 25.6, pid=9)
@@ -140,7 +140,7 @@ def test_a_slave_that_is_stopped_lets_its_host_fence_sooner_than_the_host_is_los
     assert kinds(elsewhere, [FIRST, SECOND], [replace(slave, deafens=False)])[0] == ["touched"]
 
 
-def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
+def test_the_state_of_a_killed_node_continues_where_a_snapshot_is():
     """A second of it may be repeated.
 
     Without a replica, a start on another host is from nothing.
@@ -176,7 +176,7 @@ def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
         assert after(guarantees, first, host, *disturbances)[0] == ["state"]
 
 
-def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
+def test_a_standby_lacks_the_cycles_of_a_host_that_is_cut_off():
     """Missing cycles count from the cut on, at ten a second."""
     guarded = Guarantees(stateful=True, standby=True, elsewhere=True)
     alone = run(first=10.0, last=19.5, numbers=(1, 96))  # cut off from 12.0 on
@@ -191,20 +191,20 @@ def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
 def test_a_state_that_came_to_no_other_host_in_time_is_lost():
     """The process was young, or the host of the replica was struck as well."""
     copied = Guarantees(stateful=True, kept=True, copied=5, elsewhere=True)
-    anew = run("a#2", "host2", 23.0, 30.0, (1, 50))
+    fresh = run("a#2", "host2", 23.0, 30.0, (1, 50))
     other = Disturbance("host_off", 19.0, 25.0, frozenset({"host3"}), kills=True, hides=True)
     overload = Disturbance(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True, deafens=True)
-    assert kinds(copied, [FIRST, anew], [OFF])[0] == ["state"]
+    assert kinds(copied, [FIRST, fresh], [OFF])[0] == ["state"]
     same, short = replace(other, hosts=OFF.hosts), replace(SHORT, hosts=other.hosts)
     for none in (overload, KILLED, same, short):
-        assert kinds(copied, [FIRST, anew], [OFF, none])[0] == ["state"]
+        assert kinds(copied, [FIRST, fresh], [OFF, none])[0] == ["state"]
     unrelated = [replace(other, hosts=frozenset({host})) for host in ("host3", "host4")]
-    assert kinds(copied, [FIRST, anew], [KILLED, *unrelated])[0] == ["state"]
-    assert kinds(copied, [FIRST, anew], [OFF, other]) == ([], {"state_from_nothing": 1})
+    assert kinds(copied, [FIRST, fresh], [KILLED, *unrelated])[0] == ["state"]
+    assert kinds(copied, [FIRST, fresh], [OFF, other]) == ([], {"state_from_nothing": 1})
     young = run(first=17.0, numbers=(1, 31))
-    assert kinds(copied, [young, anew], [OFF]) == ([], {"state_seconds_repeated": 1})
+    assert kinds(copied, [young, fresh], [OFF]) == ([], {"state_seconds_repeated": 1})
     young_and_far = run(first=17.0, numbers=(501, 531))
-    assert kinds(copied, [young_and_far, anew], [OFF]) == ([], {"state_from_nothing": 1})
+    assert kinds(copied, [young_and_far, fresh], [OFF]) == ([], {"state_from_nothing": 1})
 
 
 def test_a_standby_bears_one_fault_and_the_copy_another():

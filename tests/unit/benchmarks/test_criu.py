@@ -16,7 +16,7 @@ def hop(**changes):
     plain = {
         "strategy": "criu", "mb": 10.0, "end": "migrated", "why": "", "silence": 1.5,
         "seconds": 2.0, "parts": parts, "repeated": 0, "missed": 0, "checksums": [7],
-        "began_anew": False,
+        "restarted": False,
     }  # fmt: skip
     return {**plain, **changes}
 
@@ -54,7 +54,7 @@ def test_most_moves_are_of_the_first_heap():
 def test_the_table_has_all_strategies():
     """The table has the loss of each strategy."""
     others = {
-        "relaunch": beside([hop(strategy="relaunch", began_anew=True)], "relaunch"),
+        "relaunch": beside([hop(strategy="relaunch", restarted=True)], "relaunch"),
         "handoff": beside([hop(strategy="handoff")], "handoff"),
     }
     lines = table({"10": Outcome([hop()]).figures()}, others).splitlines()

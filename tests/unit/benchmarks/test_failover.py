@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.failover import GoneOn
+from benchmarks.failover import Continuation
 
 
 @pytest.mark.parametrize(
@@ -18,9 +18,9 @@ from benchmarks.failover import GoneOn
         (100, 100, 103, 0, 0, 2),
     ],
 )
-def test_a_state_is_lost_where_it_was_published_and_not_gone_on_from(
+def test_a_published_state_without_a_continuation_is_lost(
     said, published, first, lost, repeated, skipped
 ):
     """By design a cycle with an output but without a published state is repeated."""
-    gone_on = GoneOn(said, published, first)
-    assert (gone_on.lost, gone_on.repeated, gone_on.skipped) == (lost, repeated, skipped)
+    found = Continuation(said, published, first)
+    assert (found.lost, found.repeated, found.skipped) == (lost, repeated, skipped)

@@ -143,8 +143,8 @@ KEPT_UP = {
         ({}, None),
         ({"missed": 30_000}, "30000 of 59400 readings were missed"),
         ({"offered_per_s": 5000.0}, "5000.0 cycles a second instead of 10000 were carried out"),
-        ({"received_per_s": 5000.0}, "5000.0 cycles a second instead of 10000 were heard"),
-        ({"hosts_heard": 999}, "of 1000 slaves 999 were heard"),
+        ({"received_per_s": 5000.0}, "5000.0 cycles a second instead of 10000 were received"),
+        ({"hosts_heard": 999}, "of 1000 slaves 999 sent readings"),
         ({"masters_lost": 2}, "of 1000 slaves 2 took the master for lost"),
     ],
 )

@@ -80,7 +80,7 @@ def test_help_imports_neither_ros_nor_pydantic_nor_numpy():
         "import sys; from rosrm.cli.commands import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: print(*sorted("
-        "{'rclpy', 'pydantic', 'yaml', 'numpy', 'rosrm.ros.client', 'rosrm_lab.lab'}"
+        "{'rclpy', 'pydantic', 'yaml', 'numpy', 'rosrm.ros.master_connection', 'rosrm_lab.lab'}"
         " & set(sys.modules)))"
     )
     assert run(code).stdout.splitlines()[-1] == ""

@@ -13,7 +13,7 @@ from rosrm.extensions.registry import Registry
 from rosrm.testing import FakeProbe
 from tests.plugin_kit import plugin
 
-from .test_start import OURS
+from .test_runtimes import OURS
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ SIMULATION = "hosts: [{name: a, memory: 1GiB, cpu: 1}]\nprocesses: [{name: p, du
         ("f.yaml", f"name: evening\nseed: 1\n{SIMULATION}", "ok, a simulation"),
     ],
 )
-def test_the_name_tells_the_kind_where_the_keys_do_not(rosrm, file, name, text, said):
+def test_the_file_name_decides_the_kind_where_the_keys_do_not(rosrm, file, name, text, said):
     result = rosrm("config", "check", file(text, name))
     assert (result.code, result.err, said in result.out) == (0, "", True)
 
@@ -122,7 +122,7 @@ def test_a_file_of_another_kind_is_named_once(rosrm, file, command, text, said):
     assert said in result.err
 
 
-def test_every_wrong_file_is_said_and_nothing_else_is_lost(rosrm, file):
+def test_every_wrong_file_is_reported(rosrm, file):
     texts = {
         "a.yaml": "scoring: {policy: wieghted}", "b.yaml": "host: h1",
         "c.yaml": "host: h1\nprobes: [lidar]",

@@ -16,7 +16,7 @@ from rosrm.cli import connection, early
 from rosrm.cli.commands import app
 from rosrm.errors import NoMaster, RosrmError
 from rosrm.model.ros_settings import RosSettings
-from rosrm.ros import client as client_module
+from rosrm.ros import master_connection
 
 
 def test_the_domain_comes_from_before_or_after_the_command(rosrm, client):
@@ -53,7 +53,7 @@ def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, ela
             seen.update(name=name, timeout=timeout)
 
     module = SimpleNamespace(MasterClient=MasterClient)
-    monkeypatch.setitem(sys.modules, "rosrm.ros.client", module)
+    monkeypatch.setitem(sys.modules, "rosrm.ros.master_connection", module)
     monkeypatch.setattr(connection, "BEGUN", time.monotonic() - elapsed)
     connection.connect(RosSettings())
     assert least <= seen["timeout"] <= most
@@ -139,9 +139,9 @@ def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, serve
     closed = []
     participant = SimpleNamespace(settings=settings, close=lambda: closed.append(True))
     monkeypatch.delenv("ROS_DISCOVERY_SERVER", raising=False)
-    monkeypatch.setattr(client_module, "find_master", lambda *_: None)
+    monkeypatch.setattr(master_connection, "find_master", lambda *_: None)
     with pytest.raises(NoMaster) as refusal:
-        client_module.MasterClient.connect(
+        master_connection.MasterClient.connect(
             settings, name="x", timeout=1.6, joined=participant, begun=time.monotonic() - 3.0
         )
     assert "no master answered within 3.0 s" in str(refusal.value)
@@ -153,7 +153,7 @@ def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, serve
 def test_commands_do_not_load_the_generator_of_messages():
     """The generator costs 60 ms, and only builds of interfaces use it."""
     code = (
-        "import sys; from rosrm.ros import client; from rosrm_msgs import srv\n"
+        "import sys; import rosrm.ros.master_connection; from rosrm_msgs import srv\n"
         "srv.List.__class__.__import_type_support__.__get__(srv.List)()\n"
         "print('em' in sys.modules, 'rosidl_generator_py' in sys.modules)"
     )
@@ -167,7 +167,7 @@ def test_without_ros_a_command_says_how_to_get_it(monkeypatch):
     real = builtins.__import__
 
     def no_ros(name, *more):
-        if name == "rosrm.ros.client":
+        if name == "rosrm.ros.master_connection":
             raise ModuleNotFoundError("No module named 'rclpy'", name="rclpy")
         return real(name, *more)
 

@@ -29,7 +29,7 @@ def here(monkeypatch):
     return pretend
 
 
-def test_one_that_works_is_told_line_by_line(rosrm, here):
+def test_a_working_criu_is_reported_line_by_line(rosrm, here):
     here()
     result = rosrm("criu", "check", "--prefix", "/opt/criu")
     assert result.code == 0
@@ -59,7 +59,7 @@ def test_without_the_libraries_of_a_transfer_no_image_can_be_sent(rosrm, here, m
     )
 
 
-def test_one_that_does_not_is_told_with_what_to_do(rosrm, here):
+def test_a_criu_that_does_not_work_is_reported_with_the_remedy(rosrm, here):
     here("it has no right. `sudo setcap ...` gives it", "4.1.1")
     result = rosrm("criu", "check")
     assert result.code == 1
@@ -69,7 +69,7 @@ def test_one_that_does_not_is_told_with_what_to_do(rosrm, here):
     ]
 
 
-def test_none_is_told_in_one_line(rosrm, here):
+def test_a_missing_criu_is_reported_in_one_line(rosrm, here):
     here(missing="there is no CRIU here. `install_criu.sh` installs one")
     result = rosrm("criu", "check")
     assert (result.code, result.err) == (1, "")

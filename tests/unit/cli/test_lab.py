@@ -44,7 +44,7 @@ def test_numbers_are_base_units():
         ({}, [":cpu=1"], "'' cannot be the name of a host"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_place(changes, more, said):
+def test_a_wrong_argument_is_reported_with_its_place(changes, more, said):
     """The error also has the allowed values."""
     with pytest.raises(ConfigError) as raised:
         planned(1, {**LIMITS, **changes}, more)

@@ -63,7 +63,9 @@ def test_status_names_the_plugins_that_fail(rosrm, client):
 
 @pytest.mark.parametrize("command", ["status", "ps", "hosts", "events"])
 @pytest.mark.parametrize("json_too", [(), ("--json",)])
-def test_a_master_that_takes_no_work_is_told_beside_the_listing(rosrm, client, command, json_too):
+def test_a_master_that_accepts_no_work_is_reported_beside_the_listing(
+    rosrm, client, command, json_too
+):
     whole = rosrm(command, *json_too)
     client.trouble = "the master accepts no new work: the disk is full"
     result = rosrm(command, *json_too)
@@ -73,7 +75,7 @@ def test_a_master_that_takes_no_work_is_told_beside_the_listing(rosrm, client, c
         assert result.out == whole.out
 
 
-def test_ps_lists_what_is_not_over_and_says_what_it_leaves_out(rosrm, client):
+def test_ps_leaves_out_terminal_processes_and_counts_them(rosrm, client):
     out = rosrm("ps").out
     assert "done" not in out
     assert "1 finished or cancelled (--all shows them)" in out
@@ -223,18 +225,18 @@ def drawn(made, width=60):
     return [line.rstrip() for line in output.getvalue().splitlines()]
 
 
-def test_the_history_of_explain_wraps_below_the_message():
-    entry = {"elapsed": 9.0, "kind": "waits", "message": "a host " * 9}
-    lines = drawn(explain.render({**STORY, "history": [entry]}))
-    first = next(i for i, line in enumerate(lines) if "waits" in line)
+LONG = "a host " * 9
+WAITS = {"elapsed": 9.0, "kind": "waits", "message": LONG}
+
+
+@pytest.mark.parametrize(
+    "made", [explain.render({**STORY, "history": [WAITS]}), tables.event(event(1, message=LONG))]
+)
+def test_an_event_on_a_terminal_wraps_below_its_message(made):
+    lines = drawn(made)
+    first = next(i for i, line in enumerate(lines) if "a host" in line)
     indent = lines[first].index("a host")
     assert [len(line) - len(line.lstrip()) for line in lines[first + 1 :]] == [indent, indent]
-
-
-def test_an_event_on_a_terminal_wraps_below_its_message():
-    lines = drawn(tables.event(event(1, message="a host " * 9)))
-    indent = lines[0].index("a host")
-    assert [len(line) - len(line.lstrip()) for line in lines[1:]] == [indent, indent]
 
 
 @pytest.fixture
@@ -264,24 +266,22 @@ def test_explain_says_that_older_events_are_left_out_and_where_they_are(explaine
         ("set_aside", "talker is set aside on alpha"),
     ],
 )
-def test_a_state_is_said_in_a_sentence(explained, state, sentence):
+def test_a_state_is_shown_in_a_sentence(explained, state, sentence):
     assert explained(state=state)[0] == sentence
 
 
-def test_one_restart_is_singular(rosrm, client):
-    client.processes = [process("talker", restarts=1)]
-    assert re.search(r"1 restart\b", rosrm("ps").out)
+@pytest.mark.parametrize(
+    ("restarts", "reason", "shown"),
+    [(1, "", r"1 restart\b"), (3, "its restart policy allows 3 restarts in 300 s", "3 restarts")],
+)
+def test_the_number_of_restarts_is_shown_once(rosrm, client, restarts, reason, shown):
+    client.processes = [process("talker", restarts=restarts, reason=reason)]
+    assert len(re.findall(shown, rosrm("ps").out)) == 1
 
 
-def test_restarts_that_the_reason_counts_are_not_said_twice(rosrm, client):
-    reason = "exit code 3; its restart policy allows 3 restarts within 300 s"
-    client.processes = [process("crashed", "failed", restarts=3, reason=reason)]
-    assert rosrm("ps").out.count("3 restarts") == 1
-
-
-@pytest.mark.parametrize("command", ["events", "ps"])
+@pytest.mark.parametrize("command", ["events", "ps", "logs talker"])
 def test_a_host_that_is_not_there_is_refused(rosrm, client, command):
-    result = rosrm(command, "--host", "alpa")
+    result = rosrm(*command.split(), "--host", "alpa")
     assert (result.code, result.out) == (1, "")
     assert result.err == (
         "rosrm: no such host: 'alpa'; did you mean 'alpha'? (`rosrm hosts` lists them)\n"
@@ -310,7 +310,7 @@ def test_explain_json_is_the_masters_own(rosrm, client):
     assert json.loads(rosrm("explain", "talker", "--json").out) == STORY
 
 
-def test_explain_says_where_a_state_is_kept(explained):
+def test_explain_lists_the_snapshot_replicas(explained):
     kept = [{"host": "beta", "number": 7, "sequence": 120, "size": 5_000_000, "elapsed": 0.4}]
     said = "Snapshots of its state are on beta (cycle 120, 5.0 MB, 0.4 s ago)."
     assert explained(kept=kept)[1] == said

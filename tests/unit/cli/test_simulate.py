@@ -132,7 +132,7 @@ def test_until_ends_the_recorded_run_as_well(rosrm, record):
     assert report["record"]["decisions"] == 6
 
 
-def test_a_replay_that_decides_otherwise_is_said(rosrm, tmp_path, content):
+def test_a_replay_with_other_decisions_is_reported(rosrm, tmp_path, content):
     """The header names another policy than the one that decided."""
     from io import BytesIO
 
@@ -168,7 +168,7 @@ def test_a_bad_record_is_one_clear_error(rosrm, tmp_path, content, change, said)
     assert f"r.rosrec: {said}" in result.err
 
 
-def test_one_that_is_cut_short_can_be_used_as_far_as_it_goes(rosrm, tmp_path, content):
+def test_a_record_cut_short_is_used_up_to_the_cut(rosrm, tmp_path, content):
     (tmp_path / "r.rosrec").write_bytes(content[:-200])
     result = rosrm("simulate", tmp_path / "r.rosrec", "--cut")
     assert (result.code, "cut short" in result.out) == (0, True)

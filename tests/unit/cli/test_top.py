@@ -17,7 +17,7 @@ from .conftest import HOSTS, NAN, PROCESSES, event, host, process, resource
 
 def drawn(snapshot, width=80, **more):
     output = StringIO()
-    Console(file=output, width=width, color_system=None).print(top.render(snapshot, **more))
+    Console(file=output, width=width, color_system=None).print(top.TopView(snapshot, **more))
     return output.getvalue()
 
 

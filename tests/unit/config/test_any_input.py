@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosrm.config import load_cluster, load_host, load_work
+from rosrm.config.cluster import load_cluster
+from rosrm.config.host import load_host
 from rosrm.config.process import (
     LabelsInFile,
     MigrationInFile,
@@ -20,6 +21,7 @@ from rosrm.config.process import (
 )
 from rosrm.config.ros import DiscoveryInFile, RosInFile
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
+from rosrm.config.work import load_work
 from rosrm.errors import ConfigError
 
 KINDS = (

@@ -9,7 +9,8 @@ from typing import Annotated
 import pytest
 from annotated_types import Le
 
-from rosrm.config import ClusterConfig, load_cluster
+from rosrm.config.cluster import load_cluster
+from rosrm.config.settings import ClusterConfig
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.extensions.registry import Registry
@@ -125,7 +126,7 @@ def test_every_setting_is_read(file, tmp_path):
     assert ClusterConfig.from_json(config.to_json()) == config
 
 
-def test_everything_wrong_is_said_at_once_each_with_its_place(refusal):
+def test_every_error_is_reported_at_once_with_its_place(refusal):
     said = refusal(
         load_cluster,
         """
@@ -180,7 +181,7 @@ def test_a_suspicion_of_just_three_beat_periods_is_taken(file):
     assert load_cluster(file("liveness: {suspect: 600ms}")).liveness.suspect == 0.6
 
 
-def test_a_wrong_type_and_an_unknown_plugin_are_said_together(refusal, registry):
+def test_a_wrong_type_and_an_unknown_plugin_are_reported_together(refusal, registry):
     said = refusal(load_cluster, "name: 5\nscoring: {policy: wieghted}\n", registry)
     assert "f.yaml:1:7: name: text is required, not 5" in said
     unknown = "f.yaml:2:11: unknown scoring policy 'wieghted'; did you mean 'weighted'?"
@@ -238,7 +239,7 @@ def test_options_that_nothing_takes_are_refused(refusal, registry, text, said):
     assert said in refusal(load_cluster, text, registry)
 
 
-def test_a_default_plugin_that_is_not_installed_is_said_too(refusal):
+def test_a_default_plugin_that_is_not_installed_is_reported(refusal):
     said = refusal(load_cluster, "", Registry.of())
     assert "unknown scoring policy 'weighted'. None is installed; rosrm-scoring brings" in said
     assert "unknown migration strategy 'relaunch'" in said

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.config import HostConfig, load_host
+from rosrm.config.host import load_host
+from rosrm.config.settings import HostConfig
 from rosrm.errors import ConfigError
 
 
@@ -19,14 +20,14 @@ def test_the_variable_gives_the_default(monkeypatch, file, word, scope):
     assert HostConfig().scope == load_host(file("host: a")).scope == scope
 
 
-def test_the_file_has_the_last_word(monkeypatch, file):
+def test_the_file_takes_precedence(monkeypatch, file):
     """The file is more specific than the variable."""
     monkeypatch.setenv("ROSRM_SCOPE", "cgroup")
     assert load_host(file("scope: machine")).scope == "machine"
 
 
 @pytest.mark.parametrize("word", ["slice", "Cgroup", "x"])
-def test_a_wrong_word_is_refused(monkeypatch, refusal, word):
+def test_a_wrong_scope_is_refused(monkeypatch, refusal, word):
     """A slice needs a budget, which the variable cannot give."""
     monkeypatch.setenv("ROSRM_SCOPE", word)
     assert f"ROSRM_SCOPE={word!r}; allowed: machine, cgroup" in refusal(load_host, "host: a")

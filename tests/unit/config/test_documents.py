@@ -54,7 +54,7 @@ def test_a_key_given_twice_is_refused_with_both_places():
     )
 
 
-def test_every_fault_of_form_is_said_at_once():
+def test_every_fault_of_form_is_reported_at_once():
     said = refusal("a: 1\na: 2\n3: x\nc: !!python/name:os.system y\n")
     assert said.startswith("3 errors in f.yaml\n")
     assert "f.yaml:3:1: a key must be text, and '3' is not; put it in quotes" in said

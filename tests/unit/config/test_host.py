@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from rosrm.config import HostConfig, load_host
+from rosrm.config.host import load_host
+from rosrm.config.settings import HostConfig
 from rosrm.errors import SkipPlugin
 from rosrm.extensions.contracts import ProbeOffer
 from tests.plugin_kit import registry_of
@@ -140,7 +141,7 @@ def test_a_resource_that_no_probe_reads_is_refused_with_the_nearest(refusal, wit
 
 
 def test_a_limit_of_a_probe_that_is_not_chosen_is_refused(refusal, file, with_fds):
-    """Its limit would never apply."""
+    """The limit would never apply."""
     said = refusal(load_host, "limits: {fds: 0.9}", with_fds)
     assert "limits: 'fds' is read by the probe 'fds', which is not among `probes`" in said
     assert load_host(file("limits: {fds: 0.9}\nprobes: [fds]"), with_fds).limits["fds"] == 0.9

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 
 import pytest
 
-from rosrm.config import load_work
 from rosrm.config.process import ProcessInFile
+from rosrm.config.work import load_work
 from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (
@@ -34,7 +34,7 @@ def test_every_key_of_a_process_reaches_its_spec():
     assert in_file - {field.name for field in fields(ProcessSpec)} == {"labels"}
 
 
-def test_every_word_is_read(file):
+def test_every_key_is_read(file):
     spec = one(
         file(
             """
@@ -238,7 +238,7 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
          "unknown migration strategy 'relunch'"),
     ],
 )  # fmt: skip
-def test_what_several_keys_break_is_said_along_with_a_wrong_key(refusal, entry, said):
+def test_a_conflict_of_keys_is_reported_along_with_a_wrong_key(refusal, entry, said):
     """The message lists all errors at once, not one stage of the check after the other."""
     found = refusal(load_work, f"processes: [{{name: a, {entry}}}]", registry_of(RELAUNCH))
     assert said in found
@@ -248,7 +248,7 @@ def test_what_several_keys_break_is_said_along_with_a_wrong_key(refusal, entry, 
 @pytest.mark.parametrize(
     "entry", ["comand: x", "package: [p], executable: e, parameters: {b: 1}", "module: 5, ros: 3"]
 )
-def test_a_key_that_cannot_be_read_is_not_said_to_be_missing(refusal, entry):
+def test_an_unreadable_key_is_not_reported_as_missing(refusal, entry):
     """Errors that only follow from the first one are left out."""
     said = refusal(load_work, f"processes: [{{name: a, {entry}}}]")
     assert "exactly one of" not in said
@@ -354,7 +354,7 @@ def test_a_misspelt_section_is_one_error(refusal):
     )
 
 
-def test_a_fault_in_defaults_is_said_once_at_its_place(refusal):
+def test_a_fault_in_defaults_is_reported_once_at_its_place(refusal):
     processes = "processes: [{name: a, command: x}, {name: b, command: x}]"
     said = refusal(load_work, f"defaults: {{needs: {{memory: 64mib}}}}\n{processes}")
     assert said.startswith("f.yaml:1:28: needs.memory: unknown unit 'mib'; did you mean 'MiB'?")
@@ -397,7 +397,7 @@ class Waits:
     ready: PositiveSeconds = 10.0
 
 
-def test_only_the_options_that_a_process_gives_go_over_those_of_the_cluster(file):
+def test_only_options_given_by_a_process_override_those_of_the_cluster(file):
     """Values are in base units.
 
     Missing options keep the cluster's values, not the plugin's defaults.

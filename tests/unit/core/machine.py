@@ -74,7 +74,6 @@ class Machine(Host[Program]):
     connected: bool = True
     takes: bool = True
     fresh: bool = False
-    pids: int = 100
 
     def __post_init__(self) -> None:
         self.resources = self.resources or (
@@ -104,14 +103,11 @@ class Machine(Host[Program]):
     # --- programs --------------------------------------------------------------------------
 
     def make_program(self, assignment: Assignment, restart: RestartPolicy) -> Program:
-        self.pids += 1
         silent = assignment.shadow or assignment.restored
         node = Node(assignment.instance, silent, self.quirks[assignment.instance.process])
-        return Program(assignment=assignment, restart=restart, pid=self.pids, node=node)
+        return Program(assignment=assignment, restart=restart, pid=self.next_pid(), node=node)
 
     def run_begins_again(self, program: Program, now: float) -> None:
-        self.pids += 1
-        program.pid = self.pids
         instance = program.assignment.instance
         program.node = Node(instance, False, self.quirks[instance.process])
 

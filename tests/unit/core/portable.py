@@ -100,7 +100,7 @@ class Portable(Machine):
     def _checkpoint(self, arguments: Mapping[str, Any]) -> Any:
         node = self._node(arguments, "source")
         if arguments["attempt"] in self._turned_back or node is None:
-            raise RuntimeError("it was turned back meanwhile, or has ended")
+            raise RuntimeError("it was turned back since, or has ended")
         node.active = False
         self.stand_still[node.instance.number] = arguments["attempt"]
         return {"offer": "of an image"}

@@ -148,6 +148,15 @@ def test_a_primary_keeps_its_restarts_beside_its_standby() -> None:
     assert not cluster.told("migration_step")
 
 
+def test_the_end_of_a_standby_is_reported_with_its_cause() -> None:
+    """The event quotes the exit status of the standby."""
+    cluster = with_standby()
+    cluster.machines["b"].finish("p", cluster.now, code=3)
+    cluster.wait(1.0)
+    (lost,) = cluster.told("standby_lost")
+    assert lost.startswith("p has no standby: p#2 ended: exit code 3"), lost
+
+
 def test_one_that_gave_up_is_replaced_after_a_while() -> None:
     """The delay grows with each failed standby."""
     cluster = Cluster("a", "b")

@@ -43,21 +43,20 @@ Error (criu/util.c:1534): rlimit: Can't setup RLIMIT_NOFILE for self: Operation 
         ),
         (WITHOUT_TIMES, ("inet: Can't bind inet socket: in use",)),
         ("Error (criu/cr-restore.c:99): exited, status=1\n" * 2, ("exited, status=1",)),
+        (
+            "".join(f"(00.1) Error (a.c:{n}): cause {n}\n" for n in range(20)),
+            ("cause 0", "cause 1", "cause 2"),
+        ),
         ("(00.1) Looks good.\nWarn (a.c:1): Error is a word\n", ()),
         ("", ()),
     ],
-    ids=["socket", "restore", "without-times", "nothing-better", "no-error", "empty"],
+    ids=["socket", "restore", "without-times", "nothing-better", "many", "no-error", "empty"],
 )
-def test_the_first_causes_are_told_once_and_without_what_every_failure_says(log, expected):
+def test_the_first_three_causes_are_named_once_without_general_lines(log, expected):
     assert causes(log) == expected
 
 
-def test_no_more_lines_than_fit_a_sentence():
-    log = "".join(f"(00.1) Error (a.c:{n}): cause {n}\n" for n in range(20))
-    assert causes(log) == ("cause 0", "cause 1", "cause 2")
-
-
-def test_where_nothing_is_called_an_error_its_first_words_are_taken():
+def test_without_an_error_the_first_line_is_taken():
     said = (
         "Warn  (criu/kerndat.c:1200): $XDG_RUNTIME_DIR not set.\n"
         "CRIU needs to have the CAP_SYS_ADMIN or the CAP_CHECKPOINT_RESTORE capability: \n"
@@ -70,41 +69,39 @@ def test_where_nothing_is_called_an_error_its_first_words_are_taken():
 # --- explanations of messages that CRIU 4.2.1 gave in trials ---------------------------------
 
 
-@pytest.mark.parametrize(
-    ("said", "meaning"),
-    [
-        ("Can't dump file 3 of that type [20600] (chr 10:229)", "is the device 10:229"),
-        ("Can't dump file 3 of that type [600] (anon anon_inode:[userfaultfd])", "userfaultfd"),
-        ("unix: External socket is used. Consider using --ext-unix-sk option.", "Unix socket"),
-        ("Task 1 with SysVIPC shmem map @7f54 doesn't live in IPC ns", "System V shared memory"),
-        ("sockets: BUG! Unknown socket collected (family 40)", "address family 40"),
-        ("pidfd: pidfd pid 1 is not a part of process tree..", "a pidfd of the process 1"),
-        ("Can't dump nested pid namespace for 14630", "a pid namespace of its own"),
-        ("Can't lookup mount=43 for fd=1 path=/tmp/x.log;", "the file /tmp/x.log lies on a mount"),
-        ("Can't write 4096 bytes: No space left on device", "the file system of the image is full"),
-    ],
-)  # fmt: skip
-def test_why_it_could_not_be_dumped(said, meaning):
-    """The explanation of a failed dump names the resource."""
-    assert meaning in explain_dump(f"CRIU 4.2.1 could not dump: {said} (its log: /a/dump.log)")
+DUMP = [
+    ("Can't dump file 3 of that type [20600] (chr 10:229)", "is the device 10:229"),
+    ("Can't dump file 3 of that type [600] (anon anon_inode:[userfaultfd])", "userfaultfd"),
+    ("unix: External socket is used. Consider using --ext-unix-sk option.", "Unix socket"),
+    ("Task 1 with SysVIPC shmem map @7f54 doesn't live in IPC ns", "System V shared memory"),
+    ("sockets: BUG! Unknown socket collected (family 40)", "address family 40"),
+    ("pidfd: pidfd pid 1 is not a part of process tree..", "a pidfd of the process 1"),
+    ("Can't dump nested pid namespace for 14630", "a pid namespace of its own"),
+    ("Can't lookup mount=43 for fd=1 path=/tmp/x.log;", "the file /tmp/x.log lies on a mount"),
+    ("Can't write 4096 bytes: No space left on device", "the file system of the image is full"),
+]  # fmt: skip
+RESTORE_FAULTS = [
+    ("inet: Can't bind inet socket (id 15): Cannot assign requested address", "does not have"),
+    ("inet: Can't bind inet socket (id 15): Address already in use", "port .* is in use here"),
+    ("Can't fork for 4711: File exists", "its pid 4711 is in use here"),
+    ("Can't open file home/a/x on restore: No such file or directory", "file /home/a/x cannot"),
+    ("File home/a/x has bad size 3 (expect 4)", "/home/a/x has 3 bytes here; .* with 4"),
+    ("unix: FATAL: Peer 1739708 unresolved for 1741185", "Unix socket"),
+]
 
 
 @pytest.mark.parametrize(
-    ("said", "meaning"),
+    ("explain", "message", "meaning"),
     [
-        ("inet: Can't bind inet socket (id 15): Cannot assign requested address", "does not have"),
-        ("inet: Can't bind inet socket (id 15): Address already in use", "port .* is in use here"),
-        ("Can't fork for 4711: File exists", "its pid 4711 is in use here"),
-        ("Can't open file home/a/x on restore: No such file or directory", "file /home/a/x cannot"),
-        ("File home/a/x has bad size 3 (expect 4)", "/home/a/x has 3 bytes here; .* with 4"),
-        ("unix: FATAL: Peer 1739708 unresolved for 1741185", "Unix socket"),
+        *((explain_dump, *row) for row in DUMP),
+        *((explain_restore, *row) for row in RESTORE_FAULTS),
     ],
 )
-def test_why_it_could_not_be_restored(said, meaning):
-    """The explanation of a failed restore names what this host lacks."""
-    assert re.search(meaning, explain_restore(f"CRIU 4.2.1 could not restore: {said}"))
+def test_a_known_message_is_explained(explain, message, meaning):
+    """The explanation names the resource, or what this host lacks."""
+    assert re.search(meaning, explain(f"CRIU 4.2.1 failed: {message} (its log: /a/x.log)"))
 
 
-def test_what_is_not_in_the_table_is_passed_on():
-    """An unknown message gets no explanation."""
+def test_an_unknown_message_has_no_explanation():
+    """The message itself is passed on."""
     assert explain_dump("something new") == explain_restore("something new") == ""

@@ -70,10 +70,10 @@ def test_a_damaged_one_is_named(parent, content):
         slots.newest(parent)
 
 
-def test_who_is_to_begin_anew_does_so_once(parent):
-    """`begin_anew` removes all images once, including one completed since; later ones are used."""
+def test_a_start_without_image_happens_once(parent):
+    """All images are removed once, including one completed since; later ones are used."""
     slot = image(parent)
-    slots.begin_anew(parent)
+    slots.start_without_image(parent)
     slots.complete(slot, REJOIN)
     assert slots.newest(parent) is None
     assert not parent.exists()
@@ -115,16 +115,16 @@ def test_without_an_image_it_is_the_process_itself(parent):
 
 def test_sigpipe_ends_it_as_ever(parent):
     """SIGPIPE ends the process, although Python ignores it and execve keeps ignored signals."""
-    done = start(parent, "sh", "-c", "kill -PIPE $$; echo went on")
+    done = start(parent, "sh", "-c", "kill -PIPE $$; echo continued")
     assert (done.returncode, done.stdout) == (-13, "")
 
 
-def test_an_image_that_is_damaged_is_said_and_the_process_begins_anew(parent):
+def test_a_damaged_image_is_logged_and_the_process_starts_without_it(parent):
     """A damaged image is logged, and the process starts without it."""
     slot = image(parent)
     (slot / "rejoin.json").write_text("{")
-    done = start(parent, "echo", "anew")
-    assert (done.returncode, done.stdout) == (0, "anew\n")
+    done = start(parent, "echo", "started")
+    assert (done.returncode, done.stdout) == (0, "started\n")
     assert "not started from its periodic image, but without it" in done.stderr
 
 
@@ -141,10 +141,10 @@ def test_it_asks_the_node_to_join_before_it_is_restored(parent, tmp_path):
     control = tmp_path / "control"
     slot = image(parent)
     slots.complete(slot, Rejoin(str(control), "p#1-periodic-1", os.geteuid()))
-    done = start(parent, "echo", "anew")
+    done = start(parent, "echo", "started")
     assert done.returncode == 125
     assert "not restored" in done.stderr
     request = json.loads((control / "request").read_text())
     assert (request["id"], request["want"]) == ("p#1-periodic-1", "join")
-    assert start(parent, "echo", "anew").returncode == 125
-    assert start(parent, "echo", "anew").stdout == "anew\n"
+    assert start(parent, "echo", "started").returncode == 125
+    assert start(parent, "echo", "started").stdout == "started\n"

@@ -35,39 +35,39 @@ def start(directory: Path, *then: str, remove: bool = True) -> subprocess.Comple
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_after_a_life_that_was_restored_the_process_begins_anew(directory):
+def test_after_a_restored_process_has_ended_its_command_runs(directory):
     """A restart after a restore runs the command, keeps the result and removes leftover images."""
-    told = Outcome(pid=7, inner_pid=7)
-    restore_result.write(directory, told)
+    outcome = Outcome(pid=7, inner_pid=7)
+    restore_result.write(directory, outcome)
     for _ in range(2):
-        assert start(directory, "echo", "anew").stdout == "anew\n"
-        assert restore_result.read(directory) == told
+        assert start(directory, "echo", "started").stdout == "started\n"
+        assert restore_result.read(directory) == outcome
         assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
 
 
-def test_without_an_image_nothing_begins_anew(tmp_path):
+def test_without_an_image_no_command_runs(tmp_path):
     """A missing image fails the start, because its process is lost or may run elsewhere."""
-    ended = start(tmp_path / "in-7", "echo", "anew")
+    ended = start(tmp_path / "in-7", "echo", "started")
     assert (ended.returncode, ended.stdout) == (FAILED, "")
     assert "holds no complete image" in ended.stderr
 
 
-@pytest.mark.parametrize("told", [None, Outcome(reason="no room")])
-def test_a_restore_that_never_worked_does_not_begin_anew(directory, told):
+@pytest.mark.parametrize("outcome", [None, Outcome(reason="no room")])
+def test_after_a_failed_restore_no_command_runs(directory, outcome):
     """A failed restore fails with its reason at each start, and the command never runs."""
-    if told is not None:
-        restore_result.write(directory, told)
+    if outcome is not None:
+        restore_result.write(directory, outcome)
     for _ in range(2):
-        ended = start(directory, "echo", "anew")
+        ended = start(directory, "echo", "started")
         assert (ended.returncode, ended.stdout) == (FAILED, "")
         assert "damaged" in restore_result.read(directory).reason
 
 
-def test_an_image_without_a_command_is_for_one_life_too(directory):
+def test_an_image_without_a_command_is_used_once(directory):
     """A used image without a command fails the start; the result of the restore stays."""
-    told = Outcome(pid=7, inner_pid=7)
-    restore_result.write(directory, told)
+    outcome = Outcome(pid=7, inner_pid=7)
+    restore_result.write(directory, outcome)
     ended = start(directory)
     assert ended.returncode == FAILED
     assert "was restored before" in ended.stderr
-    assert restore_result.read(directory) == told
+    assert restore_result.read(directory) == outcome

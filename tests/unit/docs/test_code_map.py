@@ -38,7 +38,7 @@ def test_every_source_file_that_is_named_exists(page: Path) -> None:
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 
-@pytest.mark.parametrize("way", ["a reading", "a submission", "a migration"])
+@pytest.mark.parametrize("way", ["a reading", "a submission", "a migration", "a handoff"])
 def test_each_step_of_a_way_names_one_file(way: str) -> None:
     """Each step has a path and the action there, in order."""
     section = re.split(r"^## ", MAP.partition(f"## The way of {way}\n")[2], flags=re.MULTILINE)[0]

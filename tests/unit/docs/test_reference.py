@@ -15,8 +15,11 @@ import typer.main
 
 import rosrm
 from rosrm.cli.commands import app
-from rosrm.config import ClusterConfig, HostConfig, load_cluster, load_host, load_work
+from rosrm.config.cluster import load_cluster
+from rosrm.config.host import load_host
 from rosrm.config.process import ProcessInFile
+from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.config.work import load_work
 from rosrm.extensions import contracts, hookspecs, installed
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.discovery import HOOKS
@@ -103,7 +106,7 @@ def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options)
     assert named - {name} == {field.name for field in fields(options)}
 
 
-def test_every_word_of_a_process_is_documented_and_nothing_else():
+def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
     wanted |= {"host_loss", "isolation", "standby", "health"}

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.config import load_cluster, load_host, load_work
+from rosrm.config.cluster import load_cluster
+from rosrm.config.host import load_host
+from rosrm.config.work import load_work
 from rosrm.extensions.registry import Registry
 from rosrm_examples import demo, demo_frame
 

@@ -30,11 +30,11 @@ def part(host: str, first: int, end: int, refused: int = 0) -> MapPart:
 def run() -> LiveRun:
     """Return a run without errors: three scans here, three there, the fourth 30 ms late."""
     late = [0.0, 0.0, 0.0, 0.03, 0.0, 0.0]
-    heard = [
+    received = [
         ReceivedPose(100.0 + PERIOD * index + late[index], index * 100_000_000, pose)
         for index, pose in enumerate(POSES)
     ]
-    return LiveRun(DRIVE, SCANS, heard, [part("a", 0, 3), part("b", 3, 6)], PERIOD)
+    return LiveRun(DRIVE, SCANS, received, [part("a", 0, 3), part("b", 3, 6)], PERIOD)
 
 
 def wrong(seen: LiveRun, state: str = "full", migrations: int = 1) -> list[str]:
@@ -56,17 +56,17 @@ def test_all_is_well() -> None:
 
 def test_a_scan_that_was_lost() -> None:
     seen = run()
-    seen = replace(seen, heard=[*seen.heard[:3], *seen.heard[4:]])
+    seen = replace(seen, received=[*seen.received[:3], *seen.received[4:]])
     assert summarise(seen, POSES, 1)["end_error_percent"] is None
     assert summarise(seen, POSES, 1)["gap_ms"] is None
     assert wrong(seen) == [
-        "scans_lost is 1, not 0", "no successor was heard right after its source",
+        "scans_lost is 1, not 0", "no successor has an output right after its source",
     ]  # fmt: skip
 
 
 def test_a_scan_that_was_mapped_twice() -> None:
     seen = run()
-    again = replace(seen, heard=[*seen.heard[:3], seen.heard[2], *seen.heard[3:]])
+    again = replace(seen, received=[*seen.received[:3], seen.received[2], *seen.received[3:]])
     assert wrong(again) == ["scans_repeated is 1, not 0"]
     refused = replace(seen, parts=[part("a", 0, 3), part("b", 3, 6, refused=2)])
     assert wrong(refused) == ["scans_repeated is 2, not 0"]
@@ -74,8 +74,8 @@ def test_a_scan_that_was_mapped_twice() -> None:
 
 def test_poses_out_of_order() -> None:
     seen = run()
-    heard = [*seen.heard[:4], seen.heard[5], seen.heard[4]]
-    late = replace(seen, heard=heard)
+    received = [*seen.received[:4], seen.received[5], seen.received[4]]
+    late = replace(seen, received=received)
     assert summarise(late, POSES, 1)["out_of_order"] == 1
     assert wrong(late) == []  # with two writers, repeated DDS messages arrive late
 
@@ -84,7 +84,8 @@ def test_no_migration() -> None:
     seen = replace(run(), parts=[part("a", 0, 6)])
     assert summarise(seen, POSES, 0)["gap_ms"] is None
     assert wrong(seen, migrations=0)[0] == "migrations is 0, not 1"
-    assert wrong(seen) == ["no successor was heard right after its source"]  # the move was too late
+    # The migration was too late.
+    assert wrong(seen) == ["no successor has an output right after its source"]
 
 
 def test_a_part_that_was_not_written() -> None:
@@ -95,13 +96,13 @@ def test_a_part_that_was_not_written() -> None:
 def test_a_deviation_is_judged_by_what_moved() -> None:
     seen = run()
     moved = make_pose(np.eye(3), np.array([5.0, 0.05, 0.0]))
-    seen = replace(seen, heard=[*seen.heard[:5], replace(seen.heard[5], pose=moved)])
+    seen = replace(seen, received=[*seen.received[:5], replace(seen.received[5], pose=moved)])
     assert wrong(seen, "pose") == []
     assert wrong(seen, "full") == ["max_deviation_m is 0.05, more than 1e-09"]
 
 
 def test_nothing_was_heard() -> None:
-    seen = replace(run(), heard=[])
+    seen = replace(run(), received=[])
     assert "scans_lost is 6, not 0" in wrong(seen)
     assert "max_deviation_m is None, more than 1e-09" in wrong(seen)
 

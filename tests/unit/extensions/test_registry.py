@@ -87,7 +87,7 @@ def test_an_unknown_name_is_refused_with_what_is_there_and_what_is_broken():
     assert "failed with OSError: no such table" in said
 
 
-def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
+def test_of_broken_plugins_only_the_selected_one_is_reported():
     """The plugin is found by the name of its offer or its own; others are only counted.
 
     If no plugin certainly matches, the error names those that broke before they offered a name.
@@ -155,7 +155,7 @@ def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
     ],
 )
 def test_a_resource_that_no_message_can_carry_is_refused(context, described, said):
-    """Its probe fails with the class and its place, and the others are made."""
+    """The probe fails with its class and place, and the others are made."""
     probe = Probe("a")
     probe.resources = [described]
     result = registry_of(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
@@ -267,7 +267,7 @@ def test_a_wrong_hook_is_reported(name, hook, said):
     assert re.search(said, broken.reason)
 
 
-def test_only_a_probe_that_says_so_is_absent_and_any_other_fault_is_an_error(context):
+def test_only_a_probe_that_raises_skip_is_absent(context):
     """The resources of a failed probe count as read without success, never as absent."""
 
     def skip(options, context):
@@ -324,7 +324,7 @@ UNCLOSABLE = SimpleNamespace(resources=[NOTHING], read=None, close=None)  # None
     ],
 )
 def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_fails(context, second, said):
-    """Its stand-in has its declared resources that no other probe reads, up to 16."""
+    """A stand-in has the declared resources that no other probe reads, up to 16."""
     registry = registry_of(
         offered("first", lambda options, context: Probe("a"), resources=("a",)),
         offered(

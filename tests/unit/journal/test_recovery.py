@@ -55,7 +55,7 @@ def spoil(path, table: str, which: int) -> None:
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])
-def test_what_can_be_read_goes_on(path, which) -> None:
+def test_readable_records_are_recovered(path, which) -> None:
     """With one damaged page of intents the others are restored, in both directions from it."""
     spoil(path, "intent", which)
     damaged = path.read_bytes()
@@ -77,7 +77,7 @@ def test_what_can_be_read_goes_on(path, which) -> None:
     journal.close()
 
 
-def test_of_a_file_that_was_cut_short_the_rest_goes_on(path, recovered) -> None:
+def test_a_file_cut_short_is_recovered_up_to_the_cut(path, recovered) -> None:
     """SQLite alone would read nothing of it; the amount depends on the remaining pages."""
     raw = path.read_bytes()
     path.write_bytes(raw[: len(raw) * 3 // 4])
@@ -154,7 +154,7 @@ def test_killed_at_any_step_the_journal_is_the_damaged_one_or_the_new_one(
     assert all(one == damaged for one in kept)
 
 
-def test_all_hosts_are_heard_before_work_is_given(path, recovered) -> None:
+def test_all_hosts_must_report_before_work_is_assigned(path, recovered) -> None:
     """A recovered journal counts as after a power loss: its `boot` is empty."""
     spoil(path, "intent", 1)
     assert recovered().intents("cluster")["epoch"] == {"epoch": 4, "boot": "recovered"}
@@ -176,7 +176,7 @@ def test_where_nothing_can_be_read_nothing_is_changed(path) -> None:
     assert [one.name for one in path.parent.iterdir()] == ["journal.sqlite"]
 
 
-def test_no_journal_is_said(tmp_path) -> None:
+def test_a_missing_journal_is_reported(tmp_path) -> None:
     """The error has the path."""
     with pytest.raises(JournalError, match=str(tmp_path / "journal.sqlite")):
         recover(tmp_path / "journal.sqlite")

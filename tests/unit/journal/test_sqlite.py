@@ -178,7 +178,7 @@ def test_a_damaged_log_costs_what_is_behind_the_damage(path, opened) -> None:
     assert journal.last_sequence == 2 * last
 
 
-def test_a_log_that_can_be_none_is_said(path) -> None:
+def test_an_occupied_path_of_the_write_ahead_log_is_reported(path) -> None:
     """The log's path is occupied, and the message names it."""
     fill(path)
     path.with_name("journal.sqlite-wal").mkdir()
@@ -187,7 +187,7 @@ def test_a_log_that_can_be_none_is_said(path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a file system")
-def test_a_file_system_that_is_read_only_is_said(mounted) -> None:
+def test_a_read_only_file_system_is_reported(mounted) -> None:
     """The message has the path and the remedy, and claims no damage."""
     disk = mounted()
     fill(disk / "journal.sqlite")
@@ -204,7 +204,7 @@ def test_another_version_is_refused(path) -> None:
         SqliteJournal(path)
 
 
-def test_a_stranger_s_database_is_refused(path) -> None:
+def test_a_foreign_database_is_refused(path) -> None:
     """The file of another program is not changed."""
     path.parent.mkdir()
     change(path, "CREATE TABLE record (something INTEGER)")
@@ -222,7 +222,7 @@ def test_a_locked_file_is_refused(path) -> None:
     holder.close()
 
 
-def test_a_full_disk_is_said(path, opened) -> None:
+def test_a_full_disk_is_reported(path, opened) -> None:
     """Acknowledged writes stay; the message has the full disk and the remedy."""
     code = """
         import json, resource, sys
@@ -255,7 +255,7 @@ def test_a_full_disk_is_said(path, opened) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
-def test_a_full_file_system_is_said(mounted) -> None:
+def test_a_full_file_system_is_reported(mounted) -> None:
     """The error has the file system, and writes succeed again once there is room.
 
     The group that failed is then written unchanged, and its numbers have no gap.
@@ -270,7 +270,7 @@ def test_a_full_file_system_is_said(mounted) -> None:
 
     (disk / "filler").write_bytes(bytes(100_000))
     journal = SqliteJournal(disk / "journal.sqlite")
-    free = rf"the disk is full \(the file system {disk} has \d.* free of 400.0 KiB\): make room"
+    free = rf"the disk is full \(the file system {disk} has \d.* free of 400 KiB\): make room"
     for _ in range(3):
         with pytest.raises(JournalBlocked, match=free):
             fill_up(journal)
@@ -285,14 +285,14 @@ def test_a_full_file_system_is_said(mounted) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_cannot_be_written_is_said(tmp_path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path) -> None:
     """The error has the path."""
     tmp_path.chmod(0o500)
     with pytest.raises(JournalError, match=r"journal\.sqlite"):
         SqliteJournal(tmp_path / "state" / "journal.sqlite")
 
 
-def test_a_path_that_can_be_none_is_said(tmp_path) -> None:
+def test_an_invalid_path_is_reported(tmp_path) -> None:
     """The path is a file in place of the folder, or a folder in place of the file."""
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.sqlite").mkdir()

@@ -94,7 +94,7 @@ def test_no_host_falls_silent_by_it() -> None:
     assert cluster.state.hosts.status_sequence[column] == machine.batches
 
 
-def test_a_suspect_host_that_is_heard_is_so_no_more() -> None:
+def test_a_contact_ends_the_suspicion_of_a_host() -> None:
     """Beats must report the contact; otherwise the host's fenced processes would stop.
 
     A lost host stays lost.

@@ -78,7 +78,7 @@ def test_each_plugin_has_its_own_deadline() -> None:
         assert ask(("scoring", "good"), lambda: "choice") == "choice"
 
 
-def test_the_place_at_which_a_plugin_hung_is_said_also_in_the_pause() -> None:
+def test_the_place_at_which_a_plugin_hung_is_reported_also_in_the_pause() -> None:
     """The first message and the later ones have the plugin's own line."""
     calls = PluginCalls(deadlines(pause=30.0))
     first = spin.__code__.co_firstlineno

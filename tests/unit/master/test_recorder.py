@@ -53,7 +53,7 @@ def test_only_its_owner_reads_it(start):
     assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
 
 
-def test_a_full_record_ends_there_and_says_so(start, caplog):
+def test_a_full_record_ends_there_and_logs_it(start, caplog):
     made = start(max_size=65536)
     note(made, 5000)
     made.close("the master stopped: SIGINT")
@@ -160,7 +160,7 @@ def test_what_cannot_be_encoded_ends_the_record_with_its_reason(start, monkeypat
     assert caplog.text.count("ends here") == 1
 
 
-def test_a_write_that_fails_ends_the_record_and_is_said_once(start, caplog):
+def test_a_failed_write_ends_the_record_and_is_logged_once(start, caplog):
     class Full(Opened):
         """File on a full disk."""
 

@@ -15,13 +15,13 @@ FULL = {
 }
 
 
-def test_a_slave_tells_who_a_process_is():
+def test_the_environment_identifies_a_process():
     """A process whose name has a slash has its identity, too."""
     identity = identity_from(FULL)
     assert identity == NodeIdentity("robot/p", 12, "/ns/p", "/rosrm/state_config", "lab", 4, False)
 
 
-def test_a_shadow_is_told_so():
+def test_a_shadow_is_marked_in_its_environment():
     """Only the exact value makes a shadow."""
     assert identity_from({**FULL, "ROSRM_SHADOW": "1"}).shadow
     assert not identity_from({**FULL, "ROSRM_SHADOW": ""}).shadow

@@ -1,4 +1,4 @@
-"""What a slave holds of moves by criu: steps that are asked for twice, and what is left behind."""
+"""Artifacts of migrations by criu on a slave: repeated steps, and cleanup."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _numbers = count()
 
 @pytest.fixture
 def attempt():
-    """One that no other test makes."""
+    """Return the id of an attempt that no other test uses."""
     return f"p#1-{next(_numbers)}"
 
 
-def test_a_step_that_is_asked_for_twice_is_done_once(attempt):
-    """Whoever asks while it is done, or later, gets the answer of the first."""
+def test_a_repeated_step_runs_once(attempt):
+    """Calls during the step and later ones get the answer of the first one."""
     begun, may_end, done = threading.Event(), threading.Event(), []
 
     def work():
@@ -44,17 +44,17 @@ def test_a_step_that_is_asked_for_twice_is_done_once(attempt):
     assert artifacts.once("other step", attempt, work) == {"n": 2}
 
 
-def test_a_step_that_failed_is_done_anew(attempt):
+def test_a_failed_step_runs_again(attempt):
     def fails():
         raise CriuError("no room")
 
     with pytest.raises(CriuError, match="no room"):
         artifacts.once("step", attempt, fails)
-    artifacts.after("step", attempt, 0.0)  # it is over
+    artifacts.after("step", attempt, 0.0)  # it has ended
     assert artifacts.once("step", attempt, dict) == {}
 
 
-def test_a_step_under_way_is_waited_for_no_longer_than_is_said(attempt):
+def test_the_wait_for_a_step_has_a_timeout(attempt):
     begun, may_end = threading.Event(), threading.Event()
 
     def work():
@@ -68,13 +68,13 @@ def test_a_step_under_way_is_waited_for_no_longer_than_is_said(attempt):
         with pytest.raises(CriuError, match=r"still under way after 0\.01 s"):
             artifacts.after("step", attempt, 0.01)
         may_end.set()
-        artifacts.after("step", attempt, PATIENCE)  # its failure is for who asked for it
+        artifacts.after("step", attempt, PATIENCE)  # its error is for the caller of the step
         with pytest.raises(CriuError, match="in the end"):
             going.result(PATIENCE)
 
 
-def test_what_a_former_slave_has_left_goes(tmp_path, monkeypatch):
-    """What it offered, at once; what it fetched, after a time; what runs keeps what is its own."""
+def test_remains_of_a_former_slave_are_removed(tmp_path, monkeypatch):
+    """Offered images at once, fetched ones later; an instance that runs keeps its image."""
     later = []
     monkeypatch.setattr(artifacts, "_later", lambda *call: later.append(call))
     for place in (outgoing(tmp_path, 1), incoming(tmp_path, 2), incoming(tmp_path, 3)):
@@ -90,12 +90,12 @@ def test_what_a_former_slave_has_left_goes(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("reason", "known"), [("", True), ("the image is damaged", False)])
-def test_an_unused_image_goes_and_that_there_was_a_restore_stays(tmp_path, reason, known):
-    """The program that holds the process may have been killed before it removed the image."""
+def test_an_unused_image_is_removed_and_the_result_of_a_restore_stays(tmp_path, reason, known):
+    """The shim may have been killed before it removed the image."""
     directory = incoming(tmp_path, 1)
     directory.mkdir(parents=True)
     (directory / image.MANIFEST).write_text("{}")
     restore_result.write(directory, Outcome(reason=reason, pid=7))
     artifacts.remove_unused(directory)
-    assert artifacts.was_restored(directory) is known
+    assert restore_result.was_restored(directory) is known
     assert not (directory / image.MANIFEST).exists()

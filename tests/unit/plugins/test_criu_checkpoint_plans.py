@@ -1,4 +1,4 @@
-"""The plans of `criu` for checkpoints and restores: sound, and whose options they are made by."""
+"""Plans of `criu` for checkpoints and restores, their options and their executors."""
 
 from __future__ import annotations
 
@@ -9,55 +9,58 @@ from rosrm.model.values import InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.testing import with_options
 from rosrm_criu.options import CriuOptions
 from rosrm_criu.plans import DROP, KEEP
-from rosrm_criu.plugin import register_migration_strategies
+from rosrm_criu.plugin import EXECUTORS, executor, register_migration_strategies
 from rosrm_criu.strategy import Criu
 
 OFFER = next(one for one in register_migration_strategies() if one.name == "criu")
 CRIU = Criu(CriuOptions(dump_timeout=7.0))
 
 
-def move(spec: ProcessSpec, source_node: str = "p") -> Move:
+def request(spec: ProcessSpec, source_node: str = "p") -> Move:
     one, two, three = (InstanceId("p", number) for number in (1, 2, 3))
-    asked = Move(spec, one, "a", two, "a", three, 0, source_node)
-    return with_options(asked, OFFER, dump_timeout=7.0)
+    move = Move(spec, one, "a", two, "a", three, 0, source_node)
+    return with_options(move, OFFER, dump_timeout=7.0)
 
 
 def timeout_of(plan: Plan, executor: str) -> float:
-    """Of the executor itself."""
+    """Return the timeout of the executor itself, in seconds."""
     (step,) = (one for one in plan.steps if isinstance(one, Execute) and one.executor == executor)
     return float(step.arguments["timeout"])
 
 
 def test_any_process_is_planned_for() -> None:
-    """Whether it is a ROS node or not, and however it moves."""
+    """A process may be a ROS node or not, and migrate by another strategy."""
     assert implements(CRIU, Imaging)
     for strategy in (None, "relaunch", "criu"):
-        asked = move(ProcessSpec("p", migration=MigrationPolicy(strategy)))
-        assert plan_fault(CRIU.checkpoint(asked), asked, Aim.CHECKPOINT) == ""
-        assert plan_fault(CRIU.restore(asked), asked, Aim.RESTORE) == ""
+        move = request(ProcessSpec("p", migration=MigrationPolicy(strategy)))
+        assert plan_fault(CRIU.checkpoint(move), move, Aim.CHECKPOINT) == ""
+        assert plan_fault(CRIU.restore(move), move, Aim.RESTORE) == ""
 
 
 def test_the_options_of_a_process_are_its_own_where_it_moves_by_criu() -> None:
-    """Those of another strategy would be none of ours."""
+    """Options of another strategy do not count."""
     own = MigrationPolicy("criu", options={"dump_timeout": 9.0})
     other = MigrationPolicy("handoff", options={"protocol": "paper"})
     for policy, seconds in ((own, 9.0), (other, 7.0)):
-        plan = CRIU.checkpoint(move(ProcessSpec("p", migration=policy)))
+        plan = CRIU.checkpoint(request(ProcessSpec("p", migration=policy)))
         assert timeout_of(plan, KEEP) == seconds
 
 
 def test_a_node_keeps_its_alias() -> None:
-    """It knows itself by no other name."""
+    """The restored node still has the name under which it was started."""
     for alias, said in (("p_7", "p_7"), ("p", "")):
-        plan = CRIU.restore(move(ProcessSpec("p"), alias))
+        plan = CRIU.restore(request(ProcessSpec("p"), alias))
         (start,) = (step for step in plan.steps if isinstance(step, Start))
         assert (start.node_name, start.restored, start.undo) == (said, True, None)
 
 
-def test_every_executor_is_there() -> None:
-    """Of all that the plans and their undo name, and what removes an image."""
-    asked = move(ProcessSpec("p"))
-    steps = [*CRIU.checkpoint(asked).steps, *CRIU.restore(asked).steps]
+def test_every_step_of_a_plan_has_an_executor() -> None:
+    """The steps of the plans and their undo, the one that drops an image, and no other one."""
+    move = request(ProcessSpec("p", ros=True, migration=MigrationPolicy("criu")))
+    plans = (CRIU.checkpoint(move), CRIU.restore(move), CRIU.propose(move))
+    steps = [each for plan in plans for step in plan.steps for each in (step, step.undo)]
     named = {one.executor for one in steps if isinstance(one, Execute)}
-    undone = {one.undo.executor for one in steps if isinstance(one.undo, Execute)}
-    assert named | undone | {DROP} <= set(OFFER.executors)
+    periodic = CRIU.periodic(move.spec, move.source, "a", 0)
+    assert {*named, DROP, periodic.executor, CRIU.discard, CRIU.ability} == set(EXECUTORS)
+    assert set(OFFER.executors) == set(EXECUTORS)
+    assert all(callable(executor(step)) for step in EXECUTORS)  # their modules are loaded late

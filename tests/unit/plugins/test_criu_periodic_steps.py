@@ -1,4 +1,4 @@
-"""What goes wrong with a periodic checkpoint is said in words."""
+"""Errors of periodic checkpoints."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rosrm_criu.executors.freeze import owner_of
 
 
 def started() -> subprocess.Popen[bytes]:
-    """A process with a place where it is spoken to, and that does nothing; stdin holds it."""
+    """Start a process with a control directory, which waits for the end of its input."""
     control = control_directory("test_criu_periodic_steps", os.geteuid())
     return subprocess.Popen(
         [sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE,
@@ -27,8 +27,8 @@ def started() -> subprocess.Popen[bytes]:
     )  # fmt: skip
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
-    """It is said before the node is asked for anything."""
+def test_a_directory_that_cannot_be_written_is_named(tmp_path):
+    """The error precedes any request to the node."""
     (tmp_path / "images").write_text("in the way")
     with started() as process:
         here = {"host": "a", "state": str(tmp_path), "pids": {"p#1": process.pid}, "instances": []}
@@ -46,11 +46,11 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
     [
         (errno.ENOSPC, True, "no image can be made in .*: No space left"),
         (errno.ENOENT, True, "no image can be made in .*: No such file"),
-        (errno.ENOENT, False, "was started anew meanwhile"),
+        (errno.ENOENT, False, "was restarted during the checkpoint"),
     ],
 )
-def test_images_that_were_taken_away_are_no_fault_of_the_disk(tmp_path, number, there, said):
-    """Who restarts a process by hand has its images removed, also one that is just being made."""
+def test_removed_images_are_no_fault_of_the_disk(tmp_path, number, there, said):
+    """A restart by a user removes all images, including one under way."""
     parent = paths.periodic(tmp_path, 1)
     if there:
         parent.mkdir(parents=True)
@@ -58,8 +58,8 @@ def test_images_that_were_taken_away_are_no_fault_of_the_disk(tmp_path, number, 
     assert re.search(said, periodic.why_not_written(parent, error))
 
 
-def test_a_process_that_has_ended_is_called_so():
-    """Whoever asks for its owner."""
+def test_the_owner_of_an_ended_process_is_unknown():
+    """The error names the pid."""
     with started() as process:
         process.communicate()
     with pytest.raises(CriuError, match=f"process {process.pid} has ended"):

@@ -20,9 +20,8 @@ from rosrm_criu.control.client import (
     control_directory,
     directory_of,
     make_directory,
-    remove_directory,
-    status_of,
 )
+from rosrm_criu.control.directory import remove_directory
 from rosrm_criu.control.listener import Listener
 from rosrm_criu.control.messages import (
     SIGNAL,
@@ -31,9 +30,8 @@ from rosrm_criu.control.messages import (
     State,
     Status,
     Want,
-    read_request,
-    write_request,
-    write_status,
+    read_message,
+    write_message,
 )
 
 PATIENCE = 20.0
@@ -48,7 +46,7 @@ def directory(tmp_path):
 def node(directory):
     """Return the listener of a running node."""
     listener = Listener(directory)
-    listener.say(Status(State.RUNNING))
+    listener.report(Status(State.RUNNING))
     return listener
 
 
@@ -78,18 +76,18 @@ def start():
 
 
 def leave(node: Listener) -> Request:
-    request = node.asked()
+    request = node.next_request()
     assert request.want is Want.LEAVE
-    node.say(Status(State.LEAVING, request.id))
-    node.say(Status(State.LEFT, request.id))
+    node.report(Status(State.LEAVING, request.id))
+    node.report(Status(State.LEFT, request.id))
     return request
 
 
 def join(node: Listener) -> Request:
-    request = node.asked()
+    request = node.next_request()
     assert request.want is Want.JOIN
     node.enter(State.JOINING, request.id)
-    node.done(Status(State.RUNNING, request.id))
+    node.finish(Status(State.RUNNING, request.id))
     return request
 
 
@@ -101,7 +99,7 @@ def test_a_node_leaves_and_joins_when_it_is_asked_to(directory, node) -> None:
     ask_prepare(directory, None, "m1")
     assert leave(node) == Request("m1", Want.LEAVE)
     assert await_left(directory, "m1", 0.0).state is State.LEFT
-    assert node.asked() is None
+    assert node.next_request() is None
     ask_resume(directory, None, "m1")
     assert join(node) == Request("m1", Want.JOIN)
     assert await_joined(directory, "m1", 0.0).state is State.RUNNING
@@ -119,8 +117,8 @@ def test_what_is_awaited_may_come_later(directory, node) -> None:
 def test_times_and_missing_peers_arrive(directory, node) -> None:
     """A client reads the status exactly as the node wrote it."""
     status = Status(State.RUNNING, "m1", "", {"leave": 0.25}, ("readers of /count: 0 of 1",))
-    node.say(status)
-    assert status_of(directory) == status
+    node.report(status)
+    assert read_message(directory, Status) == status
 
 
 def test_the_directory_of_a_process_is_found_in_the_middle_of_its_execve(directory) -> None:
@@ -149,26 +147,26 @@ def test_a_request_that_comes_twice_does_nothing(directory, node) -> None:
         ask_prepare(directory, None, "m1")
     leave(node)
     ask_prepare(directory, None, "m1")
-    assert node.asked() is None
+    assert node.next_request() is None
     ask_resume(directory, None, "m1")
     join(node)
     ask_resume(directory, None, "m1")
-    assert node.asked() is None
+    assert node.next_request() is None
     ask_prepare(directory, None, "m1")
-    assert node.asked() is None
-    assert status_of(directory).state is State.RUNNING
+    assert node.next_request() is None
+    assert read_message(directory, Status).state is State.RUNNING
 
 
 def test_a_node_that_is_called_back_before_it_left_stays(directory, node) -> None:
     """A withdrawn departure fails its wait, and a late request of its attempt has no effect."""
     ask_prepare(directory, None, "m1")
     ask_resume(directory, None, "m1")
-    assert node.asked() is None
+    assert node.next_request() is None
     assert await_joined(directory, "m1", 0.0).state is State.RUNNING
     with pytest.raises(PortableError, match="asked to stay"):
         await_left(directory, "m1", 0.0)
-    write_request(directory, Request("m1", Want.LEAVE))
-    assert node.asked() is None
+    write_message(directory, Request("m1", Want.LEAVE))
+    assert node.next_request() is None
 
 
 def test_a_node_that_is_away_answers_another_request_to_leave(directory, node) -> None:
@@ -176,13 +174,13 @@ def test_a_node_that_is_away_answers_another_request_to_leave(directory, node) -
     ask_prepare(directory, None, "m1")
     leave(node)
     ask_prepare(directory, None, "m2")
-    assert node.asked() is None
+    assert node.next_request() is None
     assert await_left(directory, "m2", 0.0).state is State.LEFT
     ask_resume(directory, None, "m3")
     join(node)
     for late in ("m1", "m2", "m3"):
-        write_request(directory, Request(late, Want.LEAVE))
-        assert node.asked() is None
+        write_message(directory, Request(late, Want.LEAVE))
+        assert node.next_request() is None
 
 
 def test_what_an_earlier_process_was_asked_does_not_count(directory, node) -> None:
@@ -190,9 +188,9 @@ def test_what_an_earlier_process_was_asked_does_not_count(directory, node) -> No
     ask_prepare(directory, None, "m1")
     leave(node)
     again = Listener(directory)
-    assert status_of(directory) is None
-    again.say(Status(State.RUNNING))
-    assert again.asked() is None
+    assert read_message(directory, Status) is None
+    again.report(Status(State.RUNNING))
+    assert again.next_request() is None
 
 
 def test_what_an_earlier_process_was_asked_can_be_asked_again(directory, node) -> None:
@@ -200,7 +198,7 @@ def test_what_an_earlier_process_was_asked_can_be_asked_again(directory, node) -
     ask_prepare(directory, None, "m1")
     leave(node)
     again = Listener(directory)
-    again.say(Status(State.RUNNING))
+    again.report(Status(State.RUNNING))
     ask_prepare(directory, None, "m1")
     leave(again)
 
@@ -210,7 +208,7 @@ def test_a_restored_node_finds_what_was_asked_at_the_same_path(directory, node) 
     ask_prepare(directory, None, "m1")
     leave(node)
     remove_directory(directory)
-    assert node.asked() is None
+    assert node.next_request() is None
     make_directory(directory)
     ask_resume(directory, None, "m1")
     join(node)
@@ -220,18 +218,18 @@ def test_a_restored_node_finds_what_was_asked_at_the_same_path(directory, node) 
 # --- refusals, failures and missing nodes ---
 
 
-def test_who_does_not_leave_says_why(directory, node) -> None:
+def test_a_node_that_does_not_leave_reports_why(directory, node) -> None:
     """A refusal ends the wait with its reason, and the node still runs."""
     ask_prepare(directory, None, "m1")
-    request = node.asked()
-    node.done(Status(State.RUNNING, request.id, "sockets are open"))
+    request = node.next_request()
+    node.finish(Status(State.RUNNING, request.id, "sockets are open"))
     with pytest.raises(PortableError, match="does not leave the ROS graph: sockets are open"):
         await_left(directory, "m1", 0.0)
 
 
-def test_who_cannot_join_says_why(directory, node) -> None:
+def test_a_node_that_cannot_join_reports_why(directory, node) -> None:
     """A failure of the node ends any wait at once with its reason."""
-    node.say(Status(State.FAILED, "m1", "ValueError: no camera"))
+    node.report(Status(State.FAILED, "m1", "ValueError: no camera"))
     with pytest.raises(PortableError, match="cannot join the ROS graph again: ValueError: no cam"):
         await_joined(directory, "m1", PATIENCE)
     with pytest.raises(PortableError, match="has failed: ValueError: no camera"):
@@ -244,12 +242,12 @@ def test_a_process_without_a_portable_node_is_not_asked(directory) -> None:
         ask_prepare(directory, None, "m1")
 
 
-def test_the_signal_goes_to_nobody_whom_it_would_end(directory, node, start) -> None:
+def test_the_signal_is_not_sent_to_a_process_that_it_would_end(directory, node, start) -> None:
     """A process that neither catches nor blocks the signal gets no request, and survives."""
     process = start("")
     with pytest.raises(PortableError, match=f"does not catch signal {SIGNAL}"):
         ask_prepare(directory, process.pid, "m1")
-    assert node.asked() is None
+    assert node.next_request() is None
     assert process.poll() is None
 
 
@@ -262,12 +260,12 @@ threading.Thread(target=lambda: (signal.sigwait([{0}]), os._exit(42))).start()
 
 
 @pytest.mark.parametrize("how", [CATCHES, BLOCKS], ids=["caught", "blocked"])
-def test_the_signal_wakes_who_catches_or_awaits_it(directory, node, start, how) -> None:
+def test_the_signal_wakes_a_process_that_catches_or_awaits_it(directory, node, start, how) -> None:
     """A process that catches or blocks the signal gets the request and the signal."""
     process = start(how.format(SIGNAL))
     ask_prepare(directory, process.pid, "m1")
     assert process.wait(PATIENCE) == 42
-    assert read_request(directory) == Request("m1", Want.LEAVE)
+    assert read_message(directory, Request) == Request("m1", Want.LEAVE)
 
 
 def test_a_process_that_has_ended_is_not_waited_for(directory, node, start) -> None:
@@ -296,7 +294,7 @@ def test_a_stopped_process_is_named_when_the_time_has_passed(directory, node, st
     assert f"process {process.pid} is stopped" in said
 
 
-def test_the_time_out_of_joining_says_how_it_stands(directory, node) -> None:
+def test_the_time_out_of_joining_reports_the_progress(directory, node) -> None:
     """The timeout error names the node's state, and no process if none was given."""
     ask_prepare(directory, None, "m1")
     leave(node)
@@ -313,7 +311,7 @@ def test_a_node_that_waits_opens_nothing(directory, node, monkeypatch) -> None:
     leave(node)
     with monkeypatch.context() as waiting:
         waiting.setattr(os, "open", lambda *_, **__: pytest.fail("a file was opened"))
-        assert node.asked() is None
+        assert node.next_request() is None
     ask_resume(directory, None, "m1")
     assert join(node) == Request("m1", Want.JOIN)
 
@@ -324,18 +322,18 @@ def test_a_node_that_waits_opens_nothing(directory, node, monkeypatch) -> None:
      b'{"format": 1, "state": "asleep", "request": "", "fault": "", "seconds": {}, "missing": []}',
      b'{"format": 1, "state": "left", "request": 7, "fault": "", "seconds": {}, "missing": []}'],
 )  # fmt: skip
-def test_a_damaged_status_is_said(directory, node, content) -> None:
+def test_a_damaged_status_is_reported(directory, node, content) -> None:
     """A damaged status raises an error that names the file."""
     (directory / "status").write_bytes(content)
     with pytest.raises(PortableError, match="status"):
-        status_of(directory)
+        read_message(directory, Status)
 
 
 def test_a_damaged_request_is_left_alone(directory, node, capfd) -> None:
     """The node logs a damaged request once, runs on, and accepts the next request."""
     (directory / "request").write_bytes(b"nonsense")
-    assert node.asked() is None
-    assert node.asked() is None
+    assert node.next_request() is None
+    assert node.next_request() is None
     assert capfd.readouterr().err.count("holds no JSON") == 1
     ask_prepare(directory, None, "m1")
     assert leave(node).id == "m1"
@@ -348,24 +346,24 @@ def test_a_status_is_seen_as_a_whole(directory, node) -> None:
 
     def write() -> None:
         while not over.is_set():
-            write_status(directory, one)
-            write_status(directory, other)
+            write_message(directory, one)
+            write_message(directory, other)
 
     writer = threading.Thread(target=write)
     writer.start()
     try:
         until = time.monotonic() + 0.3
         while time.monotonic() < until:
-            assert status_of(directory) in (one, other, Status(State.RUNNING))
+            assert read_message(directory, Status) in (one, other, Status(State.RUNNING))
     finally:
         over.set()
         writer.join()
 
 
-def test_a_node_whose_directory_is_gone_goes_on(directory, node, capfd) -> None:
+def test_a_node_without_its_directory_keeps_running(directory, node, capfd) -> None:
     """A node with a removed directory logs the failed write and runs on."""
     remove_directory(directory)
-    node.say(Status(State.LEFT, "m1"))
+    node.report(Status(State.LEFT, "m1"))
     assert node.status.state is State.LEFT
     assert "cannot be written" in capfd.readouterr().err
 
@@ -373,7 +371,7 @@ def test_a_node_whose_directory_is_gone_goes_on(directory, node, capfd) -> None:
 def test_an_orderly_end_leaves_no_portable_node(directory, node) -> None:
     """A regular end removes the status and the directory."""
     node.close()
-    assert status_of(directory) is None
+    assert read_message(directory, Status) is None
     assert not directory.exists()
 
 
@@ -392,7 +390,7 @@ def test_a_directory_that_others_can_write_is_refused(directory) -> None:
         make_directory(directory / "deep")
 
 
-def test_control_directories_are_told_apart_by_user_and_instance() -> None:
+def test_control_directories_differ_by_user_and_instance() -> None:
     """The path is the same on all hosts; a name that leads elsewhere is refused."""
     assert str(control_directory("c-p-7", 1000)) == "/tmp/rosrm-1000/portable/c-p-7"
     for bad in ("", "..", "a/b"):

@@ -12,15 +12,10 @@ import pytest
 
 from rosrm.errors import PortableError
 from rosrm_criu.control import client
-from rosrm_criu.control.client import (
-    ask_resume,
-    control_directory,
-    make_directory,
-    remove_directory,
-    status_of,
-)
+from rosrm_criu.control.client import ask_resume, control_directory, make_directory
+from rosrm_criu.control.directory import remove_directory
 from rosrm_criu.control.listener import Listener
-from rosrm_criu.control.messages import Request, State, Status, Want, write_request, write_status
+from rosrm_criu.control.messages import Request, State, Status, Want, read_message, write_message
 
 #: Uid of a user who owns nothing.
 NOBODY = 65534
@@ -61,15 +56,15 @@ def unchanged(precious: Path) -> bool:
 
 
 @pytest.mark.parametrize("name", ["request", ".request.new", "status", ".status.new"])
-def test_what_is_written_goes_through_no_link(directory, precious, name) -> None:
+def test_a_write_follows_no_link(directory, precious, name) -> None:
     """A write replaces a link, and changes neither its target nor another name of the file."""
     for make in (os.symlink, os.link):
         (directory / name).unlink(missing_ok=True)
         make(precious, directory / name)
-        write_request(directory, Request("m1", Want.LEAVE))
-        write_status(directory, Status(State.RUNNING))
+        write_message(directory, Request("m1", Want.LEAVE))
+        write_message(directory, Status(State.RUNNING))
         assert unchanged(precious)
-        assert status_of(directory) == Status(State.RUNNING)
+        assert read_message(directory, Status) == Status(State.RUNNING)
 
 
 def test_nothing_is_written_where_a_link_leads(directory, precious) -> None:
@@ -89,7 +84,7 @@ def test_what_is_read_is_no_link(directory, precious) -> None:
     """A read through a link fails, and does not reveal whether its target exists."""
     (directory / "status").symlink_to(precious)
     with pytest.raises(PortableError, match="status cannot be read"):
-        status_of(directory)
+        read_message(directory, Status)
 
 
 def test_a_directory_is_not_made_where_a_link_leads(tmp_path, precious) -> None:

@@ -1,4 +1,4 @@
-"""Guard of ROS callbacks: exceptions are logged with their place and counted."""
+"""Guard of ROS callbacks: exceptions are logged with their place."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ def bad_message() -> None:
 
 
 @pytest.mark.parametrize("fault", [SystemExit(3), GeneratorExit(), ZeroDivisionError("oops")])
-def test_nothing_that_a_callback_raises_gets_out(fault) -> None:
+def test_nothing_that_a_callback_raises_gets_out(fault, caplog) -> None:
     """The guard catches exceptions that `except Exception` lets pass, too."""
 
     def callback() -> None:
         raise fault
 
-    guard = CallbackGuard()
-    assert type(fault).__name__ in guard.call(callback)
-    assert guard.failures == 1
+    assert type(fault).__name__ in CallbackGuard().call(callback)
+    assert len(caplog.messages) == 1
 
 
 def test_the_log_names_the_callback_the_error_and_its_place(caplog) -> None:
@@ -42,7 +41,7 @@ def test_a_callback_that_fails_often_is_logged_once_a_second_and_counted(caplog)
     guard = CallbackGuard(clock=lambda: now[0])
     for _ in range(50):
         guard.call(bad_message)
-    assert (guard.failures, len(caplog.messages)) == (50, 1)
+    assert len(caplog.messages) == 1
     now[0] = 1.5
     guard.call(bad_message)
     assert caplog.messages[-1].endswith("; 49 more since the last line")
@@ -58,7 +57,7 @@ def test_an_interrupt_is_kept_for_the_loop(caplog, interrupt) -> None:
     guard = CallbackGuard()
     with caplog.at_level(logging.DEBUG):
         assert guard.call(callback) == ""
-    assert (guard.failures, caplog.messages) == (0, [])
+    assert caplog.messages == []
     with pytest.raises(type(interrupt)):
         guard.raise_interrupt()
     guard.raise_interrupt()

@@ -89,7 +89,7 @@ def test_the_gate_forgets_only_the_oldest() -> None:
     assert not judge.repeated(envelope(1, request_id="0"), Requested())
 
 
-def test_check_answer_raises_what_was_said() -> None:
+def test_check_answer_raises_the_refusal() -> None:
     """A client raises the master's message, or names the master's version."""
     import pytest
 

@@ -14,56 +14,10 @@ from rosrm.model import values
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros import convert
 from rosrm_msgs import msg
+from tests.drawing import SPECS, drawn
 
-WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
-NAMES = WORDS.filter(bool)
-SECONDS = st.floats(0.0, 1e6)
-PLAIN = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | WORDS,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=3),
-    max_leaves=6,
-)
-TEXTS = st.dictionaries(NAMES, WORDS, max_size=3)
-UINT32 = st.integers(0, 2**32 - 1)
-UINT64 = st.integers(0, 2**64 - 1)
-INT32 = st.integers(-(2**31), 2**31 - 1)
-INSTANCES = st.builds(values.InstanceId, NAMES, UINT64)
-
-FORMS = st.one_of(
-    st.fixed_dictionaries({"package": NAMES, "executable": NAMES}),
-    st.fixed_dictionaries({"module": NAMES}),
-    st.fixed_dictionaries({"command": st.lists(WORDS, min_size=1, max_size=3).map(tuple)}),
-)
-
-
-SPECS = st.builds(
-    lambda form, **fields: values.ProcessSpec(**form, **fields),
-    FORMS,
-    name=NAMES,
-    namespace=WORDS,
-    arguments=st.lists(WORDS, max_size=3).map(tuple),
-    parameters=st.dictionaries(NAMES, PLAIN, max_size=3),
-    remappings=TEXTS,
-    environment=TEXTS,
-    working_directory=st.none() | NAMES,
-    ros=st.booleans(),
-    kind=st.sampled_from(values.Kind),
-    restart=st.builds(
-        values.RestartPolicy, st.sampled_from(["never", "on-failure", "always"]), SECONDS, SECONDS,
-        st.floats(1.0, 100.0), UINT32, SECONDS,
-    ),
-    needs=st.dictionaries(NAMES, st.floats(0.0, 1e18), max_size=3),
-    required_labels=TEXTS,
-    preferred_labels=TEXTS,
-    avoided_labels=TEXTS,
-    priority=INT32,
-    migration=st.builds(
-        values.MigrationPolicy, st.none() | NAMES, st.booleans(),
-        st.dictionaries(WORDS, PLAIN, max_size=2),
-    ),
-    readiness=st.builds(values.Readiness, st.sampled_from(["auto", "graph", "running"]), SECONDS),
-    stop=st.builds(values.StopPolicy, SECONDS, SECONDS),
-)  # fmt: skip
+#: A fence of 0 s is none.
+FENCES = drawn(values.Fence, after=st.floats(1e-3, 1e6))
 
 
 def over_the_wire(message):
@@ -85,7 +39,7 @@ def test_spec_survives(spec) -> None:
     assert survives(spec.restart, "restart")
 
 
-@given(st.builds(values.Assignment, INSTANCES, SPECS, UINT64, WORDS, st.booleans()))
+@given(drawn(values.Assignment, spec=SPECS, fence=st.none() | FENCES))
 @settings(max_examples=30, deadline=None)
 def test_assignment_survives(assignment) -> None:
     assert survives(assignment, "assignment")
@@ -102,43 +56,16 @@ def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
         convert.restart_from_msg(message)
 
 
-@given(
-    st.builds(
-        values.InstanceStatus,
-        instance=INSTANCES,
-        state=st.sampled_from(values.InstanceState),
-        pid=UINT32,
-        exit_code=INT32,
-        exit_signal=INT32,
-        restarts=UINT32,
-        peak_memory=st.floats(0, 1e18),
-        cpu_time=st.floats(0, 1e9),
-        run_time=st.floats(0, 1e9),
-        message=WORDS,
-    )
-)
+@given(drawn(values.InstanceStatus))
 @settings(max_examples=60, deadline=None)
 def test_status_survives(status) -> None:
     """A status is received by the master as the slave sent it."""
     assert survives(status, "status")
 
 
-RESOURCES = st.lists(
-    st.builds(values.ResourceDescription, NAMES, WORDS, st.floats(1e-3, 1e18), WORDS), max_size=16
-).map(tuple)
-HOSTS = st.builds(
+HOSTS = drawn(
     values.HostDescription,
-    name=NAMES,
-    incarnation=st.integers(1, 2**64 - 1),
-    hostname=WORDS,
-    pid=UINT32,
-    software_version=WORDS,
-    labels=TEXTS,
-    resources=RESOURCES,
-    max_processes=UINT32,
-    period=st.floats(1e-3, 10.0),
-    executors=st.lists(WORDS, max_size=3).map(tuple),
-    absent=TEXTS,
+    resources=st.lists(drawn(values.ResourceDescription), max_size=16).map(tuple),
 )
 
 

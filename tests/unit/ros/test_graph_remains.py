@@ -37,14 +37,14 @@ def test_an_open_socket_is_named(make) -> None:
     assert "leave()" in what_is_left()
 
 
-def test_what_nobody_uses_is_closed(make) -> None:
+def test_unused_sockets_are_closed(make) -> None:
     """Fast DDS leaves UDP sockets that are neither bound nor connected."""
     number = make(socket.SOCK_DGRAM).fileno()
     close_leaked(open_sockets())
     assert number not in open_sockets()
 
 
-def test_what_somebody_uses_stays(make) -> None:
+def test_sockets_in_use_stay(make) -> None:
     """Bound and connected sockets, and other kinds, belong to the author of the node."""
     bound, connected, stream = (
         make(kind) for kind in (socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM)
@@ -63,7 +63,7 @@ def test_a_number_that_is_another_socket_by_now_stays(make) -> None:
     assert number in open_sockets()
 
 
-def test_a_fast_dds_that_cannot_look_again_is_said(monkeypatch) -> None:
+def test_a_fast_dds_that_cannot_rescan_is_refused(monkeypatch) -> None:
     """The error comes before the node leaves, not as a silent node after its move."""
     libc = ctypes.CDLL(None)
     monkeypatch.setattr(fast_dds_relocation, "_library", lambda: libc)
@@ -72,7 +72,7 @@ def test_a_fast_dds_that_cannot_look_again_is_said(monkeypatch) -> None:
             function()
 
 
-def test_interfaces_that_cannot_be_read_are_said(monkeypatch) -> None:
+def test_interfaces_that_cannot_be_read_are_an_error(monkeypatch) -> None:
     """Otherwise no other participant would receive the node's messages."""
     monkeypatch.setattr(fast_dds_relocation, "_library", lambda: ctypes.CDLL(None))
     monkeypatch.setattr(fast_dds_relocation, "_interfaces_of", lambda _: lambda: False)
@@ -80,7 +80,7 @@ def test_interfaces_that_cannot_be_read_are_said(monkeypatch) -> None:
         fast_dds_relocation.look_again()
 
 
-def test_guids_that_cannot_be_renewed_are_told_of(monkeypatch) -> None:
+def test_guids_that_cannot_be_renewed_are_reported(monkeypatch) -> None:
     """The loss is smaller: an image can then be restored only once."""
     monkeypatch.setattr(fast_dds_relocation, "_library", lambda: ctypes.CDLL(None))
     monkeypatch.setattr(fast_dds_relocation, "_interfaces_of", lambda _: lambda: True)

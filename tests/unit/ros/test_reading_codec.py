@@ -95,7 +95,7 @@ def test_newest_of_each_host_counts() -> None:
     assert decoded.received == 6
 
 
-def test_quiet_cycles_are_told_by_the_next_message() -> None:
+def test_unpublished_cycles_are_counted_by_the_next_message() -> None:
     """A message counts its own cycle and the idle ones before it, up to the greatest number."""
     batch = [
         serialize_message(info(host_id=host, sequence=sequence, flags=flags(**said)))

@@ -12,6 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from rosrm.core.slave import commands as slave_commands
 from rosrm.core.slave import reducer
+from rosrm.core.slave.commands import Amend, Launch, Remember, Report, Settle, Stop
 from rosrm.core.slave.events import (
     AssignmentsReceived,
     ContactConfirmed,
@@ -32,10 +33,9 @@ from rosrm.core.slave.events import (
 )
 from rosrm.core.slave.handlers import REMEMBER_END
 from rosrm.core.slave.health import LOOK_PERIOD
-from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph, under_limits
+from rosrm.core.slave.state import SlaveState, awaits_graph, under_limits
 from rosrm.core.slave.watches import Memo, Observation
 from rosrm.model.values import (
-    Assignment,
     Fence,
     Health,
     InstanceId,
@@ -46,59 +46,36 @@ from rosrm.model.values import (
     RestartPolicy,
 )
 from rosrm.slave.memos import from_memo, to_memo
+from tests.unit.slave.rig import PLAIN, Slave, assignment, launched, states
 
-PLAIN = ProcessSpec("p", command=("true",))
 NODE = ProcessSpec("n", module="m", ros=True, namespace="/robot", readiness=Readiness(timeout=10.0))
 STATE = InstanceState
-
-
-def assigned(spec=PLAIN, number=1, epoch=1, fence=None) -> AssignmentsReceived:
-    assignment = Assignment(InstanceId(spec.name, number), spec, epoch, spec.name, fence=fence)
-    return AssignmentsReceived((assignment,))
-
-
-def told(state, name="p", number=1, **more) -> SupervisorReported:
-    return SupervisorReported((InstanceStatus(InstanceId(name, number), state, **more),))
-
-
-class Slave:
-    """State of a slave's reducer, with its clock."""
-
-    def __init__(self) -> None:
-        self.state = SlaveState(registered=True)
-        self.now = 100.0
-
-    def step(self, event, after=0.0):
-        self.now += after
-        return list(reducer.step(self.state, event, self.now))
-
-    def of(self, name="p", number=1) -> HeldInstance:
-        return self.state.held[InstanceId(name, number)]
+ONE = InstanceId("p", 1)
+NODE_1 = InstanceId("n", 1)
+NEVER = RestartPolicy("never")
+ON_FAILURE = RestartPolicy("on-failure")
 
 
 @pytest.fixture
 def one() -> Slave:
+    """Return a slave without an instance."""
     return Slave()
 
 
-def test_what_went_with_the_supervisor_cannot_be_refused_any_more(one):
-    """The instance was starting when its supervisor was killed: no supervisor holds it."""
-    one.step(assigned())
-    one.step(SupervisorReplaced((), {}, frozenset()))
-    assert one.step(LaunchRefused(InstanceId("p", 1), "no such package")) == []
+@pytest.fixture
+def running(one) -> Slave:
+    """Return a slave with one running instance."""
+    one.assign()
+    one.status(STATE.RUNNING)
+    return one
 
 
-def test_what_is_taken_back_at_once_is_not_launched(one):
-    """An assignment and the next supervisor in one batch start nothing.
-
-    The next supervisor does not know the instance. The master repeats the assignment and receives
-    the refusal.
-    """
-    events = [assigned(), SupervisorReplaced((), {}, frozenset())]
-    commands = reducer.step_all(one.state, events, one.now)
-    assert [c for c in commands if isinstance(c, slave_commands.Launch) and c.assignments] == []
-    (report,) = one.step(assigned(), after=2.0)
-    assert states([report]) == [STATE.REFUSED]
+@pytest.fixture
+def node(one) -> Slave:
+    """Return a slave with a running node, which it awaits in the graph."""
+    one.assign(NODE)
+    one.status(STATE.RUNNING, "n")
+    return one
 
 
 def awaited_names(one: Slave) -> list[str]:
@@ -106,226 +83,231 @@ def awaited_names(one: Slave) -> list[str]:
     return [h.awaited.node_name for h in one.state.awaited_in_graph().values()]
 
 
-def states(commands) -> list[InstanceState]:
-    """Return the reported states."""
-    return [s.state for c in commands if isinstance(c, slave_commands.Report) for s in c.statuses]
+def replaced(*statuses, **more) -> SupervisorReplaced:
+    """Return the arrival of a supervisor that manages these instances."""
+    return SupervisorReplaced(statuses, **more)
+
+
+RUNS = replaced(InstanceStatus(ONE, STATE.RUNNING, pid=5))
+
+# --- assignments ------------------------------------------------------------------------------
 
 
 def test_an_assignment_is_launched_once(one) -> None:
-    """A repeated order starts nothing."""
-    assert [type(c) for c in one.step(assigned())] == [slave_commands.Launch]
-    assert one.step(assigned()) == []
-    one.step(told(STATE.RUNNING, pid=5))
-    one.step(told(STATE.EXITED))
-    assert one.step(assigned()) == []
+    """A repeated order starts nothing, before and after the end of the instance."""
+    assert [type(c) for c in one.assign()] == [Launch]
+    assert one.assign() == []
+    one.status(STATE.RUNNING)
+    one.status(STATE.EXITED)
+    assert one.assign() == []
 
 
-def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None:
-    """The registration request had the older status, and no batch was published without a link."""
-    one.step(assigned())
-    one.step(told(STATE.RUNNING, pid=5))
-    one.step(MasterLost())
-    one.step(told(STATE.FAILED, exit_signal=9))
-    (report,) = one.step(Registered(1))
-    assert (states([report]), report.complete) == ([STATE.FAILED], False)
+def test_a_refused_launch_is_reported(one) -> None:
+    """The reason reaches the master."""
+    one.assign()
+    (report,) = one.step(LaunchRefused(ONE, "no such package"))
+    (status,) = report.statuses
+    assert (status.state, status.message) == (STATE.REFUSED, "no such package")
 
 
-def test_a_registration_without_news_is_not_followed_by_a_report(one) -> None:
-    """The request had all statuses."""
-    one.step(assigned())
-    one.step(told(STATE.RUNNING, pid=5))
-    one.step(MasterLost())
-    assert one.step(Registered(2)) == []
+def test_an_instance_lost_with_its_supervisor_cannot_be_refused_any_more(one) -> None:
+    """The instance was starting when its supervisor was killed: no supervisor holds it."""
+    one.assign()
+    one.step(replaced())
+    assert one.step(LaunchRefused(ONE, "no such package")) == []
+
+
+def test_what_the_supervisor_lost_at_once_is_not_launched(one) -> None:
+    """An assignment and the next supervisor in one batch start nothing.
+
+    The next supervisor does not know the instance. The master repeats the assignment and receives
+    the refusal.
+    """
+    batch = [AssignmentsReceived((assignment(),)), replaced()]
+    assert launched(reducer.step_all(one.state, batch, one.now)) == []
+    assert states(one.assign(after=2.0)) == [STATE.REFUSED]
 
 
 def test_an_older_epoch_starts_nothing(one) -> None:
-    """Orders of a replaced master have no effect; the refusal names both epochs."""
+    """The refusal names both epochs; a newer master may still use the instance's number."""
     one.step(Registered(3))
-    assert states(one.step(assigned(epoch=2))) == [STATE.REFUSED]
-    assert "epoch 2" in one.of().status.message
-
-
-def test_a_registration_sets_the_epoch(one) -> None:
-    """A master with a lost journal begins at epoch 1 again, and this host works for it."""
-    one.step(Registered(7))
-    one.step(Registered(1))
-    assert [type(c) for c in one.step(assigned(epoch=1))] == [slave_commands.Launch]
+    assert states(one.assign(epoch=2, number=8)) == [STATE.REFUSED]
+    assert "epoch 2" in one.of(number=8).status.message
+    assert launched(one.assign(epoch=3, number=9)) == [InstanceId("p", 9)]
 
 
 def test_stopped_before_it_was_started(one) -> None:
     """A stop that overtakes its start wins: a later start is refused for good."""
-    assert states(one.step(StopOrdered(InstanceId("p", 1)))) == [STATE.REFUSED]
-    assert one.step(assigned()) == []
+    assert states(one.step(StopOrdered(ONE))) == [STATE.REFUSED]
+    assert one.assign() == []
     one.step(TimePassed(), after=REMEMBER_END)
-    assert states(one.step(assigned())) == [STATE.REFUSED]
+    assert states(one.assign()) == [STATE.REFUSED]
 
 
 @pytest.mark.parametrize("end", ["refused", "exited"])
 def test_a_dead_number_stays_dead(one, end) -> None:
     """A late order of the same instance starts nothing, even after its end was forgotten."""
-    one.step(assigned())
+    one.assign()
     if end == "refused":
-        one.step(LaunchRefused(InstanceId("p", 1), "no such package"))
+        one.step(LaunchRefused(ONE, "no such package"))
     else:
-        one.step(told(STATE.EXITED))
-    forgotten = one.step(TimePassed(), after=REMEMBER_END)
-    assert forgotten == [slave_commands.Forget((InstanceId("p", 1),))]
-    assert states(one.step(assigned())) == [STATE.REFUSED]
-    assert [type(c) for c in one.step(assigned(number=2))] == [slave_commands.Launch]
+        one.status(STATE.EXITED)
+    assert one.step(TimePassed(), after=REMEMBER_END) == [slave_commands.Forget((ONE,))]
+    assert states(one.assign()) == [STATE.REFUSED]
+    assert launched(one.assign(number=2)) == [InstanceId("p", 2)]
 
 
 def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one) -> None:
-    """A master with a lost journal may reuse them; a repeated registration changes nothing."""
-    one.step(StopOrdered(InstanceId("p", 1)))
-    one.step(Registered(1))
+    """A master without journal begins at epoch 1 and may reuse numbers; any other may not."""
+    one.step(StopOrdered(ONE))
+    one.step(Registered(7))
     one.step(TimePassed(), after=REMEMBER_END)
-    assert states(one.step(assigned())) == [STATE.REFUSED]
+    assert states(one.assign(epoch=7)) == [STATE.REFUSED]
     one.step(Registered(1, renumbers=True))
     one.step(TimePassed(), after=REMEMBER_END)
-    assert [type(c) for c in one.step(assigned())] == [slave_commands.Launch]
+    assert launched(one.assign(epoch=1)) == [ONE]
 
 
-def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
+def test_an_end_is_kept_until_a_master_knows_it(one) -> None:
     """The slave keeps the end of a job until a master has learned it, however long that takes."""
-    one.step(assigned())
+    one.assign()
     one.step(MasterLost())
-    one.step(told(STATE.EXITED))
+    one.status(STATE.EXITED)
     assert one.step(TimePassed(), after=10 * REMEMBER_END) == []
     one.step(Registered(2))
     assert one.step(TimePassed(), after=REMEMBER_END / 2) == []
     assert len(one.step(TimePassed(), after=REMEMBER_END)) == 1
 
 
-def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
-    """Only the order was too old: a newer master may still use the instance's number."""
-    one.step(Registered(3))
-    one.step(assigned(epoch=2, number=8))
-    assert states(one.step(assigned(epoch=3, number=9))) == []
-    assert one.of(number=9).status.state is STATE.STARTING
+# --- reports ----------------------------------------------------------------------------------
 
 
-def test_a_launch_that_is_refused_is_said(one) -> None:
-    """The reason reaches the master."""
-    one.step(assigned())
-    (report,) = one.step(LaunchRefused(InstanceId("p", 1), "no such package"))
-    assert report.statuses[0].state is STATE.REFUSED
-    assert report.statuses[0].message == "no such package"
+def test_a_change_during_the_registration_is_reported(running) -> None:
+    """The registration request had the older status; without a change it needs no report."""
+    running.step(MasterLost())
+    assert running.step(Registered(1)) == []
+    running.step(MasterLost())
+    running.status(STATE.FAILED)
+    (report,) = running.step(Registered(2))
+    assert (states([report]), report.complete) == ([STATE.FAILED], False)
+
+
+def test_a_complete_report_names_everything(one) -> None:
+    """The report includes ended instances that are still remembered."""
+    one.assign()
+    one.assign(number=2)
+    one.status(STATE.EXITED)
+    (report,) = one.step(ReportRequested())
+    assert report.complete
+    found = {s.instance.number: s.state for s in report.statuses}
+    assert found == {1: STATE.EXITED, 2: STATE.STARTING}
+
+
+def test_stop_and_restart_go_to_the_supervisor(running) -> None:
+    """An ended instance is reported again; a restart of an unknown one has no effect."""
+    assert running.step(RestartOrdered(ONE)) == [slave_commands.Restart(ONE)]
+    assert running.step(StopOrdered(ONE)) == [Stop(ONE)]
+    running.status(STATE.EXITED)
+    assert states(running.step(StopOrdered(ONE))) == [STATE.EXITED]
+    assert states(running.step(RestartOrdered(ONE))) == [STATE.EXITED]
+    assert running.step(RestartOrdered(InstanceId("q", 2))) == []
+
+
+# --- readiness --------------------------------------------------------------------------------
 
 
 def test_a_process_is_ready_as_soon_as_it_runs(one) -> None:
     """Only ROS nodes need more than a running process."""
-    one.step(assigned())
-    assert states(one.step(told(STATE.RUNNING, pid=5))) == [STATE.READY]
-    assert one.step(told(STATE.RUNNING, pid=5)) == []
+    one.assign()
+    assert states(one.status(STATE.RUNNING)) == [STATE.READY]
+    assert one.status(STATE.RUNNING) == []
 
 
-def test_a_node_is_ready_when_it_is_seen(one) -> None:
-    """The slave awaits the node under its qualified name, and reports it ready once."""
-    one.step(assigned(NODE))
-    assert one.state.awaited_in_graph() == {}
-    assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.RUNNING]
-    assert awaited_names(one) == ["/robot/n"]
-    assert states(one.step(SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
-    assert one.step(SeenInGraph(InstanceId("n", 1))) == []
-    assert one.state.awaited_in_graph() == {}
+@pytest.mark.parametrize(
+    ("shadow", "name"),
+    [({}, "/robot/n"), ({"alias": "n_17", "shadow": True}, "/robot/n_17")],
+    ids=["node", "shadow"],
+)
+def test_a_node_is_ready_when_it_is_seen(one, shadow, name) -> None:
+    """The slave awaits the qualified name, a shadow's alias, and reports the node ready once."""
+    one.assign(NODE, **shadow)
+    assert awaited_names(one) == []
+    assert states(one.status(STATE.RUNNING, "n")) == [STATE.RUNNING]
+    assert awaited_names(one) == [name]
+    assert states(one.step(SeenInGraph(NODE_1))) == [STATE.READY]
+    assert one.step(SeenInGraph(NODE_1)) == []
+    assert awaited_names(one) == []
 
 
-def test_a_shadow_is_awaited_under_its_alias(one) -> None:
-    """The source has the node's own name; the shadow's alias shows in the graph when ready."""
-    shadow = Assignment(InstanceId("n", 2), NODE, 1, "n_1700000000", shadow=True)
-    one.step(AssignmentsReceived((shadow,)))
-    one.step(told(STATE.RUNNING, "n", 2, pid=5))
-    assert awaited_names(one) == ["/robot/n_1700000000"]
-    assert states(one.step(SeenInGraph(InstanceId("n", 2)))) == [STATE.READY]
-
-
-def test_readiness_kinds(one) -> None:
+def test_readiness_kinds() -> None:
     """`running` makes a node ready at once; with `graph` the slave awaits any process."""
-    running = replace(NODE, readiness=Readiness("running"))
-    graph = replace(PLAIN, readiness=Readiness("graph"))
-    assert not awaits_graph(running)
-    assert awaits_graph(graph)
+    assert not awaits_graph(replace(NODE, readiness=Readiness("running")))
+    assert awaits_graph(replace(PLAIN, readiness=Readiness("graph")))
     assert awaits_graph(NODE)
     assert not awaits_graph(PLAIN)
 
 
-def test_never_ready_is_stopped_and_has_failed(one) -> None:
+def test_an_instance_that_does_not_become_ready_is_stopped_and_has_failed(node) -> None:
     """The time-out is the reason, whatever the exit code."""
-    one.step(assigned(NODE))
-    one.step(told(STATE.RUNNING, "n", pid=5))
-    assert one.step(TimePassed(), after=9.9) == []
-    assert one.step(TimePassed(), after=0.2) == [slave_commands.Stop(InstanceId("n", 1))]
-    assert one.step(TimePassed(), after=1.0) == []
-    assert states(one.step(told(STATE.STOPPING, "n", pid=5))) == [STATE.STOPPING]
-    (report,) = one.step(told(STATE.EXITED, "n"))
-    assert report.statuses[0].state is STATE.FAILED
+    assert node.step(TimePassed(), after=9.9) == []
+    assert node.step(TimePassed(), after=0.2) == [Stop(NODE_1)]
+    assert node.step(TimePassed(), after=1.0) == []
+    assert states(node.status(STATE.STOPPING, "n")) == [STATE.STOPPING]
+    (report,) = node.status(STATE.EXITED, "n")
+    assert states([report]) == [STATE.FAILED]
     assert "not ready within 10 s" in report.statuses[0].message
     assert "/robot/n" in report.statuses[0].message
 
 
-def test_each_run_has_its_own_time_to_become_ready(one) -> None:
+def test_each_run_has_its_own_time_to_become_ready(node) -> None:
     """After a crash and restart the node must appear in the graph again."""
-    one.step(assigned(NODE))
-    one.step(told(STATE.RUNNING, "n", pid=5))
-    one.step(SeenInGraph(InstanceId("n", 1)))
-    assert states(one.step(told(STATE.BACKOFF, "n"), after=60.0)) == [STATE.BACKOFF]
-    assert one.state.awaited_in_graph() == {}
-    assert states(one.step(told(STATE.STARTING, "n"))) == [STATE.STARTING]
-    assert states(one.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
-    assert one.step(TimePassed(), after=9.0) == []
-    assert states(one.step(SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
+    node.step(SeenInGraph(NODE_1))
+    assert states(node.status(STATE.BACKOFF, "n", after=60.0)) == [STATE.BACKOFF]
+    assert awaited_names(node) == []
+    assert states(node.status(STATE.STARTING, "n")) == [STATE.STARTING]
+    assert states(node.status(STATE.RUNNING, "n", pid=6)) == [STATE.RUNNING]
+    assert node.step(TimePassed(), after=9.0) == []
+    assert states(node.step(SeenInGraph(NODE_1))) == [STATE.READY]
 
 
-def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
-    """Its spec is lost, but the process runs and keeps running."""
-    assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.READY]
+def test_an_instance_of_a_former_run_of_the_slave_is_ready(one) -> None:
+    """The slave lost the spec, but the process runs and keeps running."""
+    assert states(one.status(STATE.RUNNING, "n")) == [STATE.READY]
     assert one.step(TimePassed(), after=1000.0) == []
-    assert one.step(assigned(NODE)) == []
+    assert one.assign(NODE) == []
 
 
 # --- a later run of the slave -----------------------------------------------------------------
 
-NODE_1 = InstanceId("n", 1)
 
-
-def memo_of(commands) -> Memo:
-    """Return the memo for the supervisor as a later run reads it."""
-    (memo,) = [c.memo for c in commands if isinstance(c, slave_commands.Remember)]
-    return from_memo(to_memo(memo))
-
-
-def taken_over(one: Slave, status: InstanceStatus, memo: Memo) -> Slave:
-    """Return a later run of the slave that re-adopts this instance from the supervisor."""
-    later = Slave()
-    later.now = one.now
-    later.step(SupervisorReplaced((status,), {status.instance: memo}))
+def re_adopted(one: Slave, memo: Memo | None, pid: int = 5) -> Slave:
+    """Return a later run of the slave that re-adopts the node from the supervisor."""
+    later = Slave(one.now)
+    written = from_memo(to_memo(memo))
+    later.step(replaced(InstanceStatus(NODE_1, STATE.RUNNING, pid), memos={NODE_1: written}))
     return later
 
 
 def test_a_node_that_was_still_awaited_is_awaited_by_the_next_slave(one) -> None:
     """The next slave waits for the node, whose first slave was killed before the node was ready."""
-    one.step(assigned(NODE))
-    awaited = from_memo(to_memo(one.of("n").memo))
-    later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
+    one.assign(NODE)
+    later = re_adopted(one, one.of("n").memo)
     assert later.of("n").status.state is STATE.RUNNING
     assert awaited_names(later) == ["/robot/n"]
     assert later.step(TimePassed(), after=9.9) == []
-    assert later.step(TimePassed(), after=0.2) == [slave_commands.Stop(NODE_1)]
+    assert later.step(TimePassed(), after=0.2) == [Stop(NODE_1)]
 
 
-def test_a_node_that_was_seen_is_ready_for_the_next_slave(one) -> None:
+def test_a_node_that_was_seen_is_ready_for_the_next_slave(node) -> None:
     """Readiness holds for the run that was seen; the next run must appear in the graph again."""
-    one.step(assigned(NODE))
-    one.step(told(STATE.RUNNING, "n", pid=5))
-    awaited = memo_of(one.step(SeenInGraph(NODE_1)))
-    later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
+    (memo,) = [c.memo for c in node.step(SeenInGraph(NODE_1)) if isinstance(c, Remember)]
+    later = re_adopted(node, memo)
     assert later.of("n").status.state is STATE.READY
     assert later.step(TimePassed(), after=1000.0) == []
-    later.step(told(STATE.BACKOFF, "n"))
-    assert states(later.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
+    later.status(STATE.BACKOFF, "n")
+    assert states(later.status(STATE.RUNNING, "n", pid=6)) == [STATE.RUNNING]
     assert awaited_names(later) == ["/robot/n"]
-    later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=6), awaited)
-    assert later.of("n").status.state is STATE.RUNNING
+    assert re_adopted(node, memo, pid=6).of("n").status.state is STATE.RUNNING
 
 
 MEMO = '{"awaited": ["/n", "soon", 0], "watch": null}'
@@ -339,168 +321,112 @@ def test_a_memo_of_another_version_is_none(memo) -> None:
 
 # --- another restart policy -------------------------------------------------------------------
 
-ONE = InstanceId("p", 1)
-NEVER = RestartPolicy("never")
-ON_FAILURE = RestartPolicy("on-failure")
 
-
-def running() -> Slave:
-    """Return a slave with one running instance."""
-    one = Slave()
-    one.step(assigned())
-    one.step(told(STATE.RUNNING, pid=5))
-    return one
-
-
-def test_a_restart_policy_is_settled_when_it_is_recorded() -> None:
+def test_a_restart_policy_is_settled_when_it_is_recorded(running) -> None:
     """Each repeated order is acknowledged, with the instance's status."""
-    one = running()
     for _ in range(2):
-        assert one.step(RestartPolicySet(ONE, NEVER)) == [slave_commands.Amend(ONE, NEVER)]
-        report, settled = one.step(RestartPolicyRecorded(ONE, NEVER))
+        assert running.step(RestartPolicySet(ONE, NEVER)) == [Amend(ONE, NEVER)]
+        report, settled = running.step(RestartPolicyRecorded(ONE, NEVER))
         assert states([report]) == [STATE.READY]
-        assert settled == slave_commands.Settle(ONE, NEVER)
+        assert settled == Settle(ONE, NEVER)
 
 
-def test_a_restart_policy_of_what_the_slave_found_running() -> None:
+def test_a_restart_policy_of_a_re_adopted_instance(one) -> None:
     """The slave lost its spec, but the supervisor has all that is needed."""
-    one = Slave()
-    one.step(SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
-    assert one.step(RestartPolicySet(ONE, NEVER)) == [slave_commands.Amend(ONE, NEVER)]
+    one.step(RUNS)
+    assert one.step(RestartPolicySet(ONE, NEVER)) == [Amend(ONE, NEVER)]
 
 
-def test_a_restart_policy_is_ordered_again_from_another_supervisor() -> None:
-    """The killed supervisor may have recorded it or not; the next one's answer counts."""
-    one = running()
-    one.step(RestartPolicySet(ONE, NEVER))
-    replaced = SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
-    assert slave_commands.Amend(ONE, NEVER) in one.step(replaced)
-    one.step(RestartPolicyRecorded(ONE, NEVER))
-    assert [type(c) for c in one.step(replaced)] == [slave_commands.Report]
+def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one(running) -> None:
+    """Each order in progress has its own answer, if need be from the next supervisor.
+
+    The killed supervisor may have recorded the newer policy or not; the next one's answer counts.
+    """
+    running.step(RestartPolicySet(ONE, NEVER))
+    running.step(RestartPolicySet(ONE, ON_FAILURE))
+    assert running.step(RestartPolicyRecorded(ONE, NEVER))[-1] == Settle(ONE, NEVER)
+    assert running.step(RUNS)[:-1] == [Amend(ONE, ON_FAILURE)]
+    running.step(RestartPolicyRecorded(ONE, ON_FAILURE))
+    assert [type(c) for c in running.step(RUNS)] == [Report]
 
 
-def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one() -> None:
-    """Both were in progress: each order has its own answer."""
-    one = running()
-    one.step(RestartPolicySet(ONE, NEVER))
-    one.step(RestartPolicySet(ONE, ON_FAILURE))
-    assert one.step(RestartPolicyRecorded(ONE, NEVER))[-1] == slave_commands.Settle(ONE, NEVER)
-    replaced = SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
-    assert one.step(replaced)[:-1] == [slave_commands.Amend(ONE, ON_FAILURE)]
-
-
-def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
+def test_a_restart_policy_of_an_ended_instance_reports_its_end(running) -> None:
     """The master receives the end, so its plan continues; the same holds for an end in between."""
-    one = running()
-    one.step(RestartPolicySet(ONE, NEVER))
-    one.step(told(STATE.FAILED))
-    report, settled = one.step(RestartPolicySet(ONE, NEVER))
+    running.step(RestartPolicySet(ONE, NEVER))
+    running.status(STATE.FAILED)
+    report, settled = running.step(RestartPolicySet(ONE, NEVER))
     assert states([report]) == [STATE.FAILED]
-    assert settled == slave_commands.Settle(ONE, NEVER)
-    replaced = SupervisorReplaced((InstanceStatus(ONE, STATE.FAILED),))
-    assert slave_commands.Settle(ONE, NEVER) in one.step(replaced)
+    assert settled == Settle(ONE, NEVER)
+    ended = replaced(InstanceStatus(ONE, STATE.FAILED))
+    assert Settle(ONE, NEVER) in running.step(ended)
 
 
-def test_a_restart_policy_of_a_stranger_is_refused() -> None:
+def test_a_restart_policy_of_an_unknown_instance_is_refused(running) -> None:
     """The order is refused also if only a killed supervisor could have known the instance."""
-    one = Slave()
-    (settled,) = one.step(RestartPolicySet(ONE, NEVER))
-    assert "p#1 is not known here" in settled.refusal
-    one = running()
-    one.step(RestartPolicySet(ONE, NEVER))
-    settled = one.step(SupervisorReplaced(()))[0]
-    assert isinstance(settled, slave_commands.Settle)
+    (settled,) = running.step(RestartPolicySet(InstanceId("q", 1), NEVER))
+    assert "q#1 is not known here" in settled.refusal
+    running.step(RestartPolicySet(ONE, NEVER))
+    settled = running.step(replaced())[0]
+    assert isinstance(settled, Settle)
     assert settled.refusal
 
 
-def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
+def test_a_restart_policy_of_a_held_instance(running) -> None:
     """The waiting instance starts with the new policy, and not as a shadow."""
-    one = running()
-    one.state.max_processes = 1
-    shadow = Assignment(InstanceId("p", 2), PLAIN, 1, "p_1700000000", shadow=True)
-    one.step(AssignmentsReceived((shadow,)))
-    _, settled = one.step(RestartPolicySet(InstanceId("p", 2), ON_FAILURE))
-    assert settled == slave_commands.Settle(InstanceId("p", 2), ON_FAILURE)
-    (launch,) = [c for c in one.step(told(STATE.EXITED)) if isinstance(c, slave_commands.Launch)]
-    (assignment,) = launch.assignments
-    assert assignment.spec.restart == ON_FAILURE
-    assert not assignment.shadow
+    running.state.max_processes = 1
+    running.assign(number=2, alias="p_17", shadow=True)
+    held = InstanceId("p", 2)
+    _, settled = running.step(RestartPolicySet(held, ON_FAILURE))
+    assert settled == Settle(held, ON_FAILURE)
+    (launch,) = [c for c in running.status(STATE.EXITED) if isinstance(c, Launch)]
+    (started,) = launch.assignments
+    assert (started.spec.restart, started.shadow) == (ON_FAILURE, False)
+
+
+def test_a_restart_policy_of_a_forgotten_instance_is_settled(running) -> None:
+    """The supervisor never records it, but the master still receives an answer."""
+    running.step(Registered(1))
+    running.step(RestartPolicySet(ONE, NEVER))
+    running.status(STATE.EXITED)
+    assert Settle(ONE, NEVER) in running.step(TimePassed(), after=100.0)
+
+
+# --- limits -----------------------------------------------------------------------------------
 
 
 def nodes(count: int) -> AssignmentsReceived:
-    specs = [replace(NODE, name=f"n{number}") for number in range(count)]
     return AssignmentsReceived(
-        tuple(Assignment(InstanceId(spec.name, 1), spec, 1, spec.name) for spec in specs)
+        tuple(assignment(replace(NODE, name=f"n{number}")) for number in range(count))
     )
 
 
-def launched(commands) -> list[str]:
-    launches = [one for one in commands if isinstance(one, slave_commands.Launch)]
-    return [one.instance.process for launch in launches for one in launch.assignments]
-
-
-def test_so_many_are_started_at_a_time(one) -> None:
+def test_at_most_max_starting_instances_start_at_a_time() -> None:
     """The others are held and reported; the next one starts once one is ready."""
-    one.state.max_starting = 2
+    one = Slave(max_starting=2)
     commands = one.step(nodes(4))
-    assert launched(commands) == ["n0", "n1"]
+    assert launched(commands) == [InstanceId("n0", 1), InstanceId("n1", 1)]
     assert states(commands) == [STATE.HELD, STATE.HELD]
     assert "max_starting: 2" in one.of("n2").status.message
-    assert launched(one.step(told(STATE.RUNNING, "n0", pid=5))) == []
-    assert launched(one.step(SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
+    assert launched(one.status(STATE.RUNNING, "n0")) == []
+    assert launched(one.step(SeenInGraph(InstanceId("n0", 1)))) == [InstanceId("n2", 1)]
 
 
-def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
-    """An instance that is stopped because it is not ready in time makes room, too."""
-    one.state.max_starting = 1
+def test_an_instance_that_ends_before_it_is_ready_frees_its_slot() -> None:
+    """An instance that is stopped because it is not ready in time frees its slot, too."""
+    one = Slave(max_starting=1)
     one.step(nodes(3))
-    assert launched(one.step(told(STATE.FAILED, "n0", exit_code=1))) == ["n1"]
-    one.step(told(STATE.RUNNING, "n1", pid=5))
-    assert one.step(TimePassed(), after=11.0) == [slave_commands.Stop(InstanceId("n1", 1))]
-    assert launched(one.step(told(STATE.STOPPING, "n1", pid=5))) == ["n2"]
+    assert launched(one.status(STATE.FAILED, "n0")) == [InstanceId("n1", 1)]
+    one.status(STATE.RUNNING, "n1")
+    assert one.step(TimePassed(), after=11.0) == [Stop(InstanceId("n1", 1))]
+    assert launched(one.status(STATE.STOPPING, "n1")) == [InstanceId("n2", 1)]
 
 
-def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
+def test_a_plain_program_has_started_as_soon_as_it_runs() -> None:
     """A bound on starts hardly delays plain programs."""
-    one.state.max_starting = 1
-    one.step(assigned(number=1))
-    one.step(assigned(replace(PLAIN, name="q")))
-    assert launched(one.step(told(STATE.RUNNING, pid=5))) == ["q"]
-
-
-def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
-    """The supervisor never records it, but the master still receives an answer."""
-    one = running()
-    one.step(Registered(1))
-    one.step(RestartPolicySet(ONE, NEVER))
-    one.step(told(STATE.EXITED))
-    commands = one.step(TimePassed(), after=100.0)
-    assert slave_commands.Settle(ONE, NEVER) in commands
-
-
-def test_stop_and_restart_go_to_the_supervisor(one) -> None:
-    """An ended instance is reported again; a restart of an unknown one has no effect."""
-    instance = InstanceId("p", 1)
-    one.step(assigned())
-    one.step(told(STATE.RUNNING, pid=5))
-    assert one.step(RestartOrdered(instance)) == [slave_commands.Restart(instance)]
-    assert one.step(StopOrdered(instance)) == [slave_commands.Stop(instance)]
-    one.step(told(STATE.EXITED))
-    assert states(one.step(StopOrdered(instance))) == [STATE.EXITED]
-    assert states(one.step(RestartOrdered(instance))) == [STATE.EXITED]
-    assert one.step(RestartOrdered(InstanceId("q", 2))) == []
-
-
-def test_a_complete_report_names_everything(one) -> None:
-    """The report includes ended instances that are still remembered."""
-    one.step(assigned())
-    one.step(assigned(number=2))
-    one.step(told(STATE.EXITED))
-    (report,) = one.step(ReportRequested())
-    assert report.complete
-    assert {s.instance.number: s.state for s in report.statuses} == {
-        1: STATE.EXITED, 2: STATE.STARTING,
-    }  # fmt: skip
+    one = Slave(max_starting=1)
+    one.assign()
+    one.assign(replace(PLAIN, name="q"))
+    assert launched(one.status(STATE.RUNNING)) == [InstanceId("q", 1)]
 
 
 @pytest.mark.parametrize(
@@ -518,7 +444,9 @@ def test_a_complete_report_names_everything(one) -> None:
         ([], 0, 0, True),  # no probe at all
     ],
 )
-def test_who_may_ask_for_work(usage, present, stale, under) -> None:
+def test_a_host_is_under_its_limits_where_each_limited_reading_is(
+    usage, present, stale, under
+) -> None:
     """Every reading that has a limit is fresh and under it."""
     values = np.zeros(16, np.float32)
     values[: len(usage)] = usage
@@ -532,8 +460,6 @@ def test_who_may_ask_for_work(usage, present, stale, under) -> None:
 NUMBERS = st.integers(1, 4)
 WATCHED = ProcessSpec("w", command=("true",), health=Health(timeout=0.5), restart=ON_FAILURE)
 SPECS = st.sampled_from([PLAIN, NODE, WATCHED])
-
-
 FENCES = st.none() | st.builds(Fence, st.sampled_from([1.0, 5.0]), st.just(1.0))
 
 
@@ -550,7 +476,7 @@ class AnySlave(RuleBasedStateMachine):
         self.stopped: set[InstanceId] = set()
         self.amending: list[tuple[InstanceId, RestartPolicy]] = []
         self.unsettled: set[tuple[InstanceId, RestartPolicy]] = set()
-        self.heard_at = 0.0
+        self.contact_at = 0.0
 
     def feed(self, event) -> None:
         for command in reducer.step(self.state, event, self.now):
@@ -579,16 +505,17 @@ class AnySlave(RuleBasedStateMachine):
 
     def check_fence(self, assignment) -> None:
         fence = assignment.fence
-        late = fence is not None and self.now >= self.heard_at + fence.after
+        late = fence is not None and self.now >= self.contact_at + fence.after
         assert not late or fence.alive, "started when its successor may run"
 
     @rule(spec=SPECS, number=NUMBERS, epoch=st.integers(1, 3), fence=FENCES)
     def assign(self, spec, number, epoch, fence) -> None:
-        self.feed(assigned(spec, number, epoch, fence))
+        given = assignment(spec, number, epoch=epoch, fence=fence)
+        self.feed(AssignmentsReceived((given,)))
 
     @rule(ago=st.sampled_from([0.0, 0.0, 0.05, 3.0]))
-    def hear(self, ago) -> None:
-        self.heard_at = max(self.heard_at, self.now - ago)
+    def confirm_contact(self, ago) -> None:
+        self.contact_at = max(self.contact_at, self.now - ago)
         self.feed(ContactConfirmed(self.now - ago))
 
     @rule(spec=SPECS, number=NUMBERS)
@@ -618,10 +545,10 @@ class AnySlave(RuleBasedStateMachine):
     def record(self) -> None:
         self.feed(RestartPolicyRecorded(*self.amending.pop(0)))
 
-    @rule(hears=st.booleans())
-    def replace_supervisor(self, hears) -> None:
+    @rule(reads=st.booleans())
+    def replace_supervisor(self, reads) -> None:
         """Replace the supervisor: unread orders are lost, its record is kept."""
-        if not hears:
+        if not reads:
             self.amending.clear()
         found = (InstanceStatus(one, state, 7) for one, state in self.alive.items())
         ended = (h.status for h in self.state.held.values() if h.status.state.ended)
@@ -683,8 +610,8 @@ class AnySlave(RuleBasedStateMachine):
 
     @invariant()
     def every_order_is_or_will_be_settled(self) -> None:
-        wanted = {(i, restart) for i, h in self.state.held.items() for restart in h.unsettled}
-        assert self.unsettled <= wanted | set(self.amending)
+        pending = {(i, restart) for i, h in self.state.held.items() for restart in h.unsettled}
+        assert self.unsettled <= pending | set(self.amending)
 
     @invariant()
     def only_ready_ones_are_watched(self) -> None:

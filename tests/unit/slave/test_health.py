@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.core.slave import events, reducer
+from rosrm.core.slave import events
 from rosrm.core.slave.commands import Command, Fail, Remember
 from rosrm.core.slave.health import LOOK_PERIOD, InstanceHealth, resolve, watch_of
-from rosrm.core.slave.state import SlaveState
 from rosrm.core.slave.watches import Awaited, Memo, Observation, Watch
 from rosrm.model.values import (
     Assignment,
@@ -23,6 +22,7 @@ from rosrm.model.values import (
     RestartPolicy,
 )
 from rosrm.slave.memos import from_memo, to_memo
+from tests.unit.slave.rig import Slave
 
 SCAN = Health("~/scan", 5.0, "", 4.0)
 SPEC = ProcessSpec("lidar", module="m", ros=True, namespace="/robot", health=SCAN)
@@ -46,16 +46,16 @@ class Node:
         self.judgement = InstanceHealth(watched(health), 7, 0.0)
         self.now = 0.0
 
-    def goes_on(self, seconds: float, rate: float | None = None, period: float = 0.2, **look):
+    def looks(self, seconds: float, rate: float | None = None, period: float = 0.2, **look):
         """Repeat a look for this long; return the first verdict of bad health, with its time."""
-        begun, told = self.now, 0
+        begun, counted = self.now, 0
         while self.now - begun < seconds:
             self.now += period
-            heard = None
+            messages = None
             if rate is not None:
-                said = int((self.now - begun) * rate + 1e-9)
-                heard, told = said - told, said
-            verdict = self.judgement.look(Observation(messages=heard, **look), self.now)
+                published = int((self.now - begun) * rate + 1e-9)
+                messages, counted = published - counted, published
+            verdict = self.judgement.look(Observation(messages=messages, **look), self.now)
             if verdict:
                 return verdict
         return ""
@@ -67,16 +67,16 @@ class Node:
 def test_a_topic_that_falls_silent_is_noticed_within_its_time_and_a_quarter() -> None:
     """The verdict comes after `timeout`, and has the finding, its duration and the requirement."""
     node = Node()
-    assert node.goes_on(60.0, rate=20.0) == ""
+    assert node.looks(60.0, rate=20.0) == ""
     silent = node.now
-    assert node.goes_on(20.0, rate=0.0).startswith("unhealthy: ~/scan: 0.0 Hz for 4.")
+    assert node.looks(20.0, rate=0.0).startswith("unhealthy: ~/scan: 0.0 Hz for 4.")
     assert 4.0 < node.now - silent < 6.0
 
 
 def test_a_slow_topic_is_not_enough() -> None:
     """A steady rate of 0.4 Hz fails where 5 Hz are required."""
     node = Node()
-    verdict = node.goes_on(20.0, rate=0.4)
+    verdict = node.looks(20.0, rate=0.4)
     assert verdict.endswith("at least 5 Hz are required")
     assert "0.4 Hz" in verdict or "0.2 Hz" in verdict or "0.5 Hz" in verdict
 
@@ -84,8 +84,8 @@ def test_a_slow_topic_is_not_enough() -> None:
 def test_a_node_has_its_time_once_more_until_it_must_publish() -> None:
     """The time starts again once the node is ready, because it may load data first."""
     node = Node()
-    assert node.goes_on(7.5, trouble="not published as /robot/lidar/scan") == ""
-    verdict = node.goes_on(2.0, trouble="not published as /robot/lidar/scan")
+    assert node.looks(7.5, trouble="not published as /robot/lidar/scan") == ""
+    verdict = node.looks(2.0, trouble="not published as /robot/lidar/scan")
     assert verdict.startswith("unhealthy: ~/scan: not published as /robot/lidar/scan for 4.")
 
 
@@ -93,38 +93,38 @@ def test_a_pause_shorter_than_its_time_is_forgiven() -> None:
     """Repeated short pauses do not add up."""
     node = Node()
     for _ in range(10):
-        assert node.goes_on(8.0, rate=5.0) == ""
-        assert node.goes_on(2.9, rate=0.0) == ""
+        assert node.looks(8.0, rate=5.0) == ""
+        assert node.looks(2.9, rate=0.0) == ""
 
 
 @given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0), st.floats(1.0, 10.0))
-def test_a_topic_as_fast_as_is_wanted_is_never_amiss(least, timeout, faster) -> None:
+def test_a_topic_at_its_required_rate_is_never_unhealthy(least, timeout, faster) -> None:
     """This holds for every rate, time and start of the windows."""
     node = Node(Health("scan", least, "", timeout))
-    assert node.goes_on(max(10 * timeout, 10 / least), least * faster, timeout / 10) == ""
+    assert node.looks(max(10 * timeout, 10 / least), least * faster, timeout / 10) == ""
 
 
 @given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0))
-def test_a_topic_at_half_its_rate_or_less_is_always_noticed(least, timeout) -> None:
+def test_a_topic_at_half_its_rate_or_less_is_always_unhealthy(least, timeout) -> None:
     """The verdict comes within twice its time and two windows."""
     node = Node(Health("scan", least, "", timeout))
     window = max(timeout / 4, 3 / least)
-    assert node.goes_on(3 * timeout + 2 * window, least / 3.1, min(0.2, timeout / 10)) != ""
+    assert node.looks(3 * timeout + 2 * window, least / 3.1, min(0.2, timeout / 10)) != ""
 
 
 def test_a_subscription_is_counted_from_its_matching_on() -> None:
     """Silence counts only from the first whole window after the match."""
     node = Node(Health("scan", 5.0, "", 1.0))
-    assert node.goes_on(1.9, trouble="not found by discovery yet") == ""
-    assert node.goes_on(30.0, rate=5.0) == ""
+    assert node.looks(1.9, trouble="not found by discovery yet") == ""
+    assert node.looks(30.0, rate=5.0) == ""
 
 
-def test_a_slave_that_did_not_look_blames_nobody() -> None:
+def test_a_slave_that_did_not_look_finds_no_instance_unhealthy() -> None:
     """Looks that failed because the slave itself was stopped for a minute do not count."""
     node = Node()
-    assert node.goes_on(20.0, rate=5.0) == ""
+    assert node.looks(20.0, rate=5.0) == ""
     node.now += 60.0
-    assert node.goes_on(20.0, rate=5.0) == ""
+    assert node.looks(20.0, rate=5.0) == ""
 
 
 # --- stopped, lifecycle -----------------------------------------------------------------------
@@ -135,10 +135,10 @@ PLAIN = Health(timeout=4.0)
 def test_what_is_stopped_for_too_long_is_unhealthy() -> None:
     """SIGSTOP counts; a process that resumes in time is healthy."""
     node = Node(PLAIN)
-    assert node.goes_on(3.7, stopped=True) == ""
-    assert node.goes_on(1.0) == ""
-    assert node.goes_on(3.7, stopped=True) == ""
-    assert node.goes_on(1.0, stopped=True).startswith("unhealthy: stopped by a signal (SIGSTOP) f")
+    assert node.looks(3.7, stopped=True) == ""
+    assert node.looks(1.0) == ""
+    assert node.looks(3.7, stopped=True) == ""
+    assert node.looks(1.0, stopped=True).startswith("unhealthy: stopped by a signal (SIGSTOP) f")
 
 
 @pytest.mark.parametrize(
@@ -151,19 +151,19 @@ def test_what_is_stopped_for_too_long_is_unhealthy() -> None:
 def test_another_lifecycle_state_or_no_answer(state, said) -> None:
     """Both fail the check; a state that is not known yet does not."""
     node = Node(Health(lifecycle="active", timeout=4.0))
-    assert node.goes_on(10.0, state=None) == ""
-    assert node.goes_on(10.0, state="active") == ""
-    assert node.goes_on(3.0, state=state) == ""
-    assert node.goes_on(0.3, state="active") == ""
-    verdict = node.goes_on(5.0, state=state)
+    assert node.looks(10.0, state=None) == ""
+    assert node.looks(10.0, state="active") == ""
+    assert node.looks(3.0, state=state) == ""
+    assert node.looks(0.3, state="active") == ""
+    verdict = node.looks(5.0, state=state)
     assert verdict.startswith(f"unhealthy: {said}")
     assert verdict.endswith("the state active is required")
 
 
-def test_all_that_is_amiss_is_said() -> None:
+def test_the_verdict_has_every_finding() -> None:
     """The message has all findings in one line."""
     node = Node(Health("~/scan", 5.0, "active", 4.0))
-    while "~/scan" not in (verdict := node.goes_on(20.0, rate=0.0, state="")):
+    while "~/scan" not in (verdict := node.looks(20.0, rate=0.0, state="")):
         assert node.now < 60.0, verdict
     assert "no answer" in verdict
 
@@ -215,93 +215,77 @@ def test_nothing_is_watched_without_a_time() -> None:
 
 # --- reducer of the slave ---------------------------------------------------------------------
 
-
-class Slave:
-    """Slave that holds one plain process with a health check."""
-
-    def __init__(self, shadow: bool = False) -> None:
-        self.state = SlaveState(registered=True)
-        self.now = 0.0
-        restart = RestartPolicy("always")
-        spec = ProcessSpec("lidar", command=("true",), health=PLAIN, restart=restart)
-        self.step(events.AssignmentsReceived((Assignment(LIDAR, spec, 1, "lidar", shadow),)))
-
-    def step(self, event) -> list[Command]:
-        return list(reducer.step(self.state, event, self.now))
-
-    def runs(self, pid: int) -> None:
-        status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=pid)
-        self.step(events.SupervisorReported((status,)))
-
-    def looks(self, seconds: float, pid: int, **look) -> list[Command]:
-        """Return the first orders within this time."""
-        ordered, until = [], self.now + seconds
-        while self.now < until and not ordered:
-            self.now += LOOK_PERIOD
-            ordered = self.step(events.LookedAt(LIDAR, pid, Observation(**look)))
-        return ordered
+ALWAYS, NEVER = RestartPolicy("always"), RestartPolicy("never")
+PROCESS = ProcessSpec("lidar", command=("true",), health=PLAIN, restart=ALWAYS)
+RUNS = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=5)
 
 
-def test_an_unhealthy_run_is_ended_as_failed() -> None:
-    """The fail order names this run, and kills it if it is stopped; a lost order is repeated."""
+def running(**assigned) -> Slave:
+    """Return a slave with one running plain process that has a health check."""
     one = Slave()
-    one.runs(5)
-    for _ in range(2):
-        (fail,) = one.looks(10.0, 5, stopped=True)
-        assert isinstance(fail, Fail)
-        assert (fail.instance, fail.pid, fail.kill) == (LIDAR, 5, True)
+    one.assign(PROCESS, **assigned)
+    one.status(InstanceState.RUNNING, "lidar")
+    return one
 
 
-def test_a_restart_begins_anew() -> None:
+def looks(one: Slave, seconds: float, pid: int = 5) -> list[Command]:
+    """Look at a stopped process; return the first commands within this time."""
+    until, commands = one.now + seconds, []
+    while one.now < until and not commands:
+        look = events.LookedAt(LIDAR, pid, Observation(stopped=True))
+        commands = one.step(look, after=LOOK_PERIOD)
+    return commands
+
+
+def test_a_restart_starts_the_time_again() -> None:
     """Looks at the former run, or at a run that is not ready, do not count."""
-    one = Slave()
-    one.runs(5)
-    assert one.looks(3.0, 5, stopped=True) == []
-    one.step(events.SupervisorReported((InstanceStatus(LIDAR, InstanceState.BACKOFF),)))
+    one = running()
+    assert looks(one, 3.0) == []
+    one.status(InstanceState.BACKOFF, "lidar")
     assert one.state.watched() == {}
-    assert one.looks(10.0, 5, stopped=True) == []
-    one.runs(6)
-    assert one.looks(10.0, 5, stopped=True) == []
-    assert one.looks(3.0, 6, stopped=True) == []
-    assert len(one.looks(3.0, 6, stopped=True)) == 1
+    assert looks(one, 10.0) == []
+    one.status(InstanceState.RUNNING, "lidar", pid=6)
+    assert looks(one, 10.0) == []
+    assert looks(one, 3.0, pid=6) == []
+    assert len(looks(one, 3.0, pid=6)) == 1
 
 
 def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
     """A later run of the slave resumes the checks, too."""
-    one = Slave(shadow=True)
-    one.runs(5)
+    one = running(shadow=True)
     assert one.state.watched() == {}
-    assert one.looks(10.0, 5, stopped=True) == []
-    commands = one.step(events.RestartPolicySet(LIDAR, RestartPolicy("always")))
+    assert looks(one, 10.0) == []
+    commands = one.step(events.RestartPolicySet(LIDAR, ALWAYS))
     (memo,) = [command.memo for command in commands if isinstance(command, Remember)]
-    assert list(one.state.watched()) == [LIDAR]
-    later = SlaveState(registered=True)
-    status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=5)
-    reducer.step(later, events.SupervisorReplaced((status,), {LIDAR: memo}), 0.0)
-    assert list(later.watched()) == [LIDAR]
+    later = Slave()
+    later.step(events.SupervisorReplaced((RUNS,), {LIDAR: memo}))
+    assert list(one.state.watched()) == list(later.state.watched()) == [LIDAR]
 
 
-def test_what_is_being_moved_may_be_silent() -> None:
-    """A move suspends restart policy and health checks; afterwards the time starts again."""
-    one = Slave()
-    one.runs(5)
-    one.looks(3.0, 5, stopped=True)
-    one.step(events.RestartPolicySet(LIDAR, RestartPolicy("never")))
-    assert one.looks(20.0, 5, stopped=True) == []
-    one.step(events.RestartPolicySet(LIDAR, RestartPolicy("always")))
-    assert one.looks(3.0, 5, stopped=True) == []
-    assert len(one.looks(3.0, 5, stopped=True)) == 1
+def test_an_unhealthy_run_is_failed_unless_it_is_being_moved() -> None:
+    """The fail order names this run, and kills it if it is stopped; a lost order is repeated.
+
+    A move suspends restart policy and health checks; afterwards the time starts again.
+    """
+    one = running()
+    looks(one, 3.0)
+    one.step(events.RestartPolicySet(LIDAR, NEVER))
+    assert looks(one, 20.0) == []
+    one.step(events.RestartPolicySet(LIDAR, ALWAYS))
+    assert looks(one, 3.0) == []
+    for _ in range(2):
+        (fail,) = looks(one, 10.0)
+        assert isinstance(fail, Fail)
+        assert (fail.instance, fail.pid, fail.kill) == (LIDAR, 5, True)
 
 
 def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
     """The restart policy arrived before its start."""
-    state = SlaveState(registered=True, max_processes=1)
-    spec = ProcessSpec("lidar", command=("true",), health=PLAIN)
-    other = Assignment(InstanceId("other", 2), replace(spec, name="other"), 1, "other")
-    shadow = Assignment(LIDAR, spec, 1, "lidar_1", shadow=True)
-    reducer.step(state, events.AssignmentsReceived((other, shadow)), 0.0)
-    reducer.step(state, events.RestartPolicySet(LIDAR, RestartPolicy("always")), 0.0)
-    watch = state.held[LIDAR].watch
+    one = Slave(max_processes=1)
+    one.assign(replace(PROCESS, name="other"))
+    one.assign(PROCESS, alias="lidar_1", shadow=True)
+    one.step(events.RestartPolicySet(LIDAR, ALWAYS))
+    watch = one.of("lidar").watch
     assert watch is not None
     assert not watch.paused
 

@@ -78,7 +78,7 @@ def test_the_launcher_that_the_strategy_declares_prepares_the_start():
     assert known.prepare(launch()).argv == ("x",)
 
 
-def test_a_restored_instance_goes_to_the_launcher_that_has_its_image():
+def test_a_restored_instance_is_launched_by_the_launcher_that_has_its_image():
     """Whatever strategy its process moves by; without an image it does not start."""
     known = launchers(first=Restorer(), second=Restorer(7))
     assert known.prepare(launch(restored=True)).argv == ("wrap", "x")
@@ -132,7 +132,7 @@ def test_a_launcher_that_leads_a_session_names_its_members(tmp_path):
 
 
 def test_a_launcher_that_fails_leaves_an_instance_as_any_other(caplog):
-    """Its fault is logged once."""
+    """The fault of a launcher is logged once."""
     caplog.set_level(logging.INFO)
     known = launchers(ours=Faulty())
     for _ in range(2):

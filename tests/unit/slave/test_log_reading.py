@@ -195,7 +195,7 @@ def test_one_answer_is_bounded(tmp_path, log) -> None:
     assert len(read(tmp_path).content) <= 1 << 20
 
 
-def test_no_log_is_said(tmp_path) -> None:
+def test_a_missing_log_is_refused(tmp_path) -> None:
     """The refusal names the file."""
     with pytest.raises(Refused, match="no log of robot/p#3"):
         read(tmp_path)
@@ -271,7 +271,7 @@ def test_a_log_that_was_cut_without_a_note_is_read_on(tmp_path, keeper) -> None:
 
 
 def test_a_log_from_before_there_were_times(tmp_path, keeper) -> None:
-    """Its bytes count; their time is that of the first look."""
+    """The bytes of an older log count; their time is that of the first look."""
     log_path(tmp_path, P).write_bytes(b"old\n")
     start(keeper, 7, b"new\n")
     keeper.look(1e9)

@@ -310,7 +310,7 @@ def test_another_error_is_reported_after_a_while(bad):
 
 
 def test_a_probe_that_could_not_be_made_is_full_and_stale(rig):
-    """Its readings are as before a first answer.
+    """The readings of a failed probe are as before a first answer.
 
     If others read all of its resources, it only fails.
     """

@@ -43,7 +43,7 @@ def told(state: InstanceState, pid: int = 0, cpu_time: float = 0.0) -> InstanceS
     return InstanceStatus(P, state, pid=pid, cpu_time=cpu_time)
 
 
-def test_usage_is_said_three_readings_after_it_was_seen(table) -> None:
+def test_usage_is_reported_three_readings_after_its_measurement(table) -> None:
     """Each usage is reported once, and is not measured again before its report."""
     watch = UsageWatch(table)
     watch.follow(told(InstanceState.RUNNING, 40))

@@ -13,12 +13,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosrm import snapshots
-from rosrm.snapshots import Block, Damaged, SlotWriter
+from rosrm.snapshots import reader
+from rosrm.snapshots.format import Block, Damaged, decoded, encoded_head
+from rosrm.snapshots.writer import CopyWriter, SlotWriter, drop_snapshots
 
 
 def blocks(*contents: bytes) -> list[Block]:
     return [Block(data, zlib.crc32(data)) for data in contents]
+
+
+def write_copy(directory: Path, data: bytes) -> None:
+    copy = CopyWriter(directory)
+    copy.append(data)
+    copy.finish()
 
 
 def write(directory: Path, sequence: int, *contents: bytes, instance: int = 7) -> bool:
@@ -30,7 +37,7 @@ def write(directory: Path, sequence: int, *contents: bytes, instance: int = 7) -
 
 
 def newest(directory: Path, up_to: int = 99):
-    found, _ = snapshots.newest(directory, up_to)
+    found, _ = reader.newest(directory, up_to)
     return None if found is None else (found.head.age, found.blocks)
 
 
@@ -41,8 +48,8 @@ CONTENTS = st.lists(st.binary(max_size=200), min_size=1, max_size=4)
 def test_what_is_written_is_read(contents, sequence, name):
     """Name, instance, sequence and every block are equal, bit by bit."""
     parts = blocks(*contents)
-    data = snapshots.encoded_head(name, 3, sequence, parts) + b"".join(contents)
-    read = snapshots.decoded(data)
+    data = encoded_head(name, 3, sequence, parts) + b"".join(contents)
+    read = decoded(data)
     assert (read.head.process, read.head.instance, read.head.sequence) == (name, 3, sequence)
     assert list(read.blocks) == contents
     assert read.head.size == len(data)
@@ -52,19 +59,19 @@ def test_what_is_written_is_read(contents, sequence, name):
 def test_no_change_goes_unseen(contents, data):
     """One changed byte anywhere, or a file that ends too early, is detected."""
     parts = blocks(*contents)
-    whole = snapshots.encoded_head("counter", 3, 5, parts) + b"".join(contents)
+    whole = encoded_head("counter", 3, 5, parts) + b"".join(contents)
     at = data.draw(st.integers(0, len(whole) - 1))
     other = data.draw(st.integers(1, 255))
     with pytest.raises(Damaged):
-        snapshots.decoded(whole[:at])
+        decoded(whole[:at])
     with pytest.raises(Damaged):
-        snapshots.decoded(whole[:at] + bytes([whole[at] ^ other]) + whole[at + 1 :])
+        decoded(whole[:at] + bytes([whole[at] ^ other]) + whole[at + 1 :])
 
 
 @given(garbage=st.binary(max_size=300))
-def test_what_is_no_state_is_said_so(garbage):
+def test_a_file_that_is_no_snapshot_is_refused(garbage):
     with pytest.raises(Damaged):
-        snapshots.decoded(garbage)
+        decoded(garbage)
 
 
 def test_the_newest_counts(tmp_path):
@@ -131,16 +138,16 @@ def test_a_damaged_newest_leaves_the_older_one_and_is_named(tmp_path):
     """The next write replaces the damaged snapshot, not the last whole one."""
     write(tmp_path, 1, b"first")
     write(tmp_path, 2, b"second")
-    damaged = tmp_path / snapshots.SLOTS[1]
+    damaged = tmp_path / reader.SLOTS[1]
     content = damaged.read_bytes()
     damaged.write_bytes(content[:-1] + b"?")
-    found, faults = snapshots.newest(tmp_path, 99)
+    found, faults = reader.newest(tmp_path, 99)
     assert found is not None
     assert found.head.sequence == 1
     assert len(faults) == 1
     assert str(damaged) in faults[0]
     write(tmp_path, 3, b"third")
-    assert snapshots.read(tmp_path / snapshots.SLOTS[0]).head.sequence == 1
+    assert reader.read(tmp_path / reader.SLOTS[0]).head.sequence == 1
 
 
 def test_a_full_disk_leaves_the_newest_state(tmp_path, monkeypatch):
@@ -169,7 +176,7 @@ def test_files_are_the_owners_alone_and_do_not_stay_large(tmp_path):
     try:
         for sequence in range(4):
             write(directory, sequence, bytes(1_000_000) if sequence < 2 else b"small")
-        snapshots.write_copy(directory, snapshots.newest_content(directory)[1])
+        write_copy(directory, reader.newest_content(directory)[1])
     finally:
         os.umask(old)
     assert stat.S_IMODE(directory.stat().st_mode) == 0o700
@@ -182,9 +189,9 @@ def test_a_copy_from_another_host_counts_like_a_state_of_ones_own(tmp_path):
     """The replica counts until a newer instance has written a snapshot."""
     there, here = tmp_path / "there", tmp_path / "here"
     write(there, 5, b"state")
-    found = snapshots.newest_content(there)
+    found = reader.newest_content(there)
     assert found is not None
-    snapshots.write_copy(here, found[1])
+    write_copy(here, found[1])
     assert newest(here) == ((7, 5), (b"state",))
     write(here, 1, b"mine", instance=9)
     assert newest(here) == ((9, 1), (b"mine",))
@@ -195,22 +202,22 @@ def test_dropped_are_the_states_of_older_instances_alone(tmp_path):
     directory = tmp_path / "counter"
     write(directory, 5, b"old")
     write(directory, 1, b"new", instance=9)
-    assert not snapshots.drop(directory, 8)
+    assert not drop_snapshots(directory, 8)
     assert newest(directory) == ((9, 1), (b"new",))
-    assert snapshots.drop(directory, 9)
+    assert drop_snapshots(directory, 9)
     assert not directory.exists()
 
 
-def test_a_writer_whose_files_were_deleted_goes_on_in_new_ones(tmp_path):
+def test_a_writer_whose_files_were_deleted_writes_new_ones(tmp_path):
     """The snapshot of a former instance may be dropped while the new one runs."""
     directory = tmp_path / "counter"
     write(directory, 5, b"old", instance=7)
     writer = SlotWriter(directory, "counter", 9)
-    assert snapshots.drop(directory, 8)
+    assert drop_snapshots(directory, 8)
     assert writer.write(1, blocks(b"new"))
     assert newest(directory) == ((9, 1), (b"new",))
     assert writer.write(2, blocks(b"newer"))
-    snapshots.drop(directory, 8)
+    drop_snapshots(directory, 8)
     assert writer.write(3, blocks(b"newest"))
     writer.close()
     assert newest(directory) == ((9, 3), (b"newest",))
@@ -222,7 +229,7 @@ def test_links_are_not_followed(tmp_path):
     victim.write_bytes(b"precious")
     directory = tmp_path / "counter"
     directory.mkdir()
-    (directory / snapshots.SLOTS[0]).symlink_to(victim)
+    (directory / reader.SLOTS[0]).symlink_to(victim)
     with pytest.raises(OSError, match="symbolic"):
         write(directory, 1, b"state")
     assert victim.read_bytes() == b"precious"

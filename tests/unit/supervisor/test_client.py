@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.core.supervisor.events import ContactReported
 from rosrm.supervisor import messages
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 
@@ -15,7 +16,7 @@ def test_a_supervisor_that_ended_beside_an_order_has_ended(tmp_path: Path) -> No
     """An unread order breaks the connection; that counts as an end, not as a crash."""
     ours, its = socket.socketpair()
     with SupervisorClient(ours, tmp_path) as client:
-        client.heard(1.0, 1.0)
+        client.send(ContactReported(1.0, 1.0))
         its.sendall(messages.encode_ended())
         its.close()
         with pytest.raises(SupervisorEnded):

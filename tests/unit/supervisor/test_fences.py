@@ -11,7 +11,7 @@ import pytest
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.commands import Signal, Unspawn
-from rosrm.core.supervisor.instance import BACKOFF, EXITED, FAILED, FENCED, REFUSED
+from rosrm.core.supervisor.instance import BACKOFF, EXITED, FAILED, FENCED
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 
@@ -48,7 +48,7 @@ def signals(core, until):
     return sent
 
 
-def test_it_is_stopped_when_nobody_says_that_it_is_heard():
+def test_an_instance_without_contact_is_stopped_within_its_fence():
     """The stop steps of its spec apply, shortened to the fence's grace; its status says why."""
     core, instance = running()
     assert signals(core, 13.5) == [(10.0, "SIGINT"), (11.0, "SIGTERM"), (13.0, "SIGKILL")]
@@ -60,15 +60,17 @@ def test_it_is_stopped_when_nobody_says_that_it_is_heard():
     assert core.deadline() is None
 
 
-def test_its_own_graces_stay_where_they_are_short_enough():
-    """Graces that are short enough allow the instance to end without haste."""
-    core, _ = running(stop=StopRule(0.5, 0.5))
-    assert signals(core, 11.5) == [(10.0, "SIGINT"), (10.5, "SIGTERM"), (11.0, "SIGKILL")]
-
-
-def test_without_a_grace_it_is_killed():
-    core, _ = running(fence=FenceRule(10.0, 0.0))
-    assert signals(core, 10.0) == [(10.0, "SIGKILL")]
+@pytest.mark.parametrize(
+    ("stop", "grace", "sent"),
+    [
+        (StopRule(0.5, 0.5), 3.0, [(10.0, "SIGINT"), (10.5, "SIGTERM"), (11.0, "SIGKILL")]),
+        (GRACES, 0.0, [(10.0, "SIGKILL")]),
+    ],
+)
+def test_graces_are_bounded_by_that_of_the_fence(stop, grace, sent):
+    """Graces that are short enough stay; a fence without a grace kills at once."""
+    core, _ = running(stop=stop, fence=FenceRule(10.0, grace))
+    assert signals(core, sent[-1][0]) == sent
 
 
 def test_a_late_look_at_the_clock_kills():
@@ -78,17 +80,15 @@ def test_a_late_look_at_the_clock_kills():
     assert [c.number for c in commands if isinstance(c, Signal)] == [signal.SIGKILL]
 
 
-def test_every_word_puts_it_off_from_when_it_was_true():
-    """The deadline counts from the contact, not from the message; older ones have no effect."""
+def test_a_contact_renews_the_fence_from_its_own_time():
+    """The deadline counts from the contact, not from the message; older ones have no effect.
+
+    A contact in the future, which is impossible, counts as one of now.
+    """
     core, _ = running()
-    core.handle(events.ContactReported(8.0), 9.5)
-    assert core.deadline() == 18.0
-    core.handle(events.ContactReported(7.0), 9.6)
-    assert core.deadline() == 18.0
-    core.handle(
-        events.ContactReported(99.0), 10.0
-    )  # no master contact is possible at this future time
-    assert core.deadline() == 20.0
+    for contact, now, deadline in ((8.0, 9.5, 18.0), (7.0, 9.6, 18.0), (99.0, 10.0, 20.0)):
+        core.handle(events.ContactReported(contact), now)
+        assert core.deadline() == deadline
 
 
 def test_the_clock_begins_with_what_the_start_knows():
@@ -99,19 +99,13 @@ def test_the_clock_begins_with_what_the_start_knows():
     assert core.deadline() == 10.0
 
 
-def test_a_word_that_comes_after_it_has_begun_is_too_late():
-    """Its successor may rely on its end."""
+def test_a_contact_after_the_fence_has_begun_is_too_late():
+    """The successor may rely on the end of the instance."""
     core, instance = running()
     core.handle(events.TimePassed(), 10.0)
     core.handle(events.ContactReported(10.5), 10.5)
     core.handle(events.Exited(ONE), 10.6)
     assert instance.phase == FENCED
-
-
-def test_one_without_a_fence_is_left_alone():
-    """A robot's driver, for example, keeps running."""
-    core, _ = running(fence=None)
-    assert core.deadline() is None
 
 
 def test_a_restart_by_policy_does_not_put_it_off():
@@ -153,6 +147,7 @@ def test_a_stop_under_way_becomes_as_short():
 
 
 def test_a_restart_under_way_becomes_an_end():
+    """A repeated order to restart changes nothing."""
     core, instance = running()
     core.handle(events.RestartOrdered(ONE), 9.0)
     core.handle(events.TimePassed(), 10.0)
@@ -165,7 +160,7 @@ def test_a_restart_under_way_becomes_an_end():
     ("code", "when", "phase"),
     [(0, "on-failure", EXITED), (1, "never", FAILED), (1, "always", FENCED)],
 )
-def test_what_had_ended_by_itself_keeps_its_end(code, when, phase):
+def test_an_instance_that_ended_before_its_fence_keeps_its_end(code, when, phase):
     """A job that completed before the fence has completed; it is not restarted."""
     core, instance = running(restart=RestartRule(when))
     core.handle(events.Exited(ONE, code, leftovers=True), 9.5)
@@ -206,15 +201,7 @@ def test_the_order_to_fence_ends_what_waits():
     assert core.handle(events.Spawned(ONE, 100), 0.2)[-1] == Signal(ONE, signal.SIGKILL)
 
 
-def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
-    """A late start is refused."""
-    core = SupervisorState()
-    core.handle(events.FenceOrdered(ONE), 0.0)
-    core.handle(events.StartOrdered(ONE, ALWAYS, GRACES), 1.0)
-    assert core.instances[ONE].phase == REFUSED
-
-
-def test_what_is_fenced_on_its_way_out_is_not_restarted_on_order():
+def test_an_instance_fenced_while_it_is_stopped_is_not_restarted_on_order():
     """The instance had failed, and its policy was to decide; now it has a successor."""
     core, instance = running(restart=RestartRule("always"))
     core.handle(events.FailOrdered(ONE, instance.pid, "hung", False), 1.0)

@@ -12,13 +12,7 @@ import yaml
 from hypothesis import given
 
 from rosrm.errors import LaunchError
-from rosrm.model.values import (
-    Assignment,
-    InstanceId,
-    ProcessSpec,
-    RestartPolicy,
-    StopPolicy,
-)
+from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy, StopPolicy
 from rosrm.slave.launch.ament_index import find_executable
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import (
@@ -48,15 +42,17 @@ def shadow() -> Assignment:
     return Assignment(InstanceId("talker", 8), spec, 3, "talker_1700000000", shadow=True)
 
 
-def order(tmp_path, environment=None, **fields):
+def launched(tmp_path, given: Assignment, environment=None, python=sys.executable):
+    """Return the launch order for an assignment."""
     return launch_order(
-        assignment(**fields),
-        {"PATH": "/usr/bin", **(environment or {})},
-        sys.executable,
-        where=HERE,
-        state_directory=tmp_path,
+        given, environment or {}, python, where=HERE, state_directory=tmp_path,
         launchers=Launchers(),
-    )
+    )  # fmt: skip
+
+
+def order(tmp_path, environment=None, **fields):
+    environment = {"PATH": "/usr/bin", **(environment or {})}
+    return launched(tmp_path, assignment(**fields), environment)
 
 
 @pytest.fixture
@@ -118,9 +114,7 @@ def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
 
 def test_an_alias_names_the_node(tmp_path):
     """In a handoff the assignment has the node's name, not the spec."""
-    made = launch_order(
-        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
-    )
+    made = launched(tmp_path, shadow())
     assert "__node:=talker_1700000000" in made.argv
     (file,) = (tmp_path / "logs").glob("*.yaml")
     assert yaml.safe_load(file.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
@@ -128,14 +122,9 @@ def test_an_alias_names_the_node(tmp_path):
 
 def test_a_shadow_is_not_restarted(tmp_path):
     """A shadow's end is final, whatever its spec says; other instances follow their specs."""
-    made = launch_order(
-        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
-    )
+    made = launched(tmp_path, shadow())
     assert made.restart == RestartPolicy("never")
-    plain = replace(shadow(), shadow=False)
-    made = launch_order(
-        plain, {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
-    )
+    made = launched(tmp_path, replace(shadow(), shadow=False))
     assert made.restart == RestartPolicy("always")
 
 
@@ -153,7 +142,7 @@ def test_ros_arguments_of_the_user_are_closed_first(arguments, joined):
     assert join_arguments(arguments, ["--ros-args", "x"]) == joined
 
 
-def test_policies_and_directory_are_carried_over(tmp_path):
+def test_the_order_has_the_policies_and_directory_of_the_spec(tmp_path):
     """The order has the spec's restart and stop policies and its directory."""
     made = order(
         tmp_path,
@@ -177,16 +166,18 @@ def test_an_executable_is_found_through_the_ament_index(tmp_path, prefix):
     assert made.argv[:2] == (str(prefix / "lib" / "demo_nodes" / "talker"), "--ros-args")
 
 
+def test_a_program_of_a_package_that_is_no_node_gets_no_ros_arguments(tmp_path, prefix):
+    environment = {"AMENT_PREFIX_PATH": str(prefix)}
+    plain = {"package": "demo_nodes", "executable": "talker", "ros": False}
+    made = order(tmp_path, environment, **plain)
+    assert made.argv == (str(prefix / "lib" / "demo_nodes" / "talker"),)
+    assert "ROSRM_NODE" not in process_environment(assignment(**plain), {}, HERE)
+
+
 def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
     """The ROS wheels set no AMENT_PREFIX_PATH: their packages are in the virtual environment."""
-    made = launch_order(
-        assignment(package="demo_nodes", executable="talker"),
-        {},
-        str(prefix / "bin" / "python3"),
-        where=HERE,
-        state_directory=tmp_path,
-        launchers=Launchers(),
-    )
+    given = assignment(package="demo_nodes", executable="talker")
+    made = launched(tmp_path, given, python=str(prefix / "bin" / "python3"))
     assert made.argv[0] == str(prefix / "lib" / "demo_nodes" / "talker")
 
 
@@ -239,10 +230,7 @@ def test_no_parameters_no_file(tmp_path):
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 SCALARS = st.one_of(
-    st.booleans(),
-    st.integers(-(2**63), 2**63 - 1),
-    st.floats(allow_nan=False),
-    TEXTS,
+    st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), TEXTS
 )
 ARRAYS = st.one_of(
     *(st.lists(kind, min_size=1) for kind in (st.booleans(), st.integers(-9, 9), TEXTS))
@@ -307,32 +295,26 @@ def test_what_no_parameter_can_hold_is_refused(value):
 # --- environment ------------------------------------------------------------------------------
 
 
-def test_the_bootstrappers_variables_are_removed():
-    """Both variables go; what was in LD_LIBRARY_PATH before stays."""
-    polluted = {
-        "LD_LIBRARY_PATH": f"{SITE}/ros_rcl.libs:/opt/mine:{VENV}/lib:{SITE}/ros_rclpy.libs",
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
-        "HOME": "/root",
-    }
-    assert without_bootstrapper(polluted) == {"LD_LIBRARY_PATH": "/opt/mine", "HOME": "/root"}
+BOOTSTRAPPED = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
 
 
-def test_nothing_is_left_of_an_empty_library_path():
-    """A variable without other content is removed altogether."""
-    polluted = {
-        "LD_LIBRARY_PATH": f"{sys.prefix}/lib:{SITE}/ros_rcl.libs",
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
-    }
-    assert without_bootstrapper(polluted) == {}
+@pytest.mark.parametrize(
+    ("library_path", "bootstrapped", "left"),
+    [
+        (f"{SITE}/ros_rcl.libs:/opt/mine:{VENV}/lib:{SITE}/ros_rclpy.libs", True, "/opt/mine"),
+        (f"{sys.prefix}/lib:{SITE}/ros_rcl.libs", True, None),
+        ("/opt/ros/jazzy/lib", False, "/opt/ros/jazzy/lib"),
+    ],
+    ids=["wheels", "wheels alone", "apt"],
+)
+def test_the_bootstrappers_variables_are_removed(library_path, bootstrapped, left):
+    """Other entries of LD_LIBRARY_PATH stay, such as those that apt's ROS 2 needs."""
+    before = {"LD_LIBRARY_PATH": library_path, "HOME": "/root"}
+    made = without_bootstrapper({**before, **(BOOTSTRAPPED if bootstrapped else {})})
+    assert made == {"HOME": "/root", **({"LD_LIBRARY_PATH": left} if left else {})}
 
 
-def test_without_the_bootstrapper_nothing_is_touched():
-    """Apt's ROS 2 needs its own LD_LIBRARY_PATH."""
-    environment = {"LD_LIBRARY_PATH": "/opt/ros/jazzy/lib"}
-    assert without_bootstrapper(environment) == environment
-
-
-def test_the_spec_has_the_last_word():
+def test_the_variables_of_the_spec_take_precedence():
     """A process has variables with its identity, and the spec's own variables take precedence."""
     made = process_environment(
         assignment(command=("x",), environment={"ROS_DOMAIN_ID": "9", "PYTHONUNBUFFERED": ""}),
@@ -352,7 +334,7 @@ def test_the_spec_has_the_last_word():
     }
 
 
-def test_a_node_is_told_by_which_name_it_is_known():
+def test_a_node_gets_its_own_name_in_its_environment():
     """The variables have the node's own name instead of the alias, and mark a shadow."""
     made = process_environment(shadow(), {}, HERE)
     assert made["ROSRM_NODE"] == "/robot/talker"
@@ -362,7 +344,7 @@ def test_a_node_is_told_by_which_name_it_is_known():
     assert process_environment(packaged, {}, HERE)["ROSRM_NODE"] == "/talker"
 
 
-def test_who_the_slave_is_itself_is_not_handed_on():
+def test_the_identity_of_the_slave_is_not_inherited():
     """A slave may itself run under rosrm, even as a shadow; its processes do not inherit that."""
     slave = process_environment(shadow(), {}, HERE)
     made = process_environment(assignment(command=("x",)), slave, HERE)

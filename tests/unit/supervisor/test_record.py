@@ -34,7 +34,7 @@ def record(tmp_path, core):
     return record
 
 
-def test_an_instance_comes_back_as_it_was(tmp_path, core, record):
+def test_an_instance_is_restored_in_every_field(tmp_path, core, record):
     """State, launch, environment and start time of its leader are restored in every field."""
     recorded = rc.read(str(tmp_path))
     back, instance = recorded.instances[TALKER], core.instances[TALKER]
@@ -82,7 +82,7 @@ def test_a_launch_without_its_environment_is_compacted(tmp_path, core, record):
 
 
 def test_a_record_of_before_protocol_2_is_read(tmp_path, core):
-    """Its launches had no memo, its instances no fault."""
+    """Launches of that version had no memo, and instances no fault."""
     instance = core.instances[TALKER]
     state = {name: getattr(instance, name) for name in Instance.__slots__ if name != "fault"}
     lines = [
@@ -114,7 +114,7 @@ def test_the_last_line_counts(tmp_path, core, record):
     assert recorded.launches == {}
 
 
-def test_the_forgotten_are_gone_but_stay_dead(tmp_path, record):
+def test_the_number_of_a_forgotten_instance_is_kept(tmp_path, record):
     """Only the number of a forgotten instance is kept, through a compaction, too."""
     record.dead(TALKER, 7)
     record.flush()
@@ -144,7 +144,7 @@ def full(*_):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_full_disk_delays_and_says_so(tmp_path, core, record, monkeypatch):
+def test_a_full_disk_delays_the_record_and_is_reported(tmp_path, core, record, monkeypatch):
     """Unwritten lines wait, and are written once there is room again."""
     core.handle(events.Exited(TALKER, 3), 2.0)
     with monkeypatch.context() as patched:

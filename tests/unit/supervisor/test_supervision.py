@@ -57,25 +57,23 @@ def kinds(commands):
     return [type(command).__name__ for command in commands]
 
 
-def started(**policies):
-    """Return a state machine with one running instance, started at time 0."""
+def ordered(restart=RestartRule(), stop=StopRule()):  # noqa: B008 - named tuples
+    """Return a state machine with one start order at time 0, and its instance."""
     core = reducer.SupervisorState()
-    core.handle(
-        StartOrdered(
-            TALKER, policies.get("restart", RestartRule()), policies.get("stop", StopRule())
-        ),
-        0.0,
-    )
-    core.handle(Spawned(TALKER, 100), 0.0)
+    core.handle(StartOrdered(TALKER, restart, stop), 0.0)
     return core, core.instances[TALKER]
+
+
+def started(**policies):
+    """Return a state machine with one running instance, and the instance."""
+    core, instance = ordered(**policies)
+    core.handle(Spawned(TALKER, 100), 0.0)
+    return core, instance
 
 
 def test_policies_are_those_of_the_model():
     """The supervisor's light policies have the fields and defaults of the model's."""
-    for light, heavy in (
-        (RestartRule, values.RestartPolicy),
-        (StopRule, values.StopPolicy),
-    ):
+    for light, heavy in ((RestartRule, values.RestartPolicy), (StopRule, values.StopPolicy)):
         assert light._fields == tuple(field.name for field in dataclasses.fields(heavy))
         assert tuple(light()) == dataclasses.astuple(heavy())
     assert FenceRule._fields == tuple(field.name for field in dataclasses.fields(values.Fence))
@@ -93,7 +91,7 @@ def test_status_is_that_of_the_model():
     assert {state.value for state in values.InstanceState if state.ended} == ENDED
 
 
-def test_rules_stand_in_the_table_of_the_module():
+def test_the_table_of_the_docstring_is_the_table_that_runs():
     """Each row of the docstring is a transition that runs, and the reverse; no event is left out.
 
     The phase "-" has the orders that may concern an unknown instance.
@@ -117,19 +115,30 @@ def test_start_is_recorded_before_it_is_tried():
     assert kinds(commands) == ["ReportStatus", "Spawn"]
 
 
-def test_repeated_start_only_tells_again():
-    """DDS repeats messages: a start of a known instance spawns nothing."""
-    core, _ = started()
-    commands = core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 1.0)
-    assert kinds(commands) == ["ReportStatus"]
-
-
-def test_late_start_of_a_stopped_stranger_is_refused():
-    """A stop that overtakes its start wins."""
+@pytest.mark.parametrize("order", [StopOrdered, FenceOrdered])
+def test_a_late_start_of_a_stopped_unknown_instance_is_refused(order):
+    """An order to stop or fence that overtakes its start wins."""
     core = reducer.SupervisorState()
-    core.handle(StopOrdered(TALKER), 0.0)
+    core.handle(order(TALKER), 0.0)
     core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 1.0)
     assert core.instances[TALKER].phase == REFUSED
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        StartOrdered(TALKER, RestartRule(), StopRule()),
+        AmendOrdered(TALKER, RestartRule()),
+        StatusStored(TALKER),
+        FailOrdered(TALKER, 99, "unhealthy"),
+    ],
+    ids=lambda order: type(order).__name__,
+)
+def test_an_order_without_effect_reports_the_status_again(order):
+    """DDS and masters repeat orders; a status that is not final, or another run, is no target."""
+    core, instance = started()
+    assert kinds(core.handle(order, 1.0)) == ["ReportStatus"]
+    assert (instance.phase, instance.restart) == (RUNNING, RestartRule())
 
 
 @pytest.mark.parametrize(("number", "starts"), [(6, False), (7, False), (8, True)])
@@ -141,13 +150,6 @@ def test_forgotten_numbers_never_start(number, starts):
     order = StartOrdered(("talker", number), RestartRule(), StopRule())
     commands = core.handle(order, 3.0)
     assert ("Spawn" in kinds(commands)) is starts
-
-
-def test_what_runs_is_not_forgotten():
-    """Only a final status can be forgotten."""
-    core, instance = started()
-    assert kinds(core.handle(StatusStored(TALKER), 1.0)) == ["ReportStatus"]
-    assert instance.phase == RUNNING
 
 
 @pytest.mark.parametrize(
@@ -215,7 +217,7 @@ def crashed(count, rule):
     return core
 
 
-def test_what_crashed_together_does_not_start_together():
+def test_processes_that_crashed_together_restart_apart():
     """The waits differ, by a fifth at most."""
     core = crashed(20, RestartRule("on-failure", delay=10.0))
     waits = {one.deadline - 10.0 for one in core.instances.values()}
@@ -236,24 +238,38 @@ def test_at_most_eight_restarts_begin_within_a_second():
     assert all(later - earlier >= 1.0 for earlier, later in zip(begun, begun[8:], strict=False))
 
 
-def test_stop_escalates_and_says_each_step():
+@pytest.mark.parametrize(
+    ("order", "phase", "message"),
+    [
+        (StopOrdered(TALKER), EXITED, "stopped by {}"),
+        (FailOrdered(TALKER, 100, "unhealthy"), FAILED, "unhealthy"),
+    ],
+)
+def test_a_stop_escalates_and_reports_each_step(order, phase, message):
     """SIGTERM and SIGKILL follow SIGINT after their graces; the last message has all three."""
     core, instance = started(stop=StopRule(2.0, 3.0))
-    sent = []
-    commands = core.handle(StopOrdered(TALKER), 10.0)
-    while len(sent) < 3:
+    commands, sent = core.handle(order, 10.0), []
+    for _ in range(3):
         sent += [(command.number, core.deadline()) for command in commands[1:]]
         commands = core.handle(TimePassed(), core.deadline())
     assert sent == [(signal.SIGINT, 12.0), (signal.SIGTERM, 15.0), (signal.SIGKILL, 16.0)]
     core.handle(Exited(TALKER, signal=signal.SIGKILL), 16.1)
-    assert instance.phase == EXITED
-    assert instance.message == "stopped by SIGINT, SIGTERM after 2.0 s, SIGKILL after 5.0 s"
+    steps = "SIGINT, SIGTERM after 2.0 s, SIGKILL after 5.0 s"
+    assert (instance.phase, instance.message) == (phase, message.format(steps))
 
 
-def test_stopped_process_is_not_restarted():
-    """The user's stop overrides `always`."""
+@pytest.mark.parametrize(
+    "before", [None, RestartOrdered(TALKER), FailOrdered(TALKER, 100, "unhealthy: silent")]
+)
+@pytest.mark.parametrize("shutdown", [False, True])
+def test_a_users_stop_wins(before, shutdown):
+    """Policy, restart order and health failure start nothing; a shutdown withdraws nothing."""
     core, instance = started(restart=RestartRule("always"))
-    core.handle(StopOrdered(TALKER), 1.0)
+    if before is not None:
+        core.handle(before, 1.0)
+    core.handle(StopOrdered(TALKER), 1.5)
+    if shutdown:
+        core.handle(ShutdownOrdered(), 1.6)
     core.handle(Exited(TALKER, signal=signal.SIGINT), 2.0)
     assert instance.phase == EXITED
 
@@ -264,15 +280,6 @@ def test_forced_restart_stops_then_starts():
     assert kinds(core.handle(RestartOrdered(TALKER), 1.0)) == ["ReportStatus", "Signal"]
     assert kinds(core.handle(Exited(TALKER, signal=2), 2.0)) == ["ReportStatus", "Spawn"]
     assert instance.restarts == 0
-
-
-def test_stop_during_a_forced_restart_wins():
-    """The instance ends instead of starting again."""
-    core, instance = started()
-    core.handle(RestartOrdered(TALKER), 1.0)
-    core.handle(StopOrdered(TALKER), 1.5)
-    core.handle(Exited(TALKER, signal=2), 2.0)
-    assert instance.phase == EXITED
 
 
 def test_a_restart_while_its_own_end_is_in_hand_is_carried_out():
@@ -303,17 +310,7 @@ def test_an_unhealthy_run_has_failed_however_it_ends(when, phase):
     assert instance.message.startswith("unhealthy: silent")
 
 
-def test_an_unhealthy_run_that_does_not_end_is_killed():
-    """The steps of the stop rule apply, as for every other stop."""
-    core, _ = started()
-    core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
-    sent = []
-    for _ in range(2):
-        sent += core.handle(TimePassed(), core.deadline())[1:]
-    assert [command.number for command in sent] == [signal.SIGTERM, signal.SIGKILL]
-
-
-def test_what_is_stopped_is_killed_at_once():
+def test_a_process_stopped_by_a_signal_is_killed_at_once():
     """A stopped process does not handle SIGINT; after SIGKILL no milder signal follows."""
     core, instance = started()
     commands = core.handle(FailOrdered(TALKER, 100, "unhealthy: stopped", kill=True), 1.0)
@@ -324,25 +321,14 @@ def test_what_is_stopped_is_killed_at_once():
 
 
 def test_a_run_is_not_failed_for_the_one_before():
-    """The order names a pid of a former run, so it does not affect the present one."""
+    """A restart clears the failure: the next run ends by its own exit code."""
     core, instance = started(restart=ON_FAILURE)
-    assert kinds(core.handle(FailOrdered(TALKER, 99, "late"), 1.0)) == ["ReportStatus"]
-    assert instance.phase == RUNNING
     core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
     core.handle(Exited(TALKER, 0), 1.1)
     core.handle(TimePassed(), core.deadline())
     core.handle(Spawned(TALKER, 101), 3.0)
     core.handle(Exited(TALKER, 0), 4.0)
     assert (instance.phase, instance.message) == (EXITED, "")
-
-
-def test_a_stop_of_what_is_failing_wins():
-    """The user's stop overrides the restart policy."""
-    core, instance = started(restart=RestartRule("always"))
-    core.handle(FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
-    core.handle(StopOrdered(TALKER), 1.5)
-    core.handle(Exited(TALKER, 0), 2.0)
-    assert instance.phase == EXITED
 
 
 def test_another_policy_counts_at_the_next_end():
@@ -355,14 +341,6 @@ def test_another_policy_counts_at_the_next_end():
     core.handle(AmendOrdered(TALKER, ON_FAILURE), 1.0)
     core.handle(Exited(TALKER, signal=9), 2.0)
     assert instance.phase == BACKOFF
-
-
-def test_a_repeated_policy_only_tells_again():
-    """DDS repeats messages, and so does a restarted master."""
-    core, instance = started()
-    core.handle(AmendOrdered(TALKER, ON_FAILURE), 1.0)
-    assert kinds(core.handle(AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["ReportStatus"]
-    assert (instance.phase, instance.restart) == (RUNNING, ON_FAILURE)
 
 
 @pytest.mark.parametrize(
@@ -389,7 +367,7 @@ def test_a_policy_that_allows_no_restart_ends_the_wait_for_one(restart, phase):
         assert instance.message == "exit code 1; by its new policy it is not restarted"
 
 
-def test_a_policy_for_what_is_being_stopped_counts_afterwards():
+def test_a_policy_for_an_instance_being_stopped_counts_afterwards():
     """The leader ended and left other processes: the policy decides once they have ended."""
     core, instance = started(restart=ON_FAILURE)
     core.handle(Exited(TALKER, 3, leftovers=True), 1.0)
@@ -398,7 +376,7 @@ def test_a_policy_for_what_is_being_stopped_counts_afterwards():
     assert instance.phase == FAILED
 
 
-def test_a_policy_for_what_has_ended_tells_its_end():
+def test_a_policy_for_an_ended_instance_reports_its_end():
     """The order starts nothing; for an unknown instance it has no effect either."""
     core, instance = started()
     core.handle(Exited(TALKER, 1), 1.0)
@@ -428,29 +406,20 @@ def test_leftovers_of_a_killed_leader_are_killed_at_once():
     assert commands[-1] == Signal(TALKER, signal.SIGKILL)
 
 
-def test_final_spawn_failure_is_not_repeated():
-    """Waiting does not provide a missing executable, but another host may have it."""
-    core = reducer.SupervisorState()
-    core.handle(StartOrdered(TALKER, RestartRule("always"), StopRule()), 0.0)
-    core.handle(SpawnFailed(TALKER, "no executable"), 0.0)
-    assert core.instances[TALKER].phase == REFUSED
-
-
-def test_transient_spawn_failure_follows_the_policy():
-    """A lack of memory may pass."""
-    core = reducer.SupervisorState()
-    core.handle(StartOrdered(TALKER, RestartRule("on-failure"), StopRule()), 0.0)
-    core.handle(SpawnFailed(TALKER, "no memory", transient=True), 0.0)
-    assert core.instances[TALKER].phase == BACKOFF
+@pytest.mark.parametrize(("transient", "phase"), [(False, REFUSED), (True, BACKOFF)])
+def test_only_a_transient_spawn_failure_follows_the_policy(transient, phase):
+    """A lack of memory may pass; a missing executable does not, but another host may have it."""
+    core, instance = ordered(RestartRule("always"))
+    core.handle(SpawnFailed(TALKER, "no memory", transient=transient), 0.0)
+    assert instance.phase == phase
 
 
 def test_stop_before_the_spawn_gives_it_up():
     """A pending start is cancelled."""
-    core = reducer.SupervisorState()
-    core.handle(StartOrdered(TALKER, RestartRule(), StopRule()), 0.0)
+    core, instance = ordered()
     assert kinds(core.handle(StopOrdered(TALKER), 0.0)) == ["ReportStatus", "Unspawn"]
     core.handle(SpawnFailed(TALKER, ""), 0.0)
-    assert core.instances[TALKER].phase == EXITED
+    assert instance.phase == EXITED
 
 
 def test_shutdown_leaves_when_all_have_ended():
@@ -464,7 +433,7 @@ def test_shutdown_leaves_when_all_have_ended():
 
 @pytest.mark.parametrize("before", [None, Exited(TALKER, 1), RestartOrdered(TALKER)])
 def test_what_a_shutdown_ends_is_withdrawn(before):
-    """Neither the process nor an order ended it, whatever its exit code is."""
+    """The shutdown ended the instance, not the process or an order, whatever the exit code is."""
     core, instance = started(restart=RestartRule("on-failure"))
     if before is not None:
         core.handle(before, 0.5)
@@ -472,15 +441,6 @@ def test_what_a_shutdown_ends_is_withdrawn(before):
     core.handle(ShutdownOrdered(), 1.5)  # the slave repeats it to the next supervisor
     core.handle(Exited(TALKER, 0), 2.0)
     assert instance.phase == WITHDRAWN
-
-
-def test_what_was_ordered_to_stop_before_a_shutdown_is_not_withdrawn():
-    """The order that came first counts: its master does not want the instance again."""
-    core, instance = started()
-    core.handle(StopOrdered(TALKER), 1.0)
-    core.handle(ShutdownOrdered(), 1.5)
-    core.handle(Exited(TALKER, signal=2), 2.0)
-    assert instance.phase == EXITED
 
 
 def test_a_lost_client_changes_nothing():
@@ -537,7 +497,7 @@ class Host(RuleBasedStateMachine):
         self.policy_restarts: dict[Key, list[float]] = {}
         self.stopped: set[Key] = set()
         self.fences: dict[Key, FenceRule] = {}
-        self.heard: dict[Key, float] = {}
+        self.contact: dict[Key, float] = {}
         self.dead_by: dict[Key, float] = {}
         self.left = False
 
@@ -572,12 +532,12 @@ class Host(RuleBasedStateMachine):
             if command.number == signal.SIGKILL:
                 self.killed.add(key)
         elif isinstance(command, ReportStatus):
-            self.hear(key)
+            self.check_status(key)
         else:
             assert key in self.final, "forgotten before its end"
             del self.final[key]
 
-    def hear(self, key):
+    def check_status(self, key):
         status = messages.Status.of(self.core.instances[key])
         if key in self.final:
             assert status == self.final[key], "a second final status"
@@ -590,7 +550,7 @@ class Host(RuleBasedStateMachine):
         self.newest += 1
         key = ("a", self.newest)
         if fence is not None:
-            self.fences[key], self.heard[key] = fence, self.now - (0.0 if fence.alive else ago)
+            self.fences[key], self.contact[key] = fence, self.now - (0.0 if fence.alive else ago)
         self.happens(StartOrdered(key, restart, stop, fence, self.now - ago))
         self.happens(TimePassed())
         self.look_at_fences()
@@ -610,7 +570,7 @@ class Host(RuleBasedStateMachine):
     def renew(self, at, *, alive):
         for key in self.fences.keys() - self.dead_by.keys():
             if self.fences[key].alive or not alive:
-                self.heard[key] = max(self.heard[key], at)
+                self.contact[key] = max(self.contact[key], at)
 
     @precondition(lambda self: self.core.instances)
     @rule(data=st.data())
@@ -621,8 +581,8 @@ class Host(RuleBasedStateMachine):
 
     def look_at_fences(self):
         for key, (after, grace, _) in self.fences.items():
-            if self.now >= self.heard[key] + after:
-                self.dead_by.setdefault(key, self.heard[key] + after + grace)
+            if self.now >= self.contact[key] + after:
+                self.dead_by.setdefault(key, self.contact[key] + after + grace)
 
     @precondition(lambda self: self.core.instances)
     @rule(
@@ -698,7 +658,7 @@ class Host(RuleBasedStateMachine):
         self.happens(TimePassed())
 
     @invariant()
-    def books_agree_with_the_host(self):
+    def the_state_agrees_with_the_host(self):
         for key, instance in self.core.instances.items():
             alive = key in self.leaders or key in self.strays
             assert alive == (instance.phase in (RUNNING, STOPPING)), key
@@ -725,7 +685,7 @@ class Host(RuleBasedStateMachine):
                 assert self.core.instances[key].phase == STOPPING, key
                 assert key in self.killed or (self.now < by and self.core.deadline() <= by), key
             elif key in self.fences:
-                assert self.core.deadline() <= self.heard[key] + self.fences[key].after, key
+                assert self.core.deadline() <= self.contact[key] + self.fences[key].after, key
         for key in self.dead_by.keys() & self.core.instances.keys():
             assert self.core.instances[key].phase not in (RUNNING, BACKOFF), key
 

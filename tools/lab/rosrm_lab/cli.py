@@ -90,35 +90,35 @@ def up(  # noqa: PLR0917 - typer calls it, by name
     limits = {"memory": memory, "cpu": cpu, "disk": disk}
     hosts = planned(number, limits, host or [])
     made = Lab(name, hosts, subnet=parse_subnet(subnet) if subnet else None)
-    with _interrupts_noted() as stop_if_asked:
-        made.up(between=stop_if_asked)
+    with _interrupts_deferred() as stop_if_interrupted:
+        made.up(between=stop_if_interrupted)
         warning = overbooked(hosts)
         if warning:
             typer.echo(f"rosrm: note: {warning}", err=True)
-        told = ", ".join(f"{one.name} {made.address(one.name)}" for one in hosts)
-        typer.echo(f"lab {name!r} is up: {told}")
+        addresses = ", ".join(f"{one.name} {made.address(one.name)}" for one in hosts)
+        typer.echo(f"lab {name!r} is up: {addresses}")
 
 
 @contextlib.contextmanager
-def _interrupts_noted() -> Iterator[Callable[[], None]]:
+def _interrupts_deferred() -> Iterator[Callable[[], None]]:
     """Defer Ctrl-C: it takes effect where the caller asks for it, and not at all after the block.
 
     Otherwise it could come at a fork or in a finaliser. Python ignores it there, and prints a
     traceback.
     """
-    asked: list[int] = []
+    interrupts: list[int] = []
 
-    def stop_if_asked() -> None:
-        if asked:
+    def stop_if_interrupted() -> None:
+        if interrupts:
             raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
+    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
     try:
-        yield stop_if_asked
+        yield stop_if_interrupted
     except BaseException as error:
         signal.signal(signal.SIGINT, before)
         if isinstance(error, LabError):
-            stop_if_asked()  # the signal has ended a child of this process
+            stop_if_interrupted()  # the signal has ended a child of this process
         raise
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -282,11 +282,11 @@ def planned(number: int, limits: dict[str, str], more: Sequence[str]) -> list[Ho
 
     if not 0 <= number <= MOST_HOSTS or (number == 0 and not more):
         raise ConfigError(f"-n {number}; allowed are 1 to {MOST_HOSTS} hosts, 0 with --host")
-    wanted = {f"host{i}": limits for i in range(1, number + 1)}
+    by_name = {f"host{i}": limits for i in range(1, number + 1)}
     for text in more:
         name, own = _named_limits(text)
-        wanted[name] = {**wanted.get(name, limits), **own}
-    return [_host(name, one) for name, one in wanted.items()]
+        by_name[name] = {**by_name.get(name, limits), **own}
+    return [_host(name, one) for name, one in by_name.items()]
 
 
 def fraction(text: str) -> float:
@@ -402,8 +402,8 @@ def _table(rows: Iterable[HostStatus]) -> Any:
 
 
 def _used(used: int | None, limit: int | None) -> str:
-    from rosrm.cli.output import formats
+    from rosrm.wording import size
 
     binary = limit is not None and limit % _MIB == 0
-    said = "?" if used is None else formats.size(used, binary=binary)
-    return said if limit is None else f"{said}/{formats.size(limit, binary=binary)}"
+    said = "?" if used is None else size(used, binary=binary)
+    return said if limit is None else f"{said}/{size(limit, binary=binary)}"

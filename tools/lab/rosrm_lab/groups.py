@@ -74,7 +74,6 @@ def find_hierarchies(root: Path = Path("/")) -> list[Hierarchy]:
 
     Raises:
         LabError: a controller is missing; the message names it.
-        LabError: one is not there; the message says which.
     """
     found: dict[Path, Hierarchy] = {}
     missing = set(_NEEDED)
@@ -274,7 +273,7 @@ def _make_group(hierarchy: Hierarchy, group: Path) -> None:
         try:
             for part in parts:
                 if hierarchy.version == 2:
-                    _hand_on(above, hierarchy.controllers)
+                    _delegate(above, hierarchy.controllers)
                 above = above / part
                 above.mkdir(exist_ok=True)
         except OSError as error:
@@ -285,7 +284,7 @@ def _make_group(hierarchy: Hierarchy, group: Path) -> None:
             return
 
 
-def _hand_on(group: Path, controllers: Sequence[str]) -> None:
+def _delegate(group: Path, controllers: Sequence[str]) -> None:
     switch = group / "cgroup.subtree_control"
     missing = set(controllers) - set(switch.read_text().split())
     if missing:

@@ -102,13 +102,13 @@ def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file:
             start_new_session=True,
         )
         os.close(writer)
-        told = _until_ready(ready.fileno(), time.monotonic() + _BOOT)
-        said = _last_words(launcher)
-    pid = next((int(line[4:]) for line in told if line.startswith("pid ")), 0)
-    birth = Birth.of(pid) if pid and told[-1] == "ready" else None
+        lines = _until_ready(ready.fileno(), time.monotonic() + _BOOT)
+        output = _last_words(launcher)
+    pid = next((int(line[4:]) for line in lines if line.startswith("pid ")), 0)
+    birth = Birth.of(pid) if pid and lines[-1] == "ready" else None
     if birth is None:
-        reasons = [line[7:] for line in told if line.startswith("failed ")]
-        reason = "; ".join([*reasons, said]).strip("; ") or f"not ready in {_BOOT:g} s"
+        reasons = [line[7:] for line in lines if line.startswith("failed ")]
+        reason = "; ".join([*reasons, output]).strip("; ") or f"not ready in {_BOOT:g} s"
         raise LabError(f"host {host.name} of lab {lab!r} could not be booted: {reason}")
     return birth
 
@@ -251,7 +251,7 @@ def _last_words(launcher: subprocess.Popen[bytes]) -> str:
     except subprocess.TimeoutExpired:
         launcher.kill()
         launcher.wait()
-        return "it holds on to its output"
+        return "its output stays open"
     return output.decode(errors="replace").strip()
 
 

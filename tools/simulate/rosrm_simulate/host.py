@@ -88,6 +88,7 @@ class Host(ABC, Generic[ProgramT]):
         said: status batches on their way to the master.
         stale: resources whose readings are too old.
         limit: (RESOURCE_SLOTS,) as in its readings.
+        newest_pid: of its programs; each start of a program has another one.
     """
 
     name: str = field(kw_only=False)
@@ -110,6 +111,7 @@ class Host(ABC, Generic[ProgramT]):
     stale: set[str] = field(default_factory=set)
     sequence: int = 0
     batches: int = 0
+    newest_pid: int = 100
     limit: FloatArray = field(init=False)
     _settled: list[commands.Settle] = field(default_factory=list)
 
@@ -265,6 +267,11 @@ class Host(ABC, Generic[ProgramT]):
 
     # --- programs --------------------------------------------------------------------------
 
+    def next_pid(self) -> int:
+        """Return the pid of a program that starts."""
+        self.newest_pid += 1
+        return self.newest_pid
+
     def _supervisor_says(self, status: InstanceStatus, now: float) -> None:
         self.tell(events.SupervisorReported((status,)), now)
 
@@ -289,6 +296,8 @@ class Host(ABC, Generic[ProgramT]):
         if program.state is InstanceState.STOPPING:
             return  # an order to stop prevails
         program.state = InstanceState.STARTING
+        # With the former pid, the slave would report a node as ready before it is in the graph.
+        program.pid = self.next_pid()
         program.run += 1
         self.run_begins_again(program, now)
         status = InstanceStatus(instance, InstanceState.STOPPING, restarts=program.run)

@@ -55,7 +55,7 @@ class Machine(Host[Work]):
         up: it runs; a host that is down neither receives nor sends anything.
         stopping: its slave is shutting down, and the host goes with its last process.
         asked: it has asked for work.
-        told_usage: usages that the master knows.
+        published_usage: usages that the master knows.
     """
 
     def __init__(
@@ -122,11 +122,8 @@ class Machine(Host[Work]):
 
     def make_program(self, assignment: Assignment, restart: RestartPolicy) -> Work:
         """Return the program of a new instance."""
-        instance = assignment.instance
-        return Work(
-            plan=self._processes[instance.process], assignment=assignment, restart=restart,
-            pid=instance.number,
-        )  # fmt: skip
+        plan = self._processes[assignment.instance.process]
+        return Work(plan=plan, assignment=assignment, restart=restart, pid=self.next_pid())
 
     def run_begins(self, program: Work, now: float) -> None:
         """Begin with the work of an instance; a ROS node is seen in the graph later."""

@@ -15,10 +15,9 @@ from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import expanded
 from rosrm.config.kinds import SIMULATION_KEYS, check_kind
 from rosrm.config.merging import merged, written_out
-from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import Labels, LabelsInFile, MigrationInFile
-from rosrm.config.rules import check_amounts, check_name
+from rosrm.config.rules import check_amounts, check_name, refuse_namesakes
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Amount, Count, Fraction, PositiveSeconds, Quantity, Seconds
@@ -95,7 +94,7 @@ class HostInFile:
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessInFile:
+class ProcessPlanInFile:
     """One process: its submission, and its real behaviour."""
 
     name: str
@@ -252,7 +251,7 @@ def _process(
     node = merged(Node({}, node.place), written_out(node))
     check_name(node.get("name"), "process", problems)
     check_amounts(node.get("needs"), "needs", problems)
-    given = validated(ProcessInFile, node, problems)
+    given = validated(ProcessPlanInFile, node, problems)
     if given is None:
         return None
     strategy = given.migration.strategy
@@ -275,7 +274,7 @@ def _process(
     )  # fmt: skip
 
 
-def _spec(given: ProcessInFile, needs: Mapping[str, float]) -> ProcessSpec:
+def _spec(given: ProcessPlanInFile, needs: Mapping[str, float]) -> ProcessSpec:
     migration = given.migration
     return ProcessSpec(
         given.name, given.namespace, command=(given.program,), ros=given.ros,
@@ -287,7 +286,7 @@ def _spec(given: ProcessInFile, needs: Mapping[str, float]) -> ProcessSpec:
 
 
 def _check_fits(
-    node: Node, given: ProcessInFile, hosts: Sequence[SimulatedHost], problems: Problems
+    node: Node, given: ProcessPlanInFile, hosts: Sequence[SimulatedHost], problems: Problems
 ) -> None:
     """Add a problem for a process that is larger than every host, and so could only wait."""
     amounts = {"memory": given.memory[1], "disk": given.disk[1]}

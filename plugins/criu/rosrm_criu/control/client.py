@@ -13,7 +13,7 @@ from typing import Final
 
 from rosrm.errors import PortableError
 from rosrm.supervisor.procfs import read_environment
-from rosrm_criu.control.directory import make, remove
+from rosrm_criu.control.directory import make
 from rosrm_criu.control.messages import (
     SIGNAL,
     VARIABLE,
@@ -21,10 +21,9 @@ from rosrm_criu.control.messages import (
     State,
     Status,
     Want,
-    read_status,
-    remove_request,
-    remove_status,
-    write_request,
+    read_message,
+    remove_messages,
+    write_message,
 )
 
 #: Seconds between two reads of a status file; the standard library cannot wait for a file change.
@@ -86,18 +85,7 @@ def make_directory(directory: Path, uid: int | None = None) -> None:
         raise PortableError(
             f"the control directory {directory} cannot be made: {error.strerror}"
         ) from None
-    remove_status(directory)
-    remove_request(directory)  # requests follow only after the node has written a status
-
-
-def remove_directory(directory: Path) -> None:
-    """Remove a control directory, which no node listens to any more."""
-    remove(directory)
-
-
-def status_of(directory: Path) -> Status | None:
-    """Return the node's status; None: no portable node runs there (yet). Raise `PortableError`."""
-    return read_status(directory)
+    remove_messages(directory)  # requests follow only after the node has written a status
 
 
 def ask_prepare(directory: Path, pid: int | None, request_id: str) -> None:
@@ -111,7 +99,12 @@ def ask_prepare(directory: Path, pid: int | None, request_id: str) -> None:
     Raises:
         PortableError: the request cannot be delivered; the message says what to do.
     """
-    status = _status_to_ask(directory)
+    status = read_message(directory, Status)
+    if status is None:
+        raise PortableError(
+            f"no portable node has joined in {directory}: its program does not use "
+            f"rosrm_criu.node.run_portable, or has not come so far yet"
+        )
     if status.state is State.FAILED:
         raise PortableError(f"the node has failed: {status.fault}")
     _ask(directory, pid, Request(request_id, Want.LEAVE))
@@ -175,21 +168,11 @@ def await_joined(
     return status
 
 
-def _status_to_ask(directory: Path) -> Status:
-    status = read_status(directory)
-    if status is None:
-        raise PortableError(
-            f"no portable node has joined in {directory}: its program does not use "
-            f"rosrm_criu.node.run_portable, or has not come so far yet"
-        )
-    return status
-
-
 def _ask(directory: Path, pid: int | None, request: Request) -> None:
     if pid is not None:
         _check_catches(pid)
     try:
-        write_request(directory, request)
+        write_message(directory, request)
     except OSError as error:
         raise PortableError(f"{directory} cannot be written: {error.strerror}") from None
     if pid is not None:
@@ -235,35 +218,35 @@ def _of_process(pid: int) -> dict[str, str]:
 
 
 def _await(
-    directory: Path, request_id: str, wanted: State, timeout: float, pid: int | None
+    directory: Path, request_id: str, target: State, timeout: float, pid: int | None
 ) -> Status:
     """Return the first status that answers a request or is final."""
     deadline = time.monotonic() + timeout
     while True:
-        status = read_status(directory)
-        if status is not None and _is_answer(status, request_id, wanted):
+        status = read_message(directory, Status)
+        if status is not None and _is_answer(status, request_id, target):
             return status
         if pid is not None:
             _of_process(pid)
         if time.monotonic() >= deadline:
-            raise PortableError(_why_not(directory, request_id, wanted, timeout, pid, status))
+            raise PortableError(_why_not(directory, request_id, target, timeout, pid, status))
         time.sleep(_LOOK)
 
 
-def _is_answer(status: Status, request_id: str, wanted: State) -> bool:
+def _is_answer(status: Status, request_id: str, target: State) -> bool:
     if status.state is State.FAILED:
         return True
     if status.request != request_id:
         return False
     # RUNNING also answers a wait for LEFT: the node refused, or the request was withdrawn.
-    return status.state in (wanted, State.RUNNING)
+    return status.state in (target, State.RUNNING)
 
 
 def _why_not(
-    directory: Path, request_id: str, wanted: State, timeout: float, pid: int | None,
+    directory: Path, request_id: str, target: State, timeout: float, pid: int | None,
     status: Status | None,
 ) -> str:  # fmt: skip
-    what = "left the ROS graph" if wanted is State.LEFT else "joined the ROS graph again"
+    what = "left the ROS graph" if target is State.LEFT else "joined the ROS graph again"
     return (
         f"the node has not {what} within {timeout:g} s (request {request_id}, {directory}): "
         f"{_standing(request_id, status)}{_doing(pid)}"

@@ -55,7 +55,7 @@ def make(directory: Path, owner: int) -> None:
             _check(path, here, owner)
 
 
-def remove(directory: Path) -> None:
+def remove_directory(directory: Path) -> None:
     """Remove a directory and the files in it; ignore errors."""
     with contextlib.suppress(OSError):
         with opened(directory) as here:

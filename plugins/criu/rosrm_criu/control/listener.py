@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import PortableError
-from rosrm_criu.control.client import make_directory, remove_directory
+from rosrm_criu.control.client import make_directory
+from rosrm_criu.control.directory import remove_directory
 from rosrm_criu.control.messages import (
     Request,
     State,
     Status,
     Want,
     edition_of_request,
-    read_request,
-    write_status,
+    read_message,
+    write_message,
 )
 
 #: Finished departures to remember; a late request of one of them has no effect.
@@ -46,14 +47,14 @@ class Listener:
         self._seen: Request | None = None
         self._edition: tuple[int, ...] = ()
         self._fault = ""
-        self._said = 0.0
+        self._reported = 0.0
         self.status = Status(State.JOINING)
         make_directory(directory)
 
-    def asked(self) -> Request | None:
+    def next_request(self) -> Request | None:
         """Return the request that the node has to act on now; None: there is no new one."""
-        if time.monotonic() > self._said + _FRESH:
-            self.say(self.status)
+        if time.monotonic() > self._reported + _FRESH:
+            self.report(self.status)
         request = self._read()
         if request is None or request == self._seen:
             return None
@@ -66,28 +67,28 @@ class Listener:
         # The node is already in the requested state: withdrawn before it left, or requested twice.
         if request.want is Want.JOIN:
             self._ended.append(request.id)
-        self.say(Status(self.status.state, request.id))
+        self.report(Status(self.status.state, request.id))
         return None
 
-    def say(self, status: Status) -> None:
+    def report(self, status: Status) -> None:
         """Write the status. If that fails, log it; clients that wait have a timeout."""
         if self.status.request not in ("", status.request):
             self._ended.append(self.status.request)
         self.status = status
-        self._said = time.monotonic()
+        self._reported = time.monotonic()
         try:
-            write_status(self._directory, status)
+            write_message(self._directory, status)
         except OSError as error:
-            self._complain(f"{self._directory} cannot be written: {error.strerror}")
+            self._log(f"{self._directory} cannot be written: {error.strerror}")
 
     def enter(self, state: State, request: str = "") -> None:
         """Write the next state of a departure; its measured times are kept."""
-        self.say(replace(self.status, state=state, request=request or self.status.request))
+        self.report(replace(self.status, state=state, request=request or self.status.request))
 
-    def done(self, status: Status) -> None:
+    def finish(self, status: Status) -> None:
         """Write the final status of a departure, successful or not."""
         self._ended.append(status.request)
-        self.say(status)
+        self.report(status)
 
     def close(self) -> None:
         """Remove the control directory at the regular end of the process."""
@@ -103,14 +104,14 @@ class Listener:
         if edition == self._edition:
             return None
         try:
-            found = read_request(self._directory)
+            found = read_message(self._directory, Request)
         except PortableError as error:
-            self._complain(str(error))
+            self._log(str(error))
             return None
         self._edition = edition
         return found
 
-    def _complain(self, fault: str) -> None:
+    def _log(self, fault: str) -> None:
         """Log a fault once to standard error, because rclpy's logging may be down."""
         if fault != self._fault:
             self._fault = fault

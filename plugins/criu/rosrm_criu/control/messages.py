@@ -33,8 +33,6 @@ VARIABLE: Final = "ROSRM_PORTABLE"
 SIGNAL: Final = int(signal.SIGRTMIN) + 5
 
 FORMAT: Final = 1
-_REQUEST: Final = "request"
-_STATUS: Final = "status"
 _LARGEST: Final = 1 << 16
 _NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _PRESENT: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -92,62 +90,12 @@ class Status:
 
 
 _Content = TypeVar("_Content", Request, Status)
+_FILES: Final[Mapping[type[Request | Status], str]] = {Request: "request", Status: "status"}
 
 
-def write_request(directory: Path, request: Request) -> None:
-    """Write a request; raise `OSError`."""
-    _write(directory, _REQUEST, request)
-
-
-def read_request(directory: Path) -> Request | None:
-    """Return the request; None: there is none.
-
-    Raises:
-        PortableError: the file holds no valid request.
-    """
-    return _read(directory, _REQUEST, Request)
-
-
-def edition_of_request(directory: Path) -> tuple[int, ...]:
-    """Return a value that differs for each written request; (): none. Opens no file."""
-    try:
-        found = os.lstat(directory / _REQUEST)
-    except OSError:
-        return ()
-    return (found.st_ino, found.st_mtime_ns, found.st_size)
-
-
-def write_status(directory: Path, status: Status) -> None:
-    """Write the status of a node; raise `OSError`."""
-    _write(directory, _STATUS, status)
-
-
-def read_status(directory: Path) -> Status | None:
-    """Return the status of the node; None: there is none.
-
-    Raises:
-        PortableError: the file holds no valid status.
-    """
-    return _read(directory, _STATUS, Status)
-
-
-def remove_status(directory: Path) -> None:
-    """Remove the status file."""
-    _remove(directory, _STATUS)
-
-
-def remove_request(directory: Path) -> None:
-    """Remove the request file."""
-    _remove(directory, _REQUEST)
-
-
-def _remove(directory: Path, name: str) -> None:
-    with contextlib.suppress(OSError), opened(directory) as place:
-        os.unlink(name, dir_fd=place)
-
-
-def _write(directory: Path, name: str, content: Request | Status) -> None:
-    """Replace a file atomically: a reader finds the old content or the new one."""
+def write_message(directory: Path, content: Request | Status) -> None:
+    """Replace a file atomically: a reader finds the old content or the new one; raise `OSError`."""
+    name = _FILES[type(content)]
     beside = f".{name}.new"
     with opened(directory) as place:
         with contextlib.suppress(FileNotFoundError):
@@ -157,7 +105,13 @@ def _write(directory: Path, name: str, content: Request | Status) -> None:
         os.replace(beside, name, src_dir_fd=place, dst_dir_fd=place)
 
 
-def _read(directory: Path, name: str, wanted: type[_Content]) -> _Content | None:
+def read_message(directory: Path, kind: type[_Content]) -> _Content | None:
+    """Return the request or the status of the node; None: there is none (yet).
+
+    Raises:
+        PortableError: the file cannot be read, or is not valid.
+    """
+    name = _FILES[kind]
     path = directory / name
     try:
         # The flags keep a FIFO from blocking, and the size limit keeps a large file out of memory.
@@ -175,8 +129,24 @@ def _read(directory: Path, name: str, wanted: type[_Content]) -> _Content | None
         raise PortableError(f"{path} holds no JSON") from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise PortableError(f"{path} is not of format {FORMAT}, which this rosrm speaks")
-    known = {one.name: found[one.name] for one in fields(wanted) if one.name in found}
+    known = {one.name: found[one.name] for one in fields(kind) if one.name in found}
     try:
-        return from_plain(wanted, known)
+        return from_plain(kind, known)
     except ValueError as error:
         raise PortableError(f"{path} is no {name}: {error}") from None
+
+
+def remove_messages(directory: Path) -> None:
+    """Remove both files; ignore errors."""
+    for name in _FILES.values():
+        with contextlib.suppress(OSError), opened(directory) as place:
+            os.unlink(name, dir_fd=place)
+
+
+def edition_of_request(directory: Path) -> tuple[int, ...]:
+    """Return a value that differs for each written request; (): none. Opens no file."""
+    try:
+        found = os.lstat(directory / _FILES[Request])
+    except OSError:
+        return ()
+    return (found.st_ino, found.st_mtime_ns, found.st_size)

@@ -52,7 +52,7 @@ class CriuBinary:
     @property
     def number(self) -> tuple[int, ...]:
         """Return the version as a tuple of numbers, for comparisons."""
-        return tuple(map(int, re.findall(r"\d+", self.version)))
+        return numbers_in(self.version)
 
     def run(
         self,
@@ -154,7 +154,7 @@ def opened(program: Path) -> CriuBinary:
     except OSError as error:
         why = error.strerror
         if isinstance(error, FileNotFoundError) and program.exists():
-            why = "the C library that it names is missing; if it was moved, install it anew"
+            why = "the C library that it names is missing; if CRIU was moved, install it again"
         raise CriuError(f"{program} cannot be started: {why}") from None
     except subprocess.TimeoutExpired:
         raise CriuError(f"{program} --version did not answer within {_ANSWER:g} s") from None
@@ -168,6 +168,11 @@ def opened(program: Path) -> CriuBinary:
     return CriuBinary((str(program),), version[1])
 
 
+def numbers_in(version: str) -> tuple[int, ...]:
+    """Return a version as a tuple of numbers, for comparisons."""
+    return tuple(map(int, re.findall(r"\d+", version)))
+
+
 def may_do_all() -> bool:
     """Return True if this process has CAP_SYS_ADMIN: root does, but not in every container."""
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
@@ -177,9 +182,9 @@ def may_do_all() -> bool:
 
 def default_prefix() -> Path:
     """Return the prefix of `install_criu.sh`: PREFIX_VARIABLE, or the user's data directory."""
-    told = os.environ.get(PREFIX_VARIABLE, "")
-    if told:
-        return Path(told).absolute()
+    named = os.environ.get(PREFIX_VARIABLE, "")
+    if named:
+        return Path(named).absolute()
     data = os.environ.get("XDG_DATA_HOME", "")
     below = Path(data) if data.startswith("/") else Path.home() / ".local/share"
     return below / "rosrm/criu"

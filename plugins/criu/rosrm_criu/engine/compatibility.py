@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.wording import listed
-from rosrm_criu.engine.binary import CriuBinary, may_do_all
+from rosrm_criu.engine.binary import CriuBinary, may_do_all, numbers_in
 
 #: Real path of the running interpreter (`sys.executable` may be a link, or empty).
 INTERPRETER: Final = os.path.realpath("/proc/self/exe")
@@ -32,7 +32,7 @@ _X86: Final = re.compile(
 #: The names of the facts, each with its meaning.
 FACTS: Final = {
     "version": "of CRIU",
-    "kernel": "its release; told, but not compared: CRIU adapts a process to another kernel",
+    "kernel": "its release; shown, but not compared: CRIU adapts a process to another kernel",
     "machine": "the architecture: x86_64",
     "cpu": "features of the processor that programs use, sorted, a space between them",
     "uid": "of the user that CRIU acts as",
@@ -83,7 +83,7 @@ def mismatch(source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         return f"it is not known of both hosts what they have: {', '.join(missing)}"
     if source["machine"] != destination["machine"]:
         return f"its machine is {destination['machine']}, the source's {source['machine']}"
-    if _number(destination["version"]) < _number(source["version"]):
+    if numbers_in(destination["version"]) < numbers_in(source["version"]):
         return (
             f"its CRIU {destination['version']} is older than the source's {source['version']}, "
             "whose images it may not understand"
@@ -105,7 +105,3 @@ def mismatch(source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         if source[name] != destination[name]:
             return f"its {what} {destination[name] or 'none'}, the source's {source[name]}"
     return ""
-
-
-def _number(version: str) -> tuple[int, ...]:
-    return tuple(map(int, re.findall(r"\d+", version)))

@@ -52,7 +52,7 @@ def dump(
 
     Args:
         criu: the CRIU to use.
-        pid: the instance's leader. If it is a shim, the process that it holds is dumped.
+        pid: the instance's leader. If it is a shim, the restored process below it is dumped.
         directory: of the image; an absolute path, empty or missing.
         leave: state of the process afterwards: "stopped" until `resume` or a SIGKILL, "running" or
             "killed".
@@ -71,9 +71,9 @@ def dump(
         raise CriuError(f"{process or 'the process'} (pid {pid}) has ended")
     was_stopped = process_tree.is_stopped(root)
     pids = process_tree.tree(root)
-    tie = external_resources.outward(pids)
-    if tie:
-        raise CriuError(f"{process or f'pid {pid}'} cannot be dumped: {tie}")
+    trouble = external_resources.outward(pids)
+    if trouble:
+        raise CriuError(f"{process or f'pid {pid}'} cannot be dumped: {trouble}")
     image.create(directory)
     try:
         image.check_room(directory, process_tree.memory_of(pids))
@@ -93,7 +93,7 @@ def dump(
         outcome = _go_on(root, was_stopped)
         if not isinstance(error, CriuError | OSError):
             raise
-        raise CriuError(_told(directory, error) + outcome) from None
+        raise CriuError(_explained(directory, error) + outcome) from None
     if leave == "killed":
         kill(pid)
     return manifest
@@ -112,7 +112,7 @@ def kill(pid: int) -> None:
     """Kill a dumped process at once; its parent must reap it before a restore on this host.
 
     Args:
-        pid: the instance's leader; a shim ends when the process that it holds ends.
+        pid: the instance's leader; a shim ends when its restored process ends.
     """
     process_tree.send(reversed(process_tree.tree(process_tree.root_of(pid))), signal.SIGKILL)
 
@@ -170,7 +170,7 @@ def _link(pid: int, name: str) -> str:
     return os.readlink(f"/proc/{pid}/{name}")  # noqa: PTH115 - as /proc says it
 
 
-def _told(directory: Path, error: Exception) -> str:
+def _explained(directory: Path, error: Exception) -> str:
     if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.ESRCH):
         return f"it could not be looked at: {error.strerror}"
     if isinstance(error, OSError):
@@ -184,7 +184,7 @@ def _go_on(root: int, was_stopped: bool) -> str:
     if not was_stopped:
         process_tree.send([pid for pid in pids if process_tree.is_stopped(pid)], signal.SIGCONT)
     if not process_tree.is_alive(root):
-        return f". The process (pid {root}) has ended meanwhile"
+        return f". The process (pid {root}) ended during the dump"
     end = time.monotonic() + _SIGNAL
     while not was_stopped and any(map(process_tree.is_stopped, pids)):
         if time.monotonic() > end:

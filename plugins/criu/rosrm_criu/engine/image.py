@@ -217,14 +217,10 @@ def _check_files(directory: Path, manifest: Manifest) -> None:
         try:
             found = (directory / name).lstat().st_size
         except OSError as error:
-            raise CriuError(
-                f"the image {directory} is damaged: {name}: {error.strerror}{_advice(manifest)}"
-            ) from None
+            raise _damaged(directory, manifest, f"{name}: {error.strerror}") from None
         if found != size:
-            raise CriuError(
-                f"the image {directory} is damaged: {name} has {found} bytes instead of {size}"
-                f"{_advice(manifest)}"
-            )
+            what = f"{name} has {found} bytes instead of {size}"
+            raise _damaged(directory, manifest, what)
 
 
 def check_contents(directory: Path, manifest: Manifest) -> None:
@@ -241,23 +237,21 @@ def check_contents(directory: Path, manifest: Manifest) -> None:
         try:
             found = _checksum_of_file(directory / name)
         except OSError as error:
-            raise CriuError(
-                f"the image {directory} is damaged: {name}: {error.strerror}{_advice(manifest)}"
-            ) from None
+            raise _damaged(directory, manifest, f"{name}: {error.strerror}") from None
         if found != checksum:
-            raise CriuError(
-                f"the image {directory} is damaged: {name} has changed since it was written "
-                f"(CRC-32 {found:08x} instead of {checksum:08x}){_advice(manifest)}"
-            )
+            sums = f"CRC-32 {found:08x} instead of {checksum:08x}"
+            what = f"{name} has changed since it was written ({sums})"
+            raise _damaged(directory, manifest, what)
 
 
-def _advice(manifest: Manifest) -> str:
-    """Return advice for a damaged image; "" for one without checksums: its process still exists."""
-    if not manifest.checksums:
-        return ""
-    return (
+def _damaged(directory: Path, manifest: Manifest, what: str) -> CriuError:
+    """Return the error, with advice unless the process of the image still exists (no checksums)."""
+    advice = (
         f". Its memory is lost: `rosrm restart {manifest.process or 'NAME'}` starts the process "
         f"without it"
+    )
+    return CriuError(
+        f"the image {directory} is damaged: {what}{advice if manifest.checksums else ''}"
     )
 
 

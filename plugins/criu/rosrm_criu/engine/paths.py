@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import rosrm
 
@@ -32,18 +33,12 @@ def checkpoint_ports(state: Path, number: int) -> Path:
     return state / "images" / f"kept-{number}.ports"
 
 
-def checkpoint_numbers(state: Path) -> list[int]:
-    """Return the numbers of the instances that have a checkpoint."""
-    names = [path.name.removeprefix("kept-") for path in (state / "images").glob("kept-*")]
-    return sorted(int(name) for name in names if name.isdigit())
-
-
 def periodic(state: Path, number: int) -> Path:
     """Return the directory of a running instance's images: see `rosrm_criu.engine.slots`."""
     return state / "images" / f"periodic-{number}"
 
 
-def periodic_numbers(state: Path) -> list[int]:
-    """Return the numbers of the instances that have periodic images."""
-    names = [path.name.removeprefix("periodic-") for path in (state / "images").glob("periodic-*")]
-    return sorted(int(name) for name in names if name.isdigit())
+def numbers(state: Path, kind: Literal["out", "in", "kept", "periodic"]) -> list[int]:
+    """Return the numbers of the instances that have an image of a kind."""
+    found = [path.name.removeprefix(f"{kind}-") for path in (state / "images").glob(f"{kind}-*")]
+    return sorted(int(number) for number in found if number.isdigit())

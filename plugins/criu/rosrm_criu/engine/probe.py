@@ -79,7 +79,7 @@ class CriuSupport:
     facts: Mapping[str, str]
 
 
-def ability(prefix: Path | None = None) -> CriuSupport:
+def criu_support(prefix: Path | None = None) -> CriuSupport:
     """Find the CRIU to use on this host and test it."""
     try:
         return probe(find(prefix))
@@ -245,7 +245,7 @@ def _folder() -> Iterator[tuple[Path, int]]:
 
 def main() -> int:
     """Print the result of the test as JSON, for the program that started this one."""
-    print(json.dumps(asdict(ability())), flush=True)  # noqa: T201 - that is what it is for
+    print(json.dumps(asdict(criu_support())), flush=True)  # noqa: T201 - that is what it is for
     return 0
 
 

@@ -27,6 +27,9 @@ from rosrm_criu.engine import paths, slots
 if TYPE_CHECKING:
     from rosrm_criu.engine.slots import Rejoin
 
+#: Signals that Python handles or ignores by default; ignored ones would stay ignored after execve.
+_CHANGED: Final = (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT)
+
 
 def command(
     python: str, directory: Path, then: Sequence[str], *, criu: Path, timeout: float
@@ -46,7 +49,7 @@ def command(
 
 
 def main() -> NoReturn:
-    """Become the shim that restores and holds the process, or the process itself."""
+    """Become the shim that restores the process and stays its parent, or the process itself."""
     end = sys.argv.index("--")
     options, then = _options(sys.argv[1:end]), sys.argv[end + 1 :]
     try:
@@ -56,7 +59,7 @@ def main() -> NoReturn:
     except (CriuError, PortableError) as error:
         sys.stderr.write(f"not started from its periodic image, but without it: {error}\n")
         sys.stderr.flush()
-    _become(then)
+    become(then)
 
 
 def _options(words: list[str]) -> argparse.Namespace:
@@ -80,24 +83,22 @@ def _restore(image: Path, rejoin: Rejoin, options: argparse.Namespace) -> NoRetu
     (image / restore_result.FILE).unlink(missing_ok=True)  # of an earlier start
     sys.stderr.write(f"starts from its periodic image {image}\n")
     sys.stderr.flush()
-    _become(
+    become(
         restore_result.command(
             sys.executable, image, criu=Path(options.criu), remove=False, timeout=options.timeout
         )
     )
 
 
-def _become(words: Sequence[str]) -> NoReturn:
-    for number in _PYTHON_S:
+def become(words: Sequence[str]) -> NoReturn:
+    """Become another program, with default handling of the signals that Python changes."""
+    for number in _CHANGED:
         signal.signal(number, signal.SIG_DFL)
     try:
         os.execvp(words[0], list(words))  # noqa: S606 - as the supervisor would start it
     except OSError as error:
         sys.exit(f"{words[0]} cannot be started: {error.strerror}")
 
-
-#: Signals that Python handles or ignores by default; ignored ones would stay ignored after execve.
-_PYTHON_S: Final = (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT)
 
 if __name__ == "__main__":
     main()

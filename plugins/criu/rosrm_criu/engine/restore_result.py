@@ -5,6 +5,7 @@ The shim reports by a file beside the image, because it is a child of the superv
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -87,6 +88,14 @@ def read(directory: Path) -> Outcome | None:
         return None
     except (OSError, ValueError, TypeError) as error:
         raise CriuError(f"{directory / FILE} cannot be read: {error}") from None
+
+
+def was_restored(directory: Path) -> bool:
+    """Return True if a process was restored from an image, even if it has ended since."""
+    with contextlib.suppress(CriuError):
+        outcome = read(directory)
+        return outcome is not None and not outcome.reason
+    return False
 
 
 def wait(directory: Path, *, timeout: float, ended: Callable[[], bool] = lambda: False) -> Outcome:

@@ -1,4 +1,4 @@
-"""Shim: restores a process and holds it; the supervisor starts it in place of the process.
+"""Shim: restores a process and stays its parent; the supervisor starts it in place of the process.
 
 The shim is the instance's leader. It enters a new pid namespace, where the ids of the image are
 free on every host, and restores the image there. Then it forwards its signals to the restored
@@ -38,6 +38,7 @@ from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm_criu.engine import image, process_tree, restore, restore_result
 from rosrm_criu.engine.binary import CriuBinary, opened
 from rosrm_criu.engine.image import Manifest
+from rosrm_criu.engine.restart_from_image import become
 from rosrm_criu.engine.restore_result import Outcome
 
 #: Exit code of a restore that failed.
@@ -63,15 +64,15 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def main() -> None:
-    """Restore and hold the process, and end as it ends."""
+    """Restore the process, and end as it ends."""
     began = time.monotonic()
     words, then = _split(sys.argv[1:])
     options = _options(words)
     directory = Path(options.directory).absolute()
-    if (then or options.remove) and _was_restored(directory):
+    if (then or options.remove) and restore_result.was_restored(directory):
         if options.remove:
             image.remove(directory)  # the rest that a SIGKILL of an earlier shim left
-        _start_anew(directory, then)
+        _start_without_image(directory, then)
     # Signals that arrive during the restore stay pending; only SIGKILL takes effect at once.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
     try:
@@ -95,7 +96,7 @@ def _split(words: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _options(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Restores a process and holds it.")
+    parser = argparse.ArgumentParser(description="Restores a process and stays its parent.")
     parser.add_argument("directory", help="of the image")
     parser.add_argument("--criu", required=True, help="the program")
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds for the restore")
@@ -104,25 +105,12 @@ def _options(words: list[str]) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def _was_restored(directory: Path) -> bool:
-    """Return True if an earlier shim reported success; a missing image proves nothing."""
-    with contextlib.suppress(CriuError):
-        told = restore_result.read(directory)
-        return told is not None and not told.reason
-    return False
-
-
-def _start_anew(directory: Path, command: list[str]) -> NoReturn:
+def _start_without_image(directory: Path, command: list[str]) -> NoReturn:
     """Become the process's own program: its image was already restored, and works only once."""
     if not command:
         sys.stderr.write(f"not restored: the image {directory} was restored before\n")
         sys.exit(FAILED)
-    for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT):  # changed by Python
-        signal.signal(number, signal.SIG_DFL)
-    try:
-        os.execvp(command[0], command)  # noqa: S606 - as the supervisor would start it
-    except OSError as error:
-        sys.exit(f"{command[0]} cannot be started: {error.strerror}")
+    become(command)
 
 
 @dataclass(frozen=True)
@@ -152,12 +140,13 @@ class _Restore:
             restore.mark_anew(member, marks)
         return pid
 
-    def tell(self, pid: int, *, namespace: bool) -> None:
+    def report(self, pid: int, *, namespace: bool) -> None:
         """Report success: first write the result, for all later readers; then remove the image."""
         seconds = round(time.monotonic() - self.began, 3)
-        told = Outcome(pid=pid, inner_pid=self.manifest.pid, namespace=namespace, seconds=seconds)
+        inner_pid = self.manifest.pid
+        outcome = Outcome(pid=pid, inner_pid=inner_pid, namespace=namespace, seconds=seconds)
         try:
-            restore_result.write(self.directory, told)
+            restore_result.write(self.directory, outcome)
             if self.remove:
                 image.remove(self.directory)
         except OSError as error:  # the process lives, and clients that wait have a timeout
@@ -205,7 +194,7 @@ def _restore_in_namespace(task: _Restore) -> NoReturn:
             _fail(task.directory, first.get("failed", "the restore was killed"))
         root = process_tree.children(init)[0]
         os.write(end_of_life, b"seen")
-        task.tell(root, namespace=True)
+        task.report(root, namespace=True)
         _attend(root, init)
         last = said.readline()
     _end_as(int(last) if last else int(signal.SIGKILL))
@@ -274,7 +263,7 @@ def _restore_as_child(task: _Restore) -> NoReturn:
         )  # processes that CRIU had started
         _fail(task.directory, str(error))
     guard, guarding = _start_guard(root)
-    task.tell(root, namespace=False)
+    task.report(root, namespace=False)
     status = _attend(root, root)
     os.write(guarding, b"ended")
     with contextlib.suppress(ChildProcessError):  # already reaped: another process killed the guard

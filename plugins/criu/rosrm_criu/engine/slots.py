@@ -20,7 +20,7 @@ from rosrm.errors import CriuError
 
 _REJOIN: Final = "rejoin.json"
 _STARTS: Final = "starts"
-_ANEW: Final = "anew"
+_IGNORE_IMAGES: Final = "anew"
 #: Most starts from one image. A process that crashes more often without a newer image may crash
 #: because of its restored memory, so it then starts without an image.
 _MOST_STARTS: Final = 2
@@ -65,10 +65,10 @@ def discard_unfinished(parent: Path) -> None:
             shutil.rmtree(slot, ignore_errors=True)
 
 
-def begin_anew(parent: Path) -> None:
+def start_without_image(parent: Path) -> None:
     """Make the next start ignore all images, including one that is being made."""
     if parent.exists():
-        (parent / _ANEW).touch()
+        (parent / _IGNORE_IMAGES).touch()
 
 
 def newest(parent: Path) -> tuple[Path, Rejoin] | None:
@@ -77,7 +77,7 @@ def newest(parent: Path) -> tuple[Path, Rejoin] | None:
     Raises:
         CriuError: an image cannot be read, or its start cannot be counted.
     """
-    if (parent / _ANEW).exists():
+    if (parent / _IGNORE_IMAGES).exists():
         shutil.rmtree(parent, ignore_errors=True)
         return None
     for slot in _slots(parent):

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
-from rosrm_criu.engine.paths import checkpoint, incoming, outgoing
+from rosrm_criu.engine.paths import checkpoint, incoming, numbers, outgoing
 from rosrm_criu.engine.restore_result import Outcome
 from rosrm_criu.executors.request import StepArguments, without_log_names
 from rosrm_criu.transfer import Fetcher, Sender
@@ -233,19 +233,10 @@ def remove_unused_later(directory: Path, keep: float) -> None:
 
 def remove_unused(directory: Path) -> None:
     """Remove an image; if a process was restored from it, keep the result of the restore."""
-    if was_restored(directory):
+    if restore_result.was_restored(directory):
         image.remove(directory)  # its shim may have been killed before it removed the image
     else:
         discard(directory)
-
-
-def was_restored(directory: Path) -> bool:
-    """Return True if a process was restored from an image, even if it has ended since."""
-    try:
-        told = restore_result.read(directory)
-    except CriuError:
-        return False
-    return told is not None and not told.reason
 
 
 # --- both -------------------------------------------------------------------------------------
@@ -264,12 +255,12 @@ def sweep(state: Path, instances: Iterable[str]) -> None:
         instances: `process#number` of each instance on this host that has not ended.
     """
     with _changing:
-        for number in _numbers(state, "out"):
+        for number in numbers(state, "out"):
             if number not in _senders:
                 discard(outgoing(state, number))
     forget_restored(state, instances)
     here = set(map(number_of, instances))
-    for number in _numbers(state, "in"):
+    for number in numbers(state, "in"):
         if number not in here:
             remove_unused_later(incoming(state, number), _LEFT_BEHIND)
 
@@ -281,9 +272,9 @@ def forget_restored(state: Path, instances: Iterable[str]) -> None:
     checkpoint was used, as long as its image exists. Arguments as for `sweep`.
     """
     here = set(map(number_of, instances))
-    for number in _numbers(state, "in"):
+    for number in numbers(state, "in"):
         directory = incoming(state, number)
-        if number not in here and was_restored(directory) and not _is_awaited(state, directory):
+        if number not in here and _is_over(state, directory):
             discard(directory)
 
 
@@ -292,23 +283,20 @@ def note_origin(directory: Path, number: int) -> None:
     (directory / _ORIGIN).write_text(str(number), encoding="utf-8")
 
 
-def _is_awaited(state: Path, directory: Path) -> bool:
+def _is_over(state: Path, directory: Path) -> bool:
+    """Return True if a process was restored, and the checkpoint that was copied is gone."""
+    if not restore_result.was_restored(directory):
+        return False
     try:
         origin = int((directory / _ORIGIN).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return checkpoint(state, origin).exists()
+        return True
+    return not checkpoint(state, origin).exists()
 
 
 def number_of(instance: str) -> int:
     """Return the number in `process#number`."""
     return int(instance.rpartition("#")[2])
-
-
-def _numbers(state: Path, way: str) -> list[int]:
-    images = outgoing(state, 0).parent.glob(f"{way}-*")
-    words = [path.name.partition("-")[2] for path in images]
-    return [int(word) for word in words if word.isdigit()]
 
 
 def _later(seconds: float, do: Callable[..., None], *arguments: Any) -> None:

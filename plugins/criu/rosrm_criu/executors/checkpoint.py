@@ -19,9 +19,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine import dump, external_resources, image, process_tree, udp_ports
+from rosrm_criu.engine import (
+    dump,
+    external_resources,
+    image,
+    process_tree,
+    restore_result,
+    udp_ports,
+)
 from rosrm_criu.engine.binary import find
-from rosrm_criu.engine.paths import checkpoint, checkpoint_numbers, checkpoint_ports, incoming
+from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
 from rosrm_criu.executors import artifacts
 from rosrm_criu.executors.request import StepArguments, check_wanted, turn_back, without_log_names
 from rosrm_criu.plans import KEEP, TAKE
@@ -109,7 +116,7 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     asked = StepArguments.of(arguments)
     if asked.pid(asked.destination):
         return {"taken": True}  # an earlier call took it, and the restore is under way
-    if artifacts.was_restored(incoming(asked.state, asked.destination)):
+    if restore_result.was_restored(incoming(asked.state, asked.destination)):
         return {"taken": True}  # restored once already; the process has ended since
     source, target = checkpoint(asked.state, asked.source), incoming(asked.state, asked.destination)
     image.read(source)
@@ -155,7 +162,7 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         artifacts.await_restored(asked)
     except CriuError:
         if asked.pid(asked.destination):
-            process_tree.send([pid], signal.SIGKILL)  # the shim, and so the process that it holds
+            process_tree.send([pid], signal.SIGKILL)  # the shim, and so the restored process
             raise
         artifacts.discard(directory)
         return {}
@@ -177,7 +184,7 @@ def drop(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def reserve_all(state: Path) -> None:
     """Reserve the ports of all checkpointed processes again, after the start of a slave."""
-    for number in checkpoint_numbers(state):
+    for number in numbers(state, "kept"):
         _reserve(state, number)
 
 

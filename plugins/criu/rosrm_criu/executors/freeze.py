@@ -14,9 +14,8 @@ from rosrm_criu.control.client import (
     directory_of,
     listens,
     make_directory,
-    status_of,
 )
-from rosrm_criu.control.messages import State
+from rosrm_criu.control.messages import State, Status, read_message
 from rosrm_criu.engine import dump, process_tree
 from rosrm_criu.executors.request import check_wanted
 
@@ -68,7 +67,7 @@ def call_back(pid: int, control: Path, attempt: str) -> bool:
 
 def has_failed(control: Path) -> bool:
     """Return True if the node reports that it can never rejoin."""
-    found = status_of(control)
+    found = read_message(control, Status)
     return found is not None and found.state is State.FAILED
 
 

@@ -15,14 +15,13 @@ from rosrm_criu.control.client import (
     await_joined,
     control_directory,
     make_directory,
-    remove_directory,
-    status_of,
 )
-from rosrm_criu.control.messages import State, Status
+from rosrm_criu.control.directory import remove_directory
+from rosrm_criu.control.messages import State, Status, read_message
 from rosrm_criu.engine import dump, process_tree
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import incoming, outgoing
-from rosrm_criu.engine.probe import ability
+from rosrm_criu.engine.probe import criu_support
 from rosrm_criu.executors import artifacts, periodic
 from rosrm_criu.executors.artifacts import Answer
 from rosrm_criu.executors.checkpoint import reserve_all
@@ -43,10 +42,10 @@ def report_capability(arguments: Answer) -> Answer:
     periodic.sweep(arguments)
     periodic.call_back_all(state, here["pids"])
     reserve_all(state)
-    found = ability()
+    found = criu_support()
     if not found.works:
         raise CriuError(found.reason)
-    return {**found.facts, "host": arguments["here"]["host"], "no_transfer": missing()}
+    return {**found.facts, "host": here["host"], "no_transfer": missing()}
 
 
 # --- the source -------------------------------------------------------------------------------
@@ -107,7 +106,7 @@ def go_on(arguments: Answer) -> Answer:
     except CriuError:  # for the same reason it was never asked to leave
         dump.resume(pid)
         return {}
-    before = status_of(control)
+    before = read_message(control, Status)
     if not call_back(pid, control, asked.attempt) or (before and before.state is State.RUNNING):
         return {}  # it had not left, and completes its current action
     status = await_joined(control, asked.attempt, asked.timeout, process_tree.root_of(pid))
@@ -121,7 +120,7 @@ def end(arguments: Answer) -> Answer:
     pid = asked.pid(asked.source)
     if pid:
         control = control_of(pid)
-        status = status_of(control)
+        status = read_message(control, Status)
         dump.kill(pid)
         # If both hosts share the directory, its status already says that the node runs.
         if status is not None and status.state is State.LEFT:
@@ -173,8 +172,8 @@ def fetch_image(arguments: Answer) -> Answer:
 
 
 def _fetch(asked: StepArguments) -> Answer:
-    told = asked.results[CHECKPOINT]
-    uid, control = int(told["uid"]), Path(told["control"])
+    dumped = asked.results[CHECKPOINT]
+    uid, control = int(dumped["uid"]), Path(dumped["control"])
     if control != control_directory(control.name, uid):
         raise PortableError(f"{control} is no control directory of user {uid}")
     directory = incoming(asked.state, asked.destination)
@@ -188,7 +187,7 @@ def _fetch(asked: StepArguments) -> Answer:
         )
     try:
         fetched = fetcher.fetch(
-            Offer.from_json(told["offer"]), directory, timeout=asked.timeout,
+            Offer.from_json(dumped["offer"]), directory, timeout=asked.timeout,
             reserve=int(asked.arguments["reserve"]),
         )  # fmt: skip
     finally:

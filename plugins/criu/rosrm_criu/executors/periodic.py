@@ -46,7 +46,7 @@ def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 def why_not_written(parent: Path, error: OSError) -> str:
     """Explain a failed write; the images are missing if the process was restarted since."""
     if isinstance(error, FileNotFoundError) and not parent.exists():
-        return "the process was started anew meanwhile, and its images are removed"
+        return "the process was restarted during the checkpoint, which removed its images"
     return f"no image can be made in {parent}: {error.strerror}"
 
 
@@ -111,9 +111,9 @@ def _seconds(asked: StepArguments, part: str) -> float:
 def sweep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Remove the images of instances that have ended."""
     here = arguments["here"]
-    state, living = Path(here["state"]), set(map(artifacts.number_of, here["instances"]))
-    for number in paths.periodic_numbers(state):
-        if number not in living:
+    state, present = Path(here["state"]), set(map(artifacts.number_of, here["instances"]))
+    for number in paths.numbers(state, "periodic"):
+        if number not in present:
             artifacts.discard(paths.periodic(state, number))
     return {}
 

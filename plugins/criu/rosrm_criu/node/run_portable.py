@@ -122,7 +122,7 @@ class _Run:
         self._node._portable_join_first()  # noqa: SLF001 - the other half of one thing
         self._add_executor()
         if self._listener is not None:
-            self._listener.say(Status(State.RUNNING))
+            self._listener.report(Status(State.RUNNING))
 
     def until_the_end(self) -> None:
         """Run, leave, wait and rejoin, until the context is shut down."""
@@ -151,7 +151,7 @@ class _Run:
         """Report the failure to waiting clients; the traceback is in the log."""
         if self._listener is not None:
             said = str(error) if isinstance(error, PortableError) else _said(error)
-            self._listener.say(Status(State.FAILED, self._listener.status.request, said))
+            self._listener.report(Status(State.FAILED, self._listener.status.request, said))
 
     # --- running ---------------------------------------------------------------------------
 
@@ -174,7 +174,7 @@ class _Run:
         if self._listener is None or not (self._woken or now >= self._looked + _LOOK):
             return None
         self._looked, self._woken = now, False
-        return self._listener.asked()
+        return self._listener.next_request()
 
     # --- leaving ---------------------------------------------------------------------------
 
@@ -185,7 +185,7 @@ class _Run:
         """
         began = time.monotonic()
         listener = self._its_listener()
-        listener.say(Status(State.LEAVING, request.id))
+        listener.report(Status(State.LEAVING, request.id))
         try:
             fast_dds_relocation.check()
             self._come_to_rest()
@@ -195,7 +195,7 @@ class _Run:
         fault = fault or _not_clean()
         if not fault:
             seconds = {"leave": round(time.monotonic() - began, 6)}
-            listener.say(Status(State.LEFT, request.id, seconds=seconds))
+            listener.report(Status(State.LEFT, request.id, seconds=seconds))
         return departure, fault
 
     def _come_to_rest(self) -> None:
@@ -237,7 +237,7 @@ class _Run:
         """Wait without any ROS entity, until the node is to rejoin."""
         listener = self._its_listener()
         while True:
-            request = listener.asked()
+            request = listener.next_request()
             if request is not None and request.want is Want.JOIN:
                 return request
             # Not SimpleQueue.get, filled by a signal handler: if its timeout passes while the
@@ -261,7 +261,7 @@ class _Run:
         if fault:
             self._node.get_logger().error(f"rosrm asked this node to leave; it stays: {fault}")
         seconds = listener.status.seconds
-        listener.done(Status(State.RUNNING, request.id, fault, seconds, missing))
+        listener.finish(Status(State.RUNNING, request.id, fault, seconds, missing))
 
     def _arrive(self, request: Request, departure: Departure) -> tuple[str, ...]:
         listener = self._its_listener()

@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +62,7 @@ def _send(asked: dict[str, Any]) -> Mapping[str, Any]:
     signal.signal(signal.SIGTERM, lambda *_: over.set())
     _when_input_ends(over.set)
     directory = Path(asked.pop("directory"))
-    sent = serve(directory, **asked, over=over, announce=lambda offer: _say(offer.as_json()))
-    return sent.as_json()
+    return asdict(serve(directory, **asked, over=over, announce=lambda one: _say(one.as_json())))
 
 
 def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
@@ -71,7 +71,7 @@ def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
 
     def stop(*_: object) -> None:
         ignore()
-        raise TransferError("the fetch was stopped before all had come")
+        raise TransferError("the fetch was stopped before everything was received")
 
     def ignore() -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -87,7 +87,7 @@ def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
     asked = json.loads(line)
     _when_input_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
     offer, target = Offer.from_json(asked.pop("offer")), Path(asked.pop("target"))
-    return receive(offer, target, **asked, identity=identity, before_placing=ignore).as_json()
+    return asdict(receive(offer, target, **asked, identity=identity, before_placing=ignore))
 
 
 def _when_input_ends(do: Callable[[], None]) -> None:

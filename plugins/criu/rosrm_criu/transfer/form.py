@@ -71,16 +71,16 @@ class Offer:
         return {**asdict(self), "addresses": list(self.addresses)}
 
     @classmethod
-    def from_json(cls, told: Mapping[str, Any]) -> Self:
+    def from_json(cls, plain: Mapping[str, Any]) -> Self:
         """Return the offer; raise `TransferError` for anything but a valid one of this version."""
-        version = told.get("version")
+        version = plain.get("version")
         if version != VERSION:
             raise TransferError(
                 f"the source speaks version {version!r} of the transfer, this host {VERSION}: "
                 "install the same rosrm on both"
             )
         try:
-            offer = cls(**{**told, "addresses": tuple(told["addresses"])})
+            offer = cls(**{**plain, "addresses": tuple(plain["addresses"])})
         except (KeyError, TypeError):
             raise TransferError("what came as an offer is none: its fields are others") from None
         if not offer._is_sound():
@@ -125,10 +125,6 @@ class OfferResult:
     outcome: Literal["taken", "broken", "expired", "withdrawn", "failed"]
     bytes: int
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the result as plain values."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Fetched:
@@ -149,7 +145,3 @@ class Fetched:
     received: int
     seconds: float
     checksum: str
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the result as plain values."""
-        return asdict(self)

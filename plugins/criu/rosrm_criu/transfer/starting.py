@@ -178,9 +178,8 @@ class Sender(_End):
 
     def _read_sent(self) -> OfferResult:
         assert self._process.stdout is not None
-        with self._process.stdout as output, contextlib.suppress(ValueError, TypeError, KeyError):
-            told = json.loads(output.readline())
-            return OfferResult(told["outcome"], told["bytes"])
+        with self._process.stdout as output, contextlib.suppress(ValueError, TypeError):
+            return OfferResult(**json.loads(output.readline()))
         return OfferResult("failed", 0)
 
 

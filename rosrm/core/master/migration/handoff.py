@@ -18,7 +18,6 @@ from rosrm.core.master.outcomes import (
     StepFailed,
     StepOutcome,
     StepProgress,
-    StepTimedOut,
     done_if,
 )
 from rosrm.core.master.state.migration import HandoffReports, Migration
@@ -253,7 +252,7 @@ def timed_out(state: MasterState, migration: Migration, step: Configure, now: fl
             _stop_silent_destination(state, migration, now)
             return StepProgress.PENDING
     what = f"{TITLES[step.phase]} took longer than {step.timeout:g} s"
-    return StepTimedOut(f"{what}: {_newest_reports(migration)}")
+    return StepFailed(f"{what}: {_newest_reports(migration)}", timed_out=True)
 
 
 def _stop_silent_destination(state: MasterState, migration: Migration, now: float) -> None:

@@ -24,7 +24,7 @@ from rosrm.core.master.assignment.assign import demand_of, ranking_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import executor, failover, handoff
 from rosrm.core.master.migration.start import plan_move, why_no_executor
-from rosrm.core.master.outcomes import Rejected, StepFailed, StepProgress, StepTimedOut
+from rosrm.core.master.outcomes import Rejected, StepFailed, StepProgress
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.migration import Migration
@@ -157,11 +157,10 @@ def _why_given_up(migration: Migration) -> str | None:
 
 def _advance(state: MasterState, process: Process, migration: Migration, now: float) -> None:
     outcome = executor.advance_standby(state, migration, now)
-    if isinstance(outcome, StepTimedOut):
-        why = f"{migration.destination} did not start in time"
+    if isinstance(outcome, StepFailed):
+        late = f"{migration.destination} did not start in time"
+        why = late if outcome.timed_out else outcome.reason
         _lost(state, process, migration, why, now)
-    elif isinstance(outcome, StepFailed):
-        _lost(state, process, migration, outcome.reason, now)
     elif outcome is StepProgress.DONE:
         _note_ready(state, process, migration, now)
 

@@ -14,7 +14,6 @@ from rosrm.core.master.outcomes import (
     StepFailed,
     StepOutcome,
     StepProgress,
-    StepTimedOut,
     done_if,
 )
 from rosrm.core.master.state.hosts import HostCondition
@@ -210,7 +209,7 @@ def _timed_out(state: MasterState, migration: Migration, step: Step, now: float)
         return handoff.timed_out(state, migration, step, now)
     if isinstance(step, AwaitReleased):
         return StepProgress.DONE
-    return StepTimedOut(f"{title(step)} took longer than {step.timeout:g} s")
+    return StepFailed(f"{title(step)} took longer than {step.timeout:g} s", timed_out=True)
 
 
 def _outcome(state: MasterState, migration: Migration, step: Step, now: float) -> StepOutcome:

@@ -10,7 +10,11 @@ from typing import Any, Final
 from rosrm.extensions.declared_fields import STANDARD_FIELDS
 from rosrm.model.values import EMPTY, ProcessSpec
 
-_standard_of: Final = attrgetter(*STANDARD_FIELDS)
+_MAPPINGS: Final = tuple(
+    name for name in STANDARD_FIELDS if isinstance(getattr(ProcessSpec(""), name), Mapping)
+)
+_mappings_of: Final = attrgetter(*_MAPPINGS)
+_plain_fields_of: Final = attrgetter(*(name for name in STANDARD_FIELDS if name not in _MAPPINGS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +42,8 @@ class Demand:
 
     def __post_init__(self) -> None:
         key = (
-            *map(_key, _standard_of(self.spec)), _key(self.amounts), self.estimated,
-            _key(self.excluded), self.headroom, self.near,
+            *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
+            _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
             *(repr(getattr(self.spec, name)) for name in self.reads),
         )  # fmt: skip
@@ -51,8 +55,5 @@ class Demand:
         return frozenset(name for name, much in self.amounts.items() if much > 0) - self.estimated
 
 
-def _key(value: Any) -> Any:
-    """Return a value in a form that can be hashed."""
-    if not isinstance(value, Mapping):
-        return value
-    return tuple(sorted(value.items())) if value else ()
+def _key(mapping: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    return tuple(sorted(mapping.items())) if mapping else ()

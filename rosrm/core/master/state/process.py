@@ -67,7 +67,7 @@ class Instance:
         peak: highest usage seen.
         restarting: it was ordered to restart, and no report shows the restart yet.
         settled: its estimates no longer count.
-        redelivered: its assignment was delivered twice, because its slave did not accept it.
+        redelivered: the assignment was delivered again, because its slave did not accept it.
         recalled: a former run of the master ordered it to stop, so its end counts as ordered.
         at_once: it is to end without delay, because another instance owns the name.
         order_at: time of the last order to stop it, or to withdraw it; -inf: none.

@@ -44,7 +44,7 @@ def test_a_message_may_come_after_the_state_that_covers_it():
     assert drained(buffer) == [(A, 6)]
 
 
-def test_what_one_publisher_said_before_the_newest_covered_was_passed_over():
+def test_older_messages_of_a_covered_publisher_are_skipped():
     """The source never had it, and a late process would break the order."""
     buffer = filled((A, 1), (A, 2), (A, 3))
     buffer.cover(A, [2], single=True, now=0.0)
@@ -93,7 +93,7 @@ def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
     assert not buffer.misses_one(A)
 
 
-def test_numbers_of_several_publishers_say_nothing_of_a_loss():
+def test_numbers_of_several_publishers_show_no_loss():
     """Numbers of a restarted publisher do not show a loss either."""
     buffer = InputBuffer(10, ROOM, 0.0)
     buffer.cover(A, [5], single=False, now=0.0)

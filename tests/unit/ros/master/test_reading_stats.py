@@ -57,7 +57,7 @@ def test_what_comes_late_is_missed_no_more(ledger: ReadingStats) -> None:
 
 
 @pytest.mark.parametrize("host", [0, 3, 10_000_000])
-def test_who_is_not_registered_is_not_entered(ledger: ReadingStats, host: int) -> None:
+def test_readings_of_an_unregistered_host_are_not_entered(ledger: ReadingStats, host: int) -> None:
     """A former run of a registered host is ignored, too."""
     assert ledger.take(runs((host, 5, 5)), 0.0).tolist() == []
     assert ledger.take(runs((1, 5, 5), incarnation=RUN + 1), 0.0).tolist() == []
@@ -65,8 +65,8 @@ def test_who_is_not_registered_is_not_entered(ledger: ReadingStats, host: int) -
     assert ledger.ages(0.0) == (0, 0.0)
 
 
-def test_a_new_run_begins_anew(ledger: ReadingStats) -> None:
-    """Its sequence starts again and its beat uses another clock; the old counts stay."""
+def test_another_run_of_a_slave_starts_its_own_statistics(ledger: ReadingStats) -> None:
+    """The new run starts its sequence again and beats by another clock; the old counts stay."""
     ledger.take(runs((1, 100, 1), beat=10**15), 0.0)
     ledger.begin(1, RUN + 1)
     assert not ledger.beat[1]

@@ -65,13 +65,12 @@ def links(monkeypatch, control) -> HostLinks:
     links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
     links._client = FakeClient()
     monkeypatch.setattr(
-        "rosrm.ros.master.slave_links.order_to_msg",
-        lambda command: SimpleNamespace(envelope=None),
+        "rosrm.ros.master.slave_links.order_to_msg", lambda command: SimpleNamespace(envelope=None)
     )
     return links
 
 
-def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control):
+def test_an_order_waits_until_discovery_finds_the_service_of_the_slave(links, control):
     """An earlier order would be lost, and repeated only after `control.order_retry`."""
     control.ready = False
     links.renew(HOST, DESCRIPTION)

@@ -101,11 +101,11 @@ class Host:
 
     def __init__(self) -> None:
         self.events = []
-        self.heard: list[float] = []
+        self.contacts: list[float] = []
 
     def take(self, event) -> None:
         if isinstance(event, events.ContactConfirmed):
-            self.heard.append(event.at)
+            self.contacts.append(event.at)
         else:
             self.events.append(event)
 
@@ -170,7 +170,7 @@ class Slave:
             self.clock.now += PERIOD
             for master in masters:
                 master.beat()
-            self.endpoint.go_on(self.clock.now)
+            self.endpoint.advance(self.clock.now)
             self.endpoint.ask(self.clock.now)
 
     def find(self, master: Master) -> None:
@@ -195,7 +195,7 @@ def slave(monkeypatch, caplog) -> Slave:
 
 
 @pytest.mark.parametrize("epoch", [1, 2, 3])
-def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> None:
+def test_another_run_of_the_master_is_reported_at_any_epoch(slave, epoch) -> None:
     """A master with a lost journal begins at epoch 1 again: the slave registers with it, too."""
     old, new = Master(slave, 11, epoch=2), Master(slave, 12, epoch=epoch, pid=8)
     slave.join(old)
@@ -216,7 +216,7 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     assert slave.newest(srv.RequestProcess).request.envelope.epoch == epoch
 
 
-def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
+def test_another_run_is_reported_without_a_contact_with_the_first(slave) -> None:
     """The first run is killed right after its greeting, which does not identify the run."""
     old, new = Master(slave, 11), Master(slave, 12, pid=8)
     slave.pass_time(PERIOD)
@@ -230,7 +230,7 @@ def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
     assert slave.link is MasterLink.REGISTERED
 
 
-def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
+def test_a_run_that_replaces_the_first_is_reported(slave) -> None:
     """In a container every master is pid 1 of the same host name."""
     old, new = Master(slave, 11, pid=1), Master(slave, 12, pid=1)
     slave.join(old)
@@ -249,7 +249,7 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     assert slave.host.events[-1] == events.Registered(1, renumbers=False)
 
 
-def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
+def test_of_two_masters_the_running_one_is_kept(slave) -> None:
     """The younger of two masters stops; the slave switches at once only to a newer epoch."""
     ours = Master(slave, 11, epoch=2)
     slave.join(ours)
@@ -260,37 +260,37 @@ def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
     assert slave.link is MasterLink.SEARCHING
 
 
-def test_beats_say_that_the_master_hears_this_host(slave) -> None:
+def test_beats_confirm_the_contact_of_this_host(slave) -> None:
     """Beats of the accepting master count, unless they list this host as silent."""
     ours, another = Master(slave, 11, epoch=2), Master(slave, 12, epoch=1, pid=8)
     slave.pass_time(PERIOD, ours)
     ours.greet()
-    assert slave.host.heard == []  # no master has accepted the host yet
+    assert slave.host.contacts == []  # no master has accepted the host yet
     ours.take_in()
-    slave.host.heard.clear()
+    slave.host.contacts.clear()
     slave.clock.now += 1.0
     ours.beat(unheard=[1, 7])
     another.beat()
-    assert slave.host.heard == []
+    assert slave.host.contacts == []
     ours.beat(unheard=[2])
-    assert slave.host.heard == pytest.approx([slave.clock.now])
+    assert slave.host.contacts == pytest.approx([slave.clock.now])
 
 
-def test_old_beats_say_who_was_heard_then(slave) -> None:
+def test_delayed_beats_confirm_the_contact_of_their_time(slave) -> None:
     """A slave that was stopped finds old beats in its sockets."""
     ours = Master(slave, 11)
     slave.join(ours)
     slave.pass_time(1.0, ours)
-    slave.host.heard.clear()
+    slave.host.contacts.clear()
     slave.clock.now += 1.5
     ours.beat(age=1.3)
     ours.beat(age=1.1)
     now = slave.clock.now
-    assert slave.host.heard == pytest.approx([now - 1.3, now - 1.1], abs=0.01)
+    assert slave.host.contacts == pytest.approx([now - 1.3, now - 1.1], abs=0.01)
 
 
-def test_an_answer_that_was_taken_in_late_greets_nobody(slave) -> None:
-    """Its round trip is too long to tell the age of the master's messages."""
+def test_a_late_greeting_starts_no_session(slave) -> None:
+    """The round trip is too long to give the age of the master's messages."""
     ours = Master(slave, 11)
     slave.pass_time(PERIOD)
     slave.clock.now += 10.0
@@ -311,15 +311,15 @@ def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave, 
     """The slave leaves once the master is silent; its log claims no running processes."""
     slave.join(Master(slave, 11))
     slave.pass_time(1.6)
-    told = []
-    slave.endpoint.leave(lambda: told.append(slave.clock.now))
+    left = []
+    slave.endpoint.leave(lambda: left.append(slave.clock.now))
     slave.pass_time(0.6)
     assert slave.link is not MasterLink.REGISTERED
-    assert len(told) == 1
+    assert len(left) == 1
     assert not [line for line in caplog.messages if "keep running" in line]
 
 
-def test_a_master_that_comes_back_is_told_that_the_slave_leaves(slave) -> None:
+def test_a_returning_master_learns_that_the_slave_leaves(slave) -> None:
     """The stop may take long; until its end the master must not count the host as staying."""
     slave.join(Master(slave, 11))
     slave.endpoint.leave(lambda: None)
@@ -362,21 +362,27 @@ def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
     assert slave.host.events.count(events.AssignmentsReceived((), None)) == 1
 
 
-def test_a_name_that_is_taken_is_said_at_once(slave, caplog) -> None:
-    """The slave retries for a moment, and logs the conflict once."""
+@pytest.mark.parametrize(
+    ("code", "message"), [("name_taken", "a live one"), ("journal", "a full disk")]
+)
+def test_a_refused_registration_is_logged_once_and_retried(slave, caplog, code, message) -> None:
+    """The name of the host is in use, or a master with a journal stall accepts no host for now."""
     ours = Master(slave, 11)
     for _ in range(3):
         slave.find(ours)
-        ours.take_in(code="name_taken", message="a live one")
-    (said,) = caplog.messages
-    assert said.startswith("a live one. Asking again for 5 s")
+        ours.take_in(code=code, message=message)
+        assert slave.link is MasterLink.SEARCHING
     assert slave.endpoint.failure == ""
+    (line,) = [line for line in caplog.messages if message in line]
+    assert line == caplog.messages[0]
+    assert code == "journal" or line.startswith("a live one. Asking again for 5 s")
+    slave.join(ours)
 
 
 # --- remembered journal numbers ----------------------------------------------------------------
 
 
-def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_path) -> None:
+def test_the_journal_position_of_a_former_run_is_sent_back(monkeypatch, tmp_path) -> None:
     """A later run of the slave reports it, too; the same run of the master needs no report."""
     clock = Clock()
     monkeypatch.setattr(endpoint, "time", clock)
@@ -390,12 +396,12 @@ def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_pa
     slave.pass_time(PERIOD)
     again = Slave(clock, JournalWatermark(path))
     for one in (slave, again):
-        told = Master(one, 12, epoch=3, pid=8)
-        one.pass_time(3.0, told)
-        told.greet()
+        new = Master(one, 12, epoch=3, pid=8)
+        one.pass_time(3.0, new)
+        new.greet()
         assert one.newest(srv.RegisterHost).request.journal_seen == 41
-        told.take_in()
-        told.beat(journal=7)
+        new.take_in()
+        new.beat(journal=7)
     assert JournalWatermark(path).of_former_run("m", 12) == 0
     assert JournalWatermark(path).of_former_run("m", 13) == 7
     assert JournalWatermark(path).of_former_run("another", 13) == 0
@@ -413,21 +419,7 @@ def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -
     assert seen.of_former_run("m", 2) == 5
 
 
-def test_a_master_that_cannot_write_is_asked_again(slave, caplog) -> None:
-    """A master with a journal stall accepts no host for now: the slave retries and logs it once."""
-    ours = Master(slave, 11)
-    for _ in range(3):
-        slave.find(ours)
-        ours.take_in(code="journal", message="a full disk")
-        assert slave.link is MasterLink.SEARCHING
-    slave.find(ours)
-    assert slave.endpoint.failure == ""
-    assert [word for word in caplog.messages if "a full disk" in word] == caplog.messages[:1]
-    ours.take_in()
-    assert slave.link is MasterLink.REGISTERED
-
-
-def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) -> None:
+def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch, caplog) -> None:
     """The slave repeats its request, instead of waiting forever during a registration."""
     master = Master(slave, 11)
     slave.find(master)
@@ -437,6 +429,6 @@ def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) ->
 
     monkeypatch.setattr(slave.endpoint._reporter, "begin", fails)
     master.take_in()
-    assert slave.wire.guard.failures == 1
+    assert [one for one in caplog.messages if "KeyError: 'oops'" in one]
     assert slave.link is MasterLink.SEARCHING
     monkeypatch.undo()

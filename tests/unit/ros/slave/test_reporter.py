@@ -37,7 +37,7 @@ class Slave:
         return len(self.sent) - before
 
 
-def test_the_first_reading_goes_out_whatever_it_says() -> None:
+def test_the_first_reading_is_always_published() -> None:
     """A master that has just accepted a host must not wait for it, on a rejoin either."""
     slave = Slave()
     assert [slave.cycle() for _ in range(3)] == [1, 0, 0]
@@ -47,7 +47,9 @@ def test_the_first_reading_goes_out_whatever_it_says() -> None:
 
 
 @pytest.mark.parametrize(("beat_period", "every"), [(1.0, 10), (0.3, 3), (0.2, 2), (0.05, 1)])
-def test_quiet_cycles_are_told_once_in_a_beat_period(beat_period: float, every: int) -> None:
+def test_unchanged_readings_are_published_once_per_beat_period(
+    beat_period: float, every: int
+) -> None:
     """However little changes, the master receives a message that often, and counts each cycle."""
     slave = Slave(beat_period)
     slave.cycle()
@@ -69,7 +71,7 @@ def test_quiet_cycles_are_told_once_in_a_beat_period(beat_period: float, every: 
     ],
     ids=["accepting", "processes", "present", "stale", "statuses"],
 )
-def test_what_decides_goes_out_in_its_own_cycle(facts) -> None:
+def test_a_change_that_matters_is_published_in_its_own_cycle(facts) -> None:
     """Changes of acceptance, load, late probes and statuses are sent at once, and once."""
     slave = Slave()
     slave.cycle()
@@ -79,7 +81,7 @@ def test_what_decides_goes_out_in_its_own_cycle(facts) -> None:
     assert slave.cycle(facts) == 0
 
 
-def test_a_limit_that_is_reached_left_or_changed_goes_out_at_once() -> None:
+def test_a_limit_that_is_reached_left_or_changed_is_published_at_once() -> None:
     """Placement compares with it; the size of the step across the limit makes no difference."""
     slave = Slave()
     slave.usage[0] = 0.799
@@ -93,7 +95,7 @@ def test_a_limit_that_is_reached_left_or_changed_goes_out_at_once() -> None:
     assert slave.cycle() == 1
 
 
-def test_a_slow_drift_is_told_when_it_adds_up() -> None:
+def test_a_slow_drift_is_published_when_it_adds_up() -> None:
     """The master's value is never further off than the resolution, however small the steps are."""
     slave = Slave(beat_period=10.0)
     slave.cycle()
@@ -104,15 +106,15 @@ def test_a_slow_drift_is_told_when_it_adds_up() -> None:
         assert abs(said - slave.usage[1]) < RESOLUTION
 
 
-def test_the_newest_reading_can_be_told_before_its_time() -> None:
+def test_the_newest_reading_can_be_published_early() -> None:
     """Messages that rely on the reading (such as a satisfied need) follow it; it is sent once."""
     slave = Slave()
     slave.cycle()
     slave.usage[0] += 0.5 * RESOLUTION
     slave.cycle()
 
-    slave.reporter.tell()
-    slave.reporter.tell()
+    slave.reporter.publish()
+    slave.reporter.publish()
 
     assert len(slave.sent) == 2
     decoded = decode(slave.sent)

@@ -49,7 +49,7 @@ def test_root_of_a_container_is_told_of_privileges(monkeypatch):
 
 def test_the_slice_that_is_offered_is_a_good_file(tmp_path):
     """A slave's configuration file can be copied from the advice."""
-    from rosrm.config import load_host
+    from rosrm.config.host import load_host
 
     with pytest.raises(LabError) as raised:
         needs.check_rights(uniform(1, memory=GIB), status(0))

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.state.process import ProcessPhase
+from rosrm.model.values import InstanceState
 from rosrm_simulate.workload import Curve
 
 from .workloads import MIB, host, plan, run, simulation
 
-START, STOP, WIRE = 0.3, 0.1, 0.002
+START, READY, STOP, WIRE = 0.3, 0.7, 0.1, 0.002
 
 # --- the model of a host ----------------------------------------------------------------------
 
@@ -123,6 +124,22 @@ def test_a_relaunched_job_begins_anew_and_one_that_hands_over_goes_on(strategy, 
     assert outcome.placements["p"] == ("a", "b")
     assert outcome.finished == 1
     assert outcome.makespan == pytest.approx(total + START, abs=0.7)
+
+
+def test_a_restarted_node_is_ready_when_it_is_seen_in_the_graph_again():
+    """The node is seen 0.7 s after each start, also after a restart at 5 s."""
+    restart = (5.0, happened.RestartRequested(0, ("p",)))
+    made = simulation([host("a")], [plan("p", ros=True)], requests=[restart], until=10.0)
+    take, ready = made.meter.take, []
+
+    def watch(state, event, commands, now):
+        statuses = getattr(event, "statuses", ())
+        ready.extend(now for one in statuses if one.state is InstanceState.READY)
+        take(state, event, commands, now)
+
+    made.meter.take = watch
+    made.run()
+    assert ready == pytest.approx([START + READY, 5.0 + STOP + START + READY], abs=0.05)
 
 
 def test_what_a_leaving_slave_ends_goes_elsewhere():

@@ -171,7 +171,7 @@ def test_the_workload_in_the_how_to_shows_differences(load, registry):
     [
         ("## The workload", SIMULATION_KEYS),
         ("### A host", [f.name for f in fields(in_file.HostInFile)]),
-        ("### A process", [f.name for f in fields(in_file.ProcessInFile)]),
+        ("### A process", [f.name for f in fields(in_file.ProcessPlanInFile)]),
         ("### The model", [f.name for f in fields(in_file.ModelInFile)]),
     ],
 )

@@ -37,7 +37,7 @@ def main() -> None:
         os._exit(1)
     os.write(ready, b"ready\n")
     os.close(ready)
-    let_go()
+    release_files()
     reap()
 
 
@@ -89,7 +89,7 @@ def mount(*words: str) -> None:
     subprocess.run(["mount", *words], check=True, capture_output=True)
 
 
-def let_go() -> None:
+def release_files() -> None:
     """Release the terminal, the directory and the files of the process that made this host."""
     os.chdir("/")
     null = os.open(os.devnull, os.O_RDWR)

@@ -87,10 +87,12 @@ def become(order: dict[str, Any], command: list[str], mask: set[int]) -> None:
 def relay(child: int) -> int:
     """Pass signals on until the child has ended; return its wait status."""
     while True:
-        told = signal.sigwaitinfo(PASSED | {signal.SIGCHLD})
-        if told.si_signo != signal.SIGCHLD:
-            if told.si_code <= 0:  # sent by a process; the child received the kernel's own as well
-                os.kill(child, told.si_signo)
+        received = signal.sigwaitinfo(PASSED | {signal.SIGCHLD})
+        if received.si_signo != signal.SIGCHLD:
+            if (
+                received.si_code <= 0
+            ):  # sent by a process; the child received the kernel's own as well
+                os.kill(child, received.si_signo)
             continue
         while True:  # one signal may announce several changes
             pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)

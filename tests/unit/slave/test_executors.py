@@ -7,7 +7,6 @@ import re
 import sys
 import threading
 from collections import ChainMap
-from pathlib import Path
 from queue import Queue
 
 import pytest
@@ -16,10 +15,10 @@ from rosrm.core.master.events import BAD_RESULT
 from rosrm.errors import CriuError, Refused
 from rosrm.extensions.plugin_calls import WORKS_AFTER
 from rosrm.extensions.registry import OfferedExecutor
-from rosrm.slave.executors import Executors, Here
+from rosrm.slave.executors import Executors
 from rosrm.testing import FakeClock
 
-HERE = Here("alpha", Path("/state"), {})
+HERE = {"host": "alpha"}
 
 
 class Rig:

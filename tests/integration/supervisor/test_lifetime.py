@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -15,13 +14,15 @@ from pathlib import Path
 import pytest
 
 import rosrm
+from rosrm.core.supervisor.events import ShutdownOrdered, StatusStored, StopOrdered
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 from rosrm.supervisor import instance_record, messages, procfs
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
+from rosrm.supervisor.messages import Forget
 from tests.waiting import command_of, wait_gone, wait_until
 
-from .conftest import Host
+from .conftest import Host, kill
 
 OURS = messages.PROTOCOL
 
@@ -72,7 +73,7 @@ def test_processes_survive_a_killed_slave(host, slave):
     wait_until(lambda: command_of(status.pid).startswith("sleep"), "the process is executed")
 
 
-def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):
+def test_no_terminal_signal_of_the_slave_reaches_its_processes(host, slave):
     """Supervisor and process have sessions of their own, so Ctrl-C reaches neither."""
     supervisor = next(iter(host.pids))
     (process,) = wait_until(host.alive, "the process is executed")
@@ -91,8 +92,7 @@ def test_a_second_live_slave_is_refused(host, slave):
 @pytest.mark.parametrize("number", [OURS - 1, OURS + 1])
 def test_a_slave_of_another_version_is_refused(host, client, monkeypatch, number):
     """The refusal names both versions; the supervisor's processes keep running."""
-    client.start([host.order("kept", "sleep", "1000")])
-    pid = host.running(client, "kept").pid
+    pid = host.sleeper(client, "kept")
     client.close()
     with monkeypatch.context() as patched:
         patched.setattr(messages, "PROTOCOL", number)
@@ -106,7 +106,7 @@ def test_final_statuses_are_kept_until_forgotten(host, client):
     final = host.run(client, host.order("job", "sh", "-c", "exit 5"))
     client = host.reconnect(client)
     assert client.instances == (final,)
-    client.forget([InstanceId("job", 1)])
+    client.send(Forget((StatusStored(("job", 1)),)))
     client = host.reconnect(client)
     assert client.instances == ()
 
@@ -119,19 +119,17 @@ def test_a_killed_supervisor_is_taken_over(host, client):
     client = host.replace_supervisor(client)
     (status,) = client.instances
     assert (status.state, status.pid) == (InstanceState.RUNNING, before.pid)
-    client.stop(InstanceId("kept", 1))
+    client.send(StopOrdered(("kept", 1)))
     assert host.ended(client, "kept").state is InstanceState.EXITED
     assert host.alive() == []
     assert host.log("kept").read_text() == "ran\n"
 
 
-def test_an_end_that_nobody_saw_is_said_to_be_unknown(host, client):
+def test_an_unobserved_end_is_reported_as_unknown(host, client):
     """A process that ended without a supervisor has failed, with exit code unknown; no restart."""
-    client.start([host.order("gone", "sleep", "1000")])
-    pid = host.running(client, "gone").pid
+    pid = host.sleeper(client, "gone")
     host.kill_supervisor(client)
-    os.kill(pid, signal.SIGKILL)
-    wait_gone(pid)
+    kill(pid)
     client = host.connect()
     (status,) = client.instances
     assert (status.state, status.exit_code) == (InstanceState.FAILED, -1)
@@ -144,8 +142,7 @@ def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host, client):
     pid = host.running(client, "leaver").pid
     wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
     host.kill_supervisor(client)
-    os.kill(pid, signal.SIGKILL)
-    wait_gone(pid)
+    kill(pid)
     client = host.connect()
     host.ended(client, "leaver")
     assert host.alive() == []
@@ -153,8 +150,7 @@ def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host, client):
 
 def test_a_taken_over_process_that_ends_is_noticed(host, client):
     """The new supervisor is not the parent, and notices the end by the pidfd."""
-    client.start([host.order("kept", "sleep", "1000")])
-    pid = host.running(client, "kept").pid
+    pid = host.sleeper(client, "kept")
     client = host.replace_supervisor(client)
     os.kill(pid, signal.SIGKILL)
     assert host.ended(client, "kept").exit_code == -1
@@ -164,10 +160,7 @@ def test_a_spawn_without_an_outcome_is_not_tried_again(host, client):
     """A kill between the spawn and its record: the process may have run, so no second run."""
     host.run(client, host.order("model", "touch", "ran"))
     host.kill_supervisor(client)
-    record = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in record.read_text().splitlines()]
-    last = max(i for i, line in enumerate(lines) if line["record"] == "spawning")
-    record.write_text("".join(json.dumps(line) + "\n" for line in lines[: last + 1]))
+    host.cut_record(after_spawn=True)
     (host.state / "work" / "ran").unlink()
     client = host.connect()
     (status,) = client.instances
@@ -180,35 +173,26 @@ def test_a_start_that_was_never_tried_is_carried_out(host, client):
     """A kill between the order's record and the spawn: the next supervisor spawns it, once."""
     host.run(client, host.order("model", "sh", "-c", "echo ran"))
     host.kill_supervisor(client)
-    record = host.state / "instances.jsonl"
-    lines = [json.loads(line) for line in record.read_text().splitlines()]
-    last = max(i for i, line in enumerate(lines) if line["record"] == "spawning")
-    record.write_text("".join(json.dumps(line) + "\n" for line in lines[:last]))
+    host.cut_record(after_spawn=False)
     host.log("model").unlink()
     client = host.connect()
-    if not any(status.state.ended for status in client.instances):
-        host.ended(client, "model")
+    host.ended_after_connect(client, "model")
     assert host.log("model").read_text() == "ran\n"
 
 
 def test_a_spawn_without_a_record_is_found_by_its_marks(host, client):
     """A kill right after the spawn: the next supervisor finds the unrecorded process."""
-    client.start([host.order("found", "sleep", "1000")])
-    pid = host.running(client, "found").pid
+    pid = host.sleeper(client, "found")
     host.kill_supervisor(client)
-    record = host.state / "instances.jsonl"
-    lines = record.read_text().splitlines(keepends=True)
-    last = max(i for i, line in enumerate(lines) if '"record":"spawning"' in line)
-    record.write_text("".join(lines[: last + 1]))
+    host.cut_record(after_spawn=True)
     client = host.connect()
     (status,) = client.instances
     assert (status.state, status.pid) == (InstanceState.RUNNING, pid)
 
 
-def test_a_torn_tail_is_left_out_and_said(host, client):
+def test_a_torn_tail_is_left_out_and_reported(host, client):
     """A record that ends in half a line is read up to there, and the client gets a note."""
-    client.start([host.order("kept", "sleep", "1000")])
-    host.running(client, "kept")
+    host.sleeper(client, "kept")
     host.kill_supervisor(client)
     with (host.state / "instances.jsonl").open("a") as record:
         record.write('{"record":"state","key":["ke')
@@ -217,7 +201,7 @@ def test_a_torn_tail_is_left_out_and_said(host, client):
     assert any("torn line" in note for note in client.notes)
 
 
-def test_a_damaged_line_is_left_out_and_said(host, client):
+def test_a_damaged_line_is_left_out_and_reported(host, client):
     """An unreadable line is skipped, and the client gets a note with its line number."""
     host.run(client, host.order("job", "true"))
     host.kill_supervisor(client)
@@ -249,8 +233,7 @@ def test_what_starts_after_the_record_was_compacted_is_taken_over(host, client):
 def test_without_its_environment_nothing_is_restarted(host, client):
     """The process with a lost environment is taken over, but refused a restart, with the reason."""
     always = RestartPolicy(when="always", delay=0.01)
-    client.start([host.order("one", "sleep", "1000", restart=always)])
-    pid = host.running(client, "one").pid
+    pid = host.sleeper(client, "one", restart=always)
     host.kill_supervisor(client)
     path = host.state / "instances.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
@@ -320,7 +303,7 @@ def test_no_supervisor_is_started_unless_asked(host):
     assert not host.state.exists()
 
 
-def test_an_unusable_state_directory_is_said(tmp_path):
+def test_an_unusable_state_directory_is_reported(tmp_path):
     """The error names the directory that cannot be created, at once."""
     (tmp_path / "file").write_text("")
     with pytest.raises(SupervisorError, match="file/state cannot be used"):
@@ -331,7 +314,7 @@ def test_shutdown_ends_everything_and_leaves_nothing(host, client):
     """After the shutdown no process, no socket and no supervisor is left."""
     client.start([host.order("a", "sleep", "1000"), host.order("b", "sleep", "1000")])
     host.running(client, "b")
-    client.shutdown()
+    client.send(ShutdownOrdered())
     with pytest.raises(SupervisorEnded):
         list(iter(lambda: client.receive(10), []))
     wait_gone(client.pid)
@@ -339,7 +322,7 @@ def test_shutdown_ends_everything_and_leaves_nothing(host, client):
     assert not (host.state / "supervisor.sock").exists()
 
 
-def test_it_ends_when_nothing_runs_and_nobody_is_there(host):
+def test_a_supervisor_without_client_and_processes_ends(host):
     """A supervisor without a client ends when all its processes have ended."""
     first = host.connect()
     first.start([host.python("p", "import sys; sys.stdin.read(); input()")])
@@ -351,7 +334,7 @@ def test_it_ends_when_nothing_runs_and_nobody_is_there(host):
     assert [status.exit_code for status in second.instances] == [1]
 
 
-def test_it_stays_for_what_runs_and_ends_with_it(host):
+def test_a_supervisor_without_client_ends_with_its_last_process(host):
     """A supervisor without a client ends with its last process."""
     first = host.connect()
     first.start([host.python("p", "import time; time.sleep(1000)")])
@@ -365,10 +348,10 @@ def test_it_stays_for_what_runs_and_ends_with_it(host):
     assert host.connect().instances[0].exit_signal == signal.SIGKILL
 
 
-def test_a_lost_supervisor_is_told(host, client):
+def test_a_lost_supervisor_is_reported(host, client):
     """A waiting slave is notified at once of the end of its supervisor."""
     os.kill(client.pid, signal.SIGKILL)
-    with pytest.raises(SupervisorError, match="is gone; its processes go on"):
+    with pytest.raises(SupervisorError, match="is gone; its processes keep running"):
         client.receive(10)
 
 
@@ -382,7 +365,7 @@ def test_orders_pass_while_another_thread_waits(host, client):
     assert received
 
 
-def test_it_sleeps_while_nothing_happens(host, client):
+def test_an_idle_supervisor_sleeps(host, client):
     """Without processes or orders the supervisor is not scheduled at all."""
     host.run(client, host.order("job", "true"))
 
@@ -398,7 +381,7 @@ def test_it_sleeps_while_nothing_happens(host, client):
     assert switches() == before
 
 
-def test_it_imports_nothing_heavy():
+def test_the_supervisor_imports_nothing_heavy():
     """The supervisor's modules import the standard library only, and little of it."""
     root = str(Path(rosrm.__file__).parent.parent)
     code = f"import sys; sys.path.append({root!r}); import rosrm.supervisor.server"
@@ -412,7 +395,7 @@ def test_it_imports_nothing_heavy():
     assert "rosrm.model.values" not in loaded
 
 
-def test_it_is_small(client):
+def test_the_supervisor_is_small(client):
     """The supervisor uses at most 12 MiB, alone on the machine (about 8 beside other Pythons)."""
     rollup = Path(f"/proc/{client.pid}/smaps_rollup").read_text().split()
     assert int(rollup[rollup.index("Pss:") + 1]) < 12 * 1024

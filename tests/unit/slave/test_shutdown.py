@@ -23,7 +23,7 @@ class Slave:
         self.when_stopped = lambda: None
         self.endpoint = SimpleNamespace(
             failure="", superseded=False, leave=lambda done, _kept: done(),
-            wait_until_heard=lambda: None,
+            wait_until_received=lambda: None,
         )  # fmt: skip
         self.state = SlaveState()
         for name in "pq":
@@ -87,7 +87,7 @@ def test_a_supervisor_that_is_gone_has_stopped_nothing(slave, caplog) -> None:
     assert said.startswith("stopping 2 processes (SIGINT)")
 
 
-def test_a_slave_whose_supervisor_was_gone_before_says_so(slave, caplog) -> None:
+def test_a_slave_whose_supervisor_ended_before_names_its_processes(slave, caplog) -> None:
     """The slave does not claim "no process is left running" if nothing stopped them."""
     slave.ending.note_supervisor_left("the supervisor is gone")
     assert slave.end() == 1
@@ -101,13 +101,13 @@ def test_a_second_signal_is_answered_with_what_is_left_and_until_when(slave) -> 
     def stop() -> None:
         slave.report("p", InstanceState.EXITED)
         slave.now += 1.5
-        slave.ending.say_progress()
+        slave.ending.log_progress()
         slave.now += 1.0
-        slave.ending.say_progress()
+        slave.ending.log_progress()
         slave.ending.note_supervisor_left("")
 
     slave.when_stopped = stop
-    slave.ending.say_progress()
+    slave.ending.log_progress()
     assert slave.end() == 0
     assert slave.said == [
         "stopping 2 processes (SIGINT); processes that run after 2 s are killed (SIGKILL)",

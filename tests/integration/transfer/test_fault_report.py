@@ -13,7 +13,7 @@ from pathlib import Path
 from tests.ros.clusters import PATIENCE, wait_until
 
 
-def test_a_fetch_that_is_ended_while_it_tells_its_fault_tells_it() -> None:
+def test_a_fetch_ended_while_it_reports_its_error_reports_it() -> None:
     """A fetch that gets SIGTERM while it writes its error completes the error, and only that."""
     heard, said = os.pipe()
     with subprocess.Popen(

@@ -56,7 +56,7 @@ def master(
     if recover:
         typer.echo(_recover(settings.state), err=True)
     with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
-        typer.echo(_says(settings), err=True)
+        typer.echo(_master_summary(settings), err=True)
     become("rosrm.master", settings.to_json())
 
 
@@ -82,7 +82,8 @@ def slave(
     The slave runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes
     too, unless the file has `on_stop: keep`.
     """
-    from rosrm.config import HostConfig, load_host
+    from rosrm.config.host import load_host
+    from rosrm.config.settings import HostConfig
     from rosrm.extensions.registry import Registry
     from rosrm.runtime.state_lock import only_one
 
@@ -103,7 +104,7 @@ def slave(
         registry.default_probes()  # raises if there is none
     remedy = "another `host:` and `state:`"
     with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
-        typer.echo(_says_of_host(settings), err=True)
+        typer.echo(_slave_summary(settings), err=True)
     become("rosrm.slave", settings.to_json())
 
 
@@ -143,14 +144,14 @@ def _recover(state: Path) -> str:
         return recover(state / "journal.sqlite")
 
 
-def _says(settings: ClusterConfig) -> str:
+def _master_summary(settings: ClusterConfig) -> str:
     return (
         f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.scoring.policy}; "
         f"migration {', '.join(settings.migration.strategies) or 'none'}; state in {settings.state}"
     )
 
 
-def _says_of_host(settings: HostConfig) -> str:
+def _slave_summary(settings: HostConfig) -> str:
     limits = ", ".join(f"{name} {limit:.0%}" for name, limit in settings.limits.items())
     return (
         f"slave of {settings.host!r}: {settings.ros.describe()}; scope {settings.scope}; "

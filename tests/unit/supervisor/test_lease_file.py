@@ -17,7 +17,7 @@ def test_the_newest_is_read_back(tmp_path):
     assert len((tmp_path / "heard").read_bytes().splitlines()) == 1
 
 
-def test_what_another_boot_heard_does_not_count(tmp_path, monkeypatch):
+def test_a_contact_of_another_boot_does_not_count(tmp_path, monkeypatch):
     """The clock of another boot does not compare."""
     lease_file.LastContact(str(tmp_path)).keep(ContactReported(5.0))
     monkeypatch.setattr(lease_file.procfs, "boot_id", lambda: "another")
@@ -25,14 +25,14 @@ def test_what_another_boot_heard_does_not_count(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"torn", b"\xff\xff \xff", b"boot not-a-number\n"])
-def test_what_cannot_be_read_does_not_count(tmp_path, content):
+def test_an_unreadable_lease_file_does_not_count(tmp_path, content):
     """Each instance's own start counts then, which fences it earlier."""
     if content is not None:
         (tmp_path / "heard").write_bytes(content)
     assert lease_file.read(str(tmp_path)) == ContactReported(0.0)
 
 
-def test_what_cannot_be_written_is_said_once(tmp_path, capsys):
+def test_a_lease_file_that_cannot_be_written_is_logged_once(tmp_path, capsys):
     """Fences then rely on the contacts known to this supervisor."""
     (tmp_path / "heard").mkdir()
     kept = lease_file.LastContact(str(tmp_path))

@@ -88,14 +88,9 @@ def is_unsure(answer: Any, epoch: int) -> bool:
 def find_master(
     participant: Participant, who: str, timeout: float
 ) -> srv.Handshake.Response | None:
-    """Find a master and shake hands.
+    """Find a master and shake hands; return its description of itself, None: no answer in time.
 
-    Args:
-        who: role and name of the caller.
-        timeout: seconds.
-
-    Returns:
-        The master's description of itself; None: no master answered in time.
+    `who` is the role and name of the caller.
     """
     deadline = time.monotonic() + timeout
     path = names.Names(participant.settings.namespace)(names.HANDSHAKE)
@@ -205,8 +200,9 @@ class MasterClient:
 
     def submit(self, specs: Sequence[ProcessSpec]) -> str:
         """Queue processes, all or none; return the master's message."""
-        request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
-        return str(self._ask(srv.Submit, names.SUBMIT, request).answer.message)
+        return self._ask(
+            srv.Submit, names.SUBMIT, processes=[convert.spec_to_msg(spec) for spec in specs]
+        )
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""
@@ -215,38 +211,31 @@ class MasterClient:
 
     def cancel(self, processes: Sequence[str]) -> str:
         """Remove processes from the queue, or stop them."""
-        request = srv.Cancel.Request(processes=list(processes))
-        return str(self._ask(srv.Cancel, names.CANCEL, request).answer.message)
+        return self._ask(srv.Cancel, names.CANCEL, processes=list(processes))
 
     def restart(self, processes: Sequence[str]) -> str:
         """Restart processes where they run; queue ended ones again."""
-        request = srv.Restart.Request(processes=list(processes))
-        return str(self._ask(srv.Restart, names.RESTART, request).answer.message)
+        return self._ask(srv.Restart, names.RESTART, processes=list(processes))
 
     def migrate(self, name: str, host: str | None = None) -> str:
         """Begin the migration of a process; without a host the core chooses one."""
-        request = srv.Migrate.Request(process=name, host=host or "")
-        return str(self._ask(srv.Migrate, names.MIGRATE, request).answer.message)
+        return self._ask(srv.Migrate, names.MIGRATE, process=name, host=host or "")
 
     def checkpoint(self, name: str) -> str:
         """Begin to dump a process into a checkpoint image on its host; the process ends."""
-        request = srv.Checkpoint.Request(process=name)
-        return str(self._ask(srv.Checkpoint, names.CHECKPOINT, request).answer.message)
+        return self._ask(srv.Checkpoint, names.CHECKPOINT, process=name)
 
     def restore(self, name: str) -> str:
         """Begin to restore a process from its checkpoint image, on the host that holds it."""
-        request = srv.Restore.Request(process=name)
-        return str(self._ask(srv.Restore, names.RESTORE, request).answer.message)
+        return self._ask(srv.Restore, names.RESTORE, process=name)
 
     def set_host_state(self, host: str, action: str) -> str:
         """Cordon, uncordon or drain a host."""
-        request = srv.SetHostState.Request(host=host, action=action)
-        return str(self._ask(srv.SetHostState, names.SET_HOST_STATE, request).answer.message)
+        return self._ask(srv.SetHostState, names.SET_HOST_STATE, host=host, action=action)
 
     def prune(self, processes: Sequence[str] = (), hosts: Sequence[str] = ()) -> str:
         """Remove ended processes and departed hosts from the listings; without names: all."""
-        request = srv.Prune.Request(processes=list(processes), hosts=list(hosts))
-        return str(self._ask(srv.Prune, names.PRUNE, request).answer.message)
+        return self._ask(srv.Prune, names.PRUNE, processes=list(processes), hosts=list(hosts))
 
     # --- listings and logs ---------------------------------------------------------------
 
@@ -288,8 +277,6 @@ class MasterClient:
         """Read a part of a log from the slave that holds it.
 
         Args:
-            host: of the slave.
-            process: that wrote the log.
             number: of the instance; 0: the newest on that host.
             offset: of the first byte.
             max_bytes: 0: as many as one answer holds.
@@ -319,26 +306,25 @@ class MasterClient:
             self._master, self._last_contact = hello, time.monotonic()
         return self._control.envelope(self._master.beat, self._master.epoch)
 
-    def _ask(self, kind: Any, name: str, request: Any) -> Any:
-        for greeted_anew in (False, True):
+    def _ask(self, kind: Any, name: str, **fields: Any) -> str:
+        """Send a request that acts, and return the master's message."""
+        request = kind.Request(**fields)
+        for is_repeated in (False, True):
             request.envelope = self._envelope()
             try:
-                return self._call(kind, self._names(name), request, _MASTER)
+                return str(self._call(kind, self._names(name), request, _MASTER).answer.message)
             except Refused as refusal:
-                if greeted_anew or refusal.code != "stale":
+                if is_repeated or refusal.code != "stale":
                     raise
-                self._last_contact = (
-                    -math.inf
-                )  # another run of the master than the one that greeted
-        raise AssertionError("the second time it is answered or raised")
+                self._last_contact = -math.inf  # another run of the master answered
+        raise AssertionError("the second request is answered, or refused")
 
     def _silent(self, who: str, trouble: str = "", unknown: str = "") -> NoMaster:
         """Return the error for a part that does not answer.
 
         Args:
-            who: the master, or the slave of a host.
-            trouble: why, if that is known.
-            unknown: what became of the request.
+            trouble: its reason, if that is known.
+            unknown: a sentence on the fate of the request.
         """
         settings = self._participant.settings
         check = _to_check(settings) if who == _MASTER else "Is `rosrm slave` running there?"

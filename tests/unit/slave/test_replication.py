@@ -13,13 +13,14 @@ from collections.abc import Callable
 
 import pytest
 
-from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.ros.slave.replication import NotStored
 from rosrm.slave.replication import fetch
 from rosrm.slave.replication.service import ReplicationService
-from rosrm.snapshots import Block, SlotWriter, TransferPart
+from rosrm.snapshots import reader
+from rosrm.snapshots.format import Block, TransferPart
+from rosrm.snapshots.writer import SlotWriter
 
 P7 = InstanceId("p", 7)
 PATIENCE = 20.0
@@ -36,10 +37,10 @@ class Wire:
     def serve(self, host) -> None:
         self.host = host
 
-    def finds_keeper(self, host: str, now: float) -> bool:
+    def finds_receiver(self, host: str, now: float) -> bool:
         return host not in self.net.hidden
 
-    finds_source = finds_keeper
+    finds_source = finds_receiver
 
     def give(self, host, part, now, timeout, done) -> None:
         self.given.append(part)
@@ -48,12 +49,12 @@ class Wire:
         else:
             self.net.slaves[host].take_part(part, done)
 
-    def ask(self, host, wanted, now, timeout, done) -> None:
+    def ask(self, host, request, now, timeout, done) -> None:
         def answer(part: TransferPart | None) -> None:
             done("there is no such snapshot here" if part is None else part)
 
-        age = (wanted.number, wanted.sequence)
-        self.net.slaves[host].read_part(wanted.process, age, wanted.offset, 1000, answer)
+        age = (request.number, request.sequence)
+        self.net.slaves[host].read_part(request.process, age, request.offset, 1000, answer)
 
     def expire(self, now: float) -> None:
         unanswered, self.net.unanswered = self.net.unanswered, []
@@ -67,7 +68,7 @@ class Net:
     Attributes:
         hidden: hosts that discovery does not find.
         silent: hosts that do not answer.
-        told: reports to the master, by host.
+        reports: reports to the master, by host.
     """
 
     def __init__(self, tmp_path, log) -> None:
@@ -78,15 +79,15 @@ class Net:
         self.hidden: set[str] = set()
         self.silent: set[str] = set()
         self.unanswered: list[Callable[[], None]] = []
-        self.told: dict[str, list] = {}
+        self.reports: dict[str, list] = {}
         self.now = time.monotonic()
 
     def add(self, name: str, **settings) -> ReplicationService:
-        self.told[name] = []
+        self.reports[name] = []
         wire = self.wires[name] = Wire(self, name)
 
         def publish(states) -> bool:
-            self.told[name].append(states)
+            self.reports[name].append(states)
             return True
 
         self.slaves[name] = ReplicationService(
@@ -94,6 +95,15 @@ class Net:
             post=self.posted.put, publish=publish,
         )  # fmt: skip
         return self.slaves[name]
+
+    def add_all(self, names: str) -> None:
+        for name in names:
+            self.add(name)
+
+    def replicate(self, *to: str, period: float = 1.0) -> None:
+        """Add these hosts, and a, which sends replicas of `p` to them."""
+        self.add_all("".join({"a", *to}))
+        self.slaves["a"].keep(P7, to, period)
 
     def write(self, host: str, sequence: int, size: int = 10, number: int = 7) -> None:
         """Publish a snapshot of the node of `p`."""
@@ -106,7 +116,7 @@ class Net:
         return self.root / host / "p"
 
     def age(self, host: str) -> tuple[int, int] | None:
-        head = snapshots.newest_head(self.directory(host))
+        head = reader.newest_head(self.directory(host))
         return None if head is None else head.age
 
     def until(self, condition: Callable[[], object], what: str, step: float = 0.1) -> None:
@@ -121,6 +131,10 @@ class Net:
         for slave in self.slaves.values():
             slave.tick(self.now)
         self.settle()
+
+    def pass_times(self, count: int, step: float = 0.1) -> None:
+        for _ in range(count):
+            self.pass_time(step)
 
     def settle(self) -> None:
         """Deliver all results of the threads to the loop."""
@@ -148,28 +162,23 @@ def assignment(*kept_on: str, kept_from: int = 1, number: int = 9, **fields) -> 
 # --- shipping ---------------------------------------------------------------------------------
 
 
-def test_a_state_is_shipped_when_it_has_changed(net):
+def test_a_snapshot_is_sent_when_it_has_changed(net):
     """The replica is identical, and is not sent again before there is a newer snapshot."""
-    net.add("a").keep(P7, ["b"], 1.0)
-    net.add("b")
+    net.replicate("b")
     net.write("a", 1, 600_000)
     net.until(lambda: net.age("b") == (7, 1), "the first state")
-    assert snapshots.newest_content(net.directory("b")) == snapshots.newest_content(
-        net.directory("a")
-    )
+    assert reader.newest_content(net.directory("b")) == reader.newest_content(net.directory("a"))
     given = len(net.wires["a"].given)
     assert given == 3
-    for _ in range(50):
-        net.pass_time(0.1)
+    net.pass_times(50)
     assert len(net.wires["a"].given) == given
     net.write("a", 2, 600_000)
     net.until(lambda: net.age("b") == (7, 2), "the second state")
 
 
-def test_not_more_often_than_the_policy_says(net):
+def test_snapshots_are_sent_at_most_as_often_as_the_policy_allows(net):
     """The bound holds however fast the snapshot changes."""
-    net.add("a").keep(P7, ["b"], 2.0)
-    net.add("b")
+    net.replicate("b", period=2.0)
     for sequence in range(1, 101):
         net.write("a", sequence)
         net.pass_time(0.1)
@@ -177,11 +186,9 @@ def test_not_more_often_than_the_policy_says(net):
     assert 4 <= shipped <= 6
 
 
-def test_to_several_hosts(net):
+def test_each_host_receives_a_replica(net):
     """Each host receives the replica, one after the other."""
-    net.add("a").keep(P7, ["b", "c", "a"], 1.0)
-    net.add("b")
-    net.add("c")
+    net.replicate("b", "c", "a")
     net.write("a", 5)
     net.until(lambda: net.age("b") == net.age("c") == (7, 5), "both copies")
 
@@ -196,65 +203,58 @@ def test_the_rate_is_bounded(net):
     assert 3.5 <= net.now - begun <= 6.0
 
 
-def test_who_does_not_answer_is_tried_again_and_named_once(net):
+def test_a_silent_host_is_tried_again_and_logged_once(net):
     """Other hosts still receive their replicas."""
-    net.add("a").keep(P7, ["b", "c"], 1.0)
-    net.add("b")
-    net.add("c")
+    net.replicate("b", "c")
     net.silent.add("b")
     net.write("a", 1)
     net.until(lambda: net.age("c") == (7, 1), "the copy on c")
-    for _ in range(100):
-        net.pass_time(0.1)
+    net.pass_times(100)
     assert net.log.messages == ["b does not keep the state of p#7: no answer"]
     net.silent.clear()
     net.until(lambda: net.age("b") == (7, 1), "the copy on b")
 
 
-def test_a_newer_state_there_is_left_alone(net):
+def test_a_newer_snapshot_on_the_other_host_is_left_alone(net):
     """An old instance that still runs somewhere does not replace newer state."""
-    net.add("a").keep(P7, ["b"], 1.0)
-    net.add("b")
+    net.replicate("b")
     net.write("b", 1, number=8)
     net.write("a", 100)
-    for _ in range(20):
-        net.pass_time(0.1)
+    net.pass_times(20)
     assert net.age("b") == (8, 1)
     assert net.log.messages == []
 
 
-def test_the_state_of_a_successor_is_not_sent_back(net):
+def test_the_snapshot_of_a_successor_is_not_sent_back(net):
     """The process has moved to b, whose slave sends its replicas to this host."""
-    net.add("a").keep(P7, ["b"], 1.0)
-    net.add("b")
+    net.replicate("b")
     net.write("a", 1)
     net.until(lambda: net.age("b") == (7, 1), "the first copy")
     given = len(net.wires["a"].given)
     net.write("b", 2, number=8)
     net.slaves["b"].keep(InstanceId("p", 8), ["a"], 1.0)
     net.until(lambda: net.age("a") == (8, 2), "the copy of the successor's state")
-    for _ in range(50):
-        net.pass_time(0.1)
+    net.pass_times(50)
     assert len(net.wires["a"].given) == given
 
 
-def test_room_is_bounded(net):
+def test_the_size_of_the_replicas_is_bounded(net):
     """The bound holds for the replicas of all processes together; existing ones stay."""
     net.add("a").keep(P7, ["b"], 1.0)
     net.add("b", max_bytes=10_000)
     net.write("a", 1, 9_000)
     net.until(lambda: net.age("b") == (7, 1), "the first state")
     net.write("a", 2, 20_000)
-    net.until(lambda: net.log.messages, "a word about it")
+    net.until(lambda: net.log.messages, "a log line")
     assert "keep.max_bytes" in net.log.messages[0]
     assert net.age("b") == (7, 1)
 
 
-def test_a_state_that_is_damaged_on_its_way_is_refused(net):
+def test_a_snapshot_damaged_in_transfer_is_refused(net):
     """No part of the damaged replica is stored or left behind."""
     taker = net.add("b")
     net.write("b", 1, number=6)
-    good = snapshots.newest_content(net.directory("b"))[1]
+    good = reader.newest_content(net.directory("b"))[1]
     answers = []
     part = TransferPart("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
     taker.take_part(part, answers.append)
@@ -264,7 +264,7 @@ def test_a_state_that_is_damaged_on_its_way_is_refused(net):
     assert not (net.directory("b") / "copy.new").exists()
 
 
-def test_parts_out_of_order_begin_anew(net):
+def test_a_part_out_of_order_restarts_the_transfer(net):
     """A part was lost, or two senders send at the same time."""
     taker = net.add("b")
     answers = []
@@ -273,7 +273,7 @@ def test_parts_out_of_order_begin_anew(net):
     assert answers[0].code == "order"
 
 
-def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
+def test_a_slow_disk_does_not_block_the_loop(net, monkeypatch):
     """Files are written by a thread, not by the loop."""
     slave = net.add("a")
     net.write("a", 1)
@@ -298,34 +298,31 @@ def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
 # --- reports to the master --------------------------------------------------------------------
 
 
-def test_the_master_is_told_what_is_kept_when_it_changes(net):
+def test_a_change_of_the_replicas_is_reported_to_the_master(net):
     """A new master receives the report at once."""
     slave = net.add("a")
-    for _ in range(30):
-        net.pass_time(0.1)
-    assert net.told["a"] in ([], [()])
+    net.pass_times(30)
+    assert net.reports["a"] in ([], [()])
     net.write("a", 3)
-    net.until(lambda: net.told["a"] and net.told["a"][-1], "a word of it")
-    ((one,),) = [net.told["a"][-1]]
+    net.until(lambda: net.reports["a"] and net.reports["a"][-1], "a report")
+    ((one,),) = [net.reports["a"][-1]]
     assert (one.instance, one.sequence) == (P7, 3)
-    before = len(net.told["a"])
+    before = len(net.reports["a"])
     slave.report_again()
-    assert len(net.told["a"]) == before + 1
+    assert len(net.reports["a"]) == before + 1
 
 
-def test_a_copy_that_has_come_is_told_at_once(net):
+def test_a_received_replica_is_reported_at_once(net):
     """The report must not wait for the next look, because the process may be lost before."""
-    net.add("a").keep(P7, ["b"], 1.0)
-    net.add("b")
+    net.replicate("b")
     net.pass_time(0.05)  # the look that follows its start is over
     net.write("a", 1)
     net.until(lambda: net.age("b") == (7, 1), "the copy", step=0.01)
-    for _ in range(3):
-        net.pass_time(0.01)
-    assert [(one.instance, one.sequence) for one in net.told["b"][-1]] == [(P7, 1)]
+    net.pass_times(3, 0.01)
+    assert [(one.instance, one.sequence) for one in net.reports["b"][-1]] == [(P7, 1)]
 
 
-def test_what_lives_here_is_not_deleted(net):
+def test_the_snapshot_of_a_running_process_is_not_deleted(net):
     """A late order does not delete the snapshot of a running process."""
     slave = net.add("a")
     net.write("a", 3)
@@ -343,30 +340,28 @@ def test_what_lives_here_is_not_deleted(net):
 # --- fetching ---------------------------------------------------------------------------------
 
 
-def prepare(net: Net, host: str, wanted: Assignment) -> list[Assignment]:
+def prepare(net: Net, host: str, request: Assignment) -> list[Assignment]:
     """Return the assignments that start, at once or after some time."""
     started: list[Assignment] = []
-    if net.slaves[host].prepare(wanted, started.append):
-        return [wanted]
+    if net.slaves[host].prepare(request, started.append):
+        return [request]
     net.until(lambda: started, "the start")
     return started
 
 
-def test_a_start_fetches_the_newest_state(net):
+def test_a_start_fetches_the_newest_snapshot(net):
     """The parts of the snapshot are stored as if the node had published it here."""
-    net.add("a")
-    net.add("b")
+    net.add_all("ab")
     net.write("b", 42, 10_000)
-    wanted = assignment("b")
-    assert prepare(net, "a", wanted) == [wanted]
+    request = assignment("b")
+    assert prepare(net, "a", request) == [request]
     assert net.age("a") == (7, 42)
     assert "was fetched from b for p#9" in net.log.messages[0]
 
 
 def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
     monkeypatch.setattr(fetch, "PATIENCE", 0.05)
-    for name in "abc":
-        net.add(name)
+    net.add_all("abc")
     net.write("b", 42)
     net.write("c", 41)
     net.hidden.add("b")
@@ -374,11 +369,10 @@ def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
     assert net.age("a") == (7, 41)
 
 
-def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
+def test_without_a_newer_snapshot_a_process_starts_from_the_local_one(net, monkeypatch):
     """The slave logs the reason."""
     monkeypatch.setattr(fetch, "PATIENCE", 0.05)
-    net.add("a")
-    net.add("b")
+    net.add_all("ab")
     prepare(net, "a", assignment("b"))
     assert net.log.messages == [
         "no newer state for p#9, it starts from nothing: b: there is no such snapshot here"
@@ -390,21 +384,19 @@ def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
     assert "it starts from cycle 5, which is here: b: its slave was not found" in second
 
 
-def test_what_is_here_and_as_new_is_not_fetched(net):
-    net.add("a")
-    net.add("b")
+def test_a_local_snapshot_as_new_is_not_fetched(net):
+    net.add_all("ab")
     net.write("a", 42)
     net.write("b", 41)
     prepare(net, "a", assignment("b"))
     assert net.age("a") == (7, 42)
 
 
-def test_all_that_is_kept_is_the_owners_alone(net):
+def test_snapshots_and_replicas_are_private_to_their_owner(net):
     """The mode is 0o700 under any umask, whether a node or a replica creates the directory."""
     before = os.umask(0)
     try:
-        net.add("a").keep(P7, ["b"], 1.0)
-        net.add("b")
+        net.replicate("b")
         prepare(net, "a", assignment())
         net.write("a", 1)
         net.until(lambda: net.age("b") == (7, 1), "the copy")
@@ -416,24 +408,23 @@ def test_all_that_is_kept_is_the_owners_alone(net):
 
 
 @pytest.mark.parametrize(
-    "wanted", [assignment("a", "b"), assignment(), assignment("b", shadow=True)], ids=str
+    "needs_none", [assignment("a", "b"), assignment(), assignment("b", shadow=True)], ids=str
 )
-def test_what_needs_no_state_of_another_host_asks_none(net, wanted):
+def test_a_start_that_needs_no_snapshot_of_another_host_fetches_none(net, needs_none):
     """The newest snapshot is here, or none exists, or the instance follows a source."""
-    net.add("a")
-    net.add("b")
+    net.add_all("ab")
     net.write("b", 42)
-    prepare(net, "a", wanted)
+    prepare(net, "a", needs_none)
     assert net.age("a") is None
 
 
-def test_a_process_without_a_state_starts_at_once(net):
+def test_a_stateless_process_starts_at_once(net):
     """No host is asked for a snapshot."""
     stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", kept_on=("b",))
     assert net.add("a").prepare(stateless, pytest.fail)
 
 
-def test_states_of_a_former_life_are_deleted_before_a_start(net):
+def test_snapshots_of_a_former_process_are_deleted_before_a_start(net):
     """The origin of these snapshots makes no difference."""
     net.add("a")
     net.write("a", 42)
@@ -441,7 +432,7 @@ def test_states_of_a_former_life_are_deleted_before_a_start(net):
     assert net.age("a") is None
 
 
-def test_a_start_goes_on_though_looking_for_its_state_failed(net, monkeypatch):
+def test_a_start_proceeds_though_the_search_for_its_snapshot_failed(net, monkeypatch):
     """The slave logs the error."""
     slave = net.add("a")
     monkeypatch.setattr(slave, "_look_for", lambda _: 1 / 0)
@@ -454,10 +445,9 @@ def test_a_start_that_is_called_off_does_not_happen(net):
     slave = net.add("a")
     net.add("b")
     net.write("b", 42, 10_000)
-    wanted = assignment("b")
-    assert not slave.prepare(wanted, lambda _: pytest.fail("it was started"))
-    assert slave.is_preparing(wanted.instance)
-    assert slave.forget(wanted.instance)
-    for _ in range(20):
-        net.pass_time(0.1)
-    assert not slave.is_preparing(wanted.instance)
+    request = assignment("b")
+    assert not slave.prepare(request, lambda _: pytest.fail("it was started"))
+    assert slave.is_preparing(request.instance)
+    assert slave.forget(request.instance)
+    net.pass_times(20)
+    assert not slave.is_preparing(request.instance)

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.cli.commands import start
-from rosrm.config import ClusterConfig, HostConfig
+from rosrm.cli.commands import runtimes
+from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.extensions.contracts import Intent, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.extensions.installed import installed_plugins
 from rosrm.extensions.registry import Registry
@@ -31,7 +31,9 @@ def becomes(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     seen = []
     monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=OURS))
-    monkeypatch.setattr(start, "become", lambda module, settings: seen.append((module, settings)))
+    monkeypatch.setattr(
+        runtimes, "become", lambda module, settings: seen.append((module, settings))
+    )
     return seen
 
 
@@ -95,7 +97,7 @@ def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch
         seen["handover"] = take_over(words[-2:])
 
     monkeypatch.setattr(os, "execv", execv)
-    start.become("rosrm.slave", '{"host": "h"}')
+    runtimes.become("rosrm.slave", '{"host": "h"}')
     assert seen["words"][-4:-1] == ["-m", "rosrm.slave", "--settings-fd"]
     assert (seen["inherited"], seen["handover"].settings) == (True, '{"host": "h"}')
     assert list(seen["handover"].plugins) == installed_plugins()

@@ -1,0 +1,81 @@
+"""Strategies of hypothesis for dataclasses: every field is drawn, by its type."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, Final, Union, get_args, get_origin, get_type_hints
+
+from hypothesis import strategies as st
+
+from rosrm.model.values import ProcessSpec
+
+Drawn = st.SearchStrategy[Any]
+
+_LETTERS: Final = st.characters(codec="utf-8", exclude_characters="\0")
+WORDS: Final = st.text(_LETTERS, max_size=12)
+NAMES: Final = st.text(_LETTERS, min_size=1, max_size=12)
+_PLAIN: Final = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | WORDS,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=3),
+    max_leaves=6,
+)
+_INT32: Final = st.integers(-(2**31), 2**31 - 1)
+_BY_TYPE: Final[Mapping[Any, Drawn]] = {
+    str: WORDS,
+    int: st.integers(0, 2**31 - 1),
+    float: st.floats(0.0, 1e18),
+    str | None: st.none() | NAMES,
+    Any: _PLAIN,
+}
+#: Fields with another range than other fields of their type.
+_BY_NAME: Final[Mapping[str, Drawn]] = {
+    "name": NAMES,
+    "process": NAMES,
+    "priority": _INT32,
+    "exit_code": _INT32,
+    "number": st.integers(0, 2**64 - 1),
+    "incarnation": st.integers(1, 2**64 - 1),
+    "factor": st.floats(1.0, 100.0),
+    "capacity": st.floats(1e-3, 1e18),
+    "period": st.floats(1e-3, 10.0),
+}
+
+
+def drawn(kind: Any, **others: Drawn) -> Drawn:
+    """Return a strategy for a dataclass; `others` are the strategies of fields by name."""
+    hints, known = get_type_hints(kind), {**_BY_NAME, **others}
+    names = [f.name for f in fields(kind)]
+    return st.builds(kind, **{n: known[n] if n in known else _of(hints[n]) for n in names})
+
+
+def _of(hint: Any) -> Drawn:
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint in _BY_TYPE:
+        return _BY_TYPE[hint]
+    if is_dataclass(hint):
+        return drawn(hint)
+    if origin in (Union, types.UnionType):
+        return st.one_of(*map(_of, inner))
+    if origin is tuple and inner[-1] is Ellipsis:
+        return st.lists(_of(inner[0]), max_size=3).map(tuple)
+    if origin is tuple:
+        return st.tuples(*map(_of, inner))
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return st.dictionaries(NAMES, _of(inner[1]), max_size=3)
+    return st.from_type(hint)
+
+
+_NO_PROGRAM: Final = {"package": None, "executable": None, "module": None, "command": ()}
+_PROGRAMS: Final = st.one_of(
+    st.fixed_dictionaries({"package": NAMES, "executable": NAMES}),
+    st.fixed_dictionaries({"module": NAMES}),
+    st.fixed_dictionaries({"command": st.lists(WORDS, min_size=1, max_size=3).map(tuple)}),
+)
+#: Specs with one program, as a master accepts them.
+SPECS: Final = st.builds(
+    lambda spec, program: replace(spec, **{**_NO_PROGRAM, **program}),
+    drawn(ProcessSpec),
+    _PROGRAMS,
+)
