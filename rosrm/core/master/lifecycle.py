@@ -66,7 +66,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     if not is_next:
         state.send(host, ReportInstances())
     for status in event.statuses:
-        take_status(state, host, status, now)
+        _take_status(state, host, status, now)
 
 
 def reconcile(
@@ -81,7 +81,7 @@ def reconcile(
     held = {status.instance: status for status in statuses}
     state.skip_numbers(max((one.number for one in held), default=0))
     for status in held.values():
-        take_status(state, host, status, now)
+        _take_status(state, host, status, now)
     for instance in state.instances_of(host):
         if instance.id in held:
             continue
@@ -99,7 +99,7 @@ def _yet_to_start(state: MasterState, instance: Instance) -> bool:
     )
 
 
-def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
+def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
     """Apply the status of one instance."""
     instance = state.instances.get(status.instance.number)
     if instance is None or instance.host is not host or instance.id != status.instance:
@@ -138,7 +138,7 @@ def _follow(
 ) -> None:  # fmt: skip
     """Set the phase of a process by the status of its owning instance."""
     before = process.phase
-    phase = phase_of(process, instance)
+    phase = _phase_of(process, instance)
     state.set_phase(process, phase, now, status.message)
     if phase is not before:
         # A job has no ready state: it runs to its end.
@@ -155,7 +155,7 @@ def _follow(
             state.save(process)
 
 
-def phase_of(process: Process, owner: Instance) -> ProcessPhase:
+def _phase_of(process: Process, owner: Instance) -> ProcessPhase:
     """Return the phase of a process by the state of the instance that owns its name."""
     if process.wanted is not DesiredState.RUN:
         return ProcessPhase.STOPPING
@@ -170,7 +170,7 @@ def _handle_unknown_instance(
     The master tracks it until it has ended: it repeats the order to stop, and starts no successor.
     """
     if readoption.readopt(state, host, status, now):
-        take_status(state, host, status, now)
+        _take_status(state, host, status, now)
         return
     if status.state.ended:
         return
@@ -421,7 +421,7 @@ def note_phase(state: MasterState, process: Process, owner: Instance, now: float
         reason = f"{host.name} {unreachable}{_what_follows(process) if lost else ''}"
         state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
     else:
-        state.set_phase(process, phase_of(process, owner), now)
+        state.set_phase(process, _phase_of(process, owner), now)
 
 
 def _what_follows(process: Process) -> str:

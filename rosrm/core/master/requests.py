@@ -211,12 +211,7 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
             now, EventKind.CANCELLED, f"{process.name} cancelled in the queue", process=process.name
         )
     elif process.image is not None and process.name not in state.migrations:
-        images.drop(state, process)
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(
-            now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
-            process=process.name,
-        )  # fmt: skip
+        images.cancel(state, process, now)
     elif process.owner == 0 and process.name not in state.migrations:
         # Its owner has ended, and former instances are being stopped.
         if not lifecycle.requeue_if_clear(state, process, now):
@@ -284,7 +279,7 @@ def migration_requested(state: MasterState, event: happened.MigrationRequested, 
     """Begin the migration of a process."""
     (process,) = known_processes(state, [event.name])
     host = None if event.host is None else known_host(state, event.host)
-    rejected = try_move(state, process, asked_for(event.by), now, host=host)
+    rejected = try_move(state, process, _cause(event.by), now, host=host)
     if rejected is not None:
         _note_refused_move(state, process, rejected.reason, now)
         raise RequestRefused(rejected.reason)
@@ -318,7 +313,7 @@ def _begin(
     now: float,
 ) -> None:
     (process,) = known_processes(state, [event.name])
-    rejected = begin(state, process, asked_for(event.by), now)
+    rejected = begin(state, process, _cause(event.by), now)
     if rejected is not None:
         raise RequestRefused(rejected.reason)
     migration = state.migrations[event.name]
@@ -326,7 +321,7 @@ def _begin(
     state.emit(Reply(event.request, message=message, host=migration.source_host.name))
 
 
-def asked_for(by: str) -> str:
+def _cause(by: str) -> str:
     """Return the cause, for records, of a change that a client requested."""
     return f"asked for by {by}" if by else "asked for"
 

@@ -235,12 +235,7 @@ def _remove_unmade(state: MasterState, migration: Migration) -> None:
 def settle(state: MasterState, process: Process, migration: Migration, now: float) -> None:
     """Set the phase after a plan that ends with an image; drop the image of a cancelled process."""
     if process.wanted is DesiredState.CANCEL:
-        images.drop(state, process, migration.destination.number)
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(
-            now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
-            process=process.name,
-        )  # fmt: skip
+        images.cancel(state, process, now, migration.destination.number)
     else:
         process.wanted = DesiredState.RUN
         failed = migration.aim is Aim.RESTORE

@@ -72,11 +72,18 @@ def reason_of(state: MasterState, process: Process) -> str:
 # --- removal of unwanted images ---------------------------------------------------------------
 
 
+def cancel(state: MasterState, process: Process, now: float, *numbers: int) -> None:
+    """Cancel a checkpointed process; the arguments are those of `drop`."""
+    drop(state, process, *numbers)
+    state.set_phase(process, ProcessPhase.CANCELLED, now)
+    message = f"{process.name} cancelled; its image is removed"
+    state.record(now, EventKind.CANCELLED, message, process=process.name)
+
+
 def drop(state: MasterState, process: Process, *numbers: int) -> None:
     """Detach the image of a process, if it has one, and have it removed.
 
-    Args:
-        numbers: of other instances under which the image may lie on its host.
+    `numbers`: of other instances under which the image may lie on its host.
     """
     image = process.image
     if image is not None:

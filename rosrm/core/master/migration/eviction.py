@@ -123,10 +123,10 @@ def _evict_for_resource(state: MasterState, host: Host, resource: str, now: floa
 def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
     held = state.instances_of(host)
     owned = [instance for instance in held if state.owned_by(instance) is not None]
-    return sorted(owned, key=lambda one: (-usage_to_free(one, resource), one.id.number))
+    return sorted(owned, key=lambda one: (-_usage_to_free(one, resource), one.id.number))
 
 
-def usage_to_free(instance: Instance, resource: str) -> float:
+def _usage_to_free(instance: Instance, resource: str) -> float:
     """Return the usage that leaves the host with an instance, in base units of the resource."""
     return instance.seen.get(resource, instance.demand.get(resource, 0.0))
 
@@ -137,7 +137,7 @@ def _why_not_now(
     refusal = why_immovable(state, process)
     if refusal:
         return refusal
-    if usage_to_free(instance, resource) <= 0.0:
+    if _usage_to_free(instance, resource) <= 0.0:
         return f"{process.name} uses no {resource}"
     since_move, cooldown = now - process.moved_at, state.settings.cooldown
     if since_move < cooldown:

@@ -64,15 +64,9 @@ def plan_move(
 def move_of(
     state: MasterState, process: Process, source: InstanceId, here: Host, there: Host, node: str
 ) -> Move:
-    """Return the input of a strategy that plans for a process.
+    """Return the input of a strategy that plans for a process; both hosts may be the same.
 
-    Args:
-        state: numbers the new instances.
-        process: to be moved, or to be dumped or restored on its own host.
-        source: the instance that owns the name, or whose image does.
-        here: host of the source.
-        there: host of the destination.
-        node: name of the source's node, without its namespace.
+    `node`: name of the source's node, without its namespace.
     """
     return Move(
         process.spec, source, here.name, state.new_instance_id(process), there.name,

@@ -36,9 +36,7 @@ def begin(state: MasterState, newest: int, now: float, *, machine_rebooted: bool
     start from this one.
 
     Args:
-        state: as it was restored.
         newest: sequence of the newest record that the journal holds.
-        now: monotonic seconds.
         machine_rebooted: the machine was rebooted, and the last master had not stopped before.
     """
     gap = state.journal_gap

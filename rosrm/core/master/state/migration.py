@@ -189,11 +189,8 @@ _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")
 def migration_to_dict(migration: Migration, stopping: Sequence[int]) -> dict[str, Any]:
     """Return all facts about a migration that a restarted master needs.
 
-    Reports of a handoff are left out, because the nodes send them again.
-
-    Args:
-        migration: the migration.
-        stopping: numbers of its instances that were ordered to stop.
+    Reports of a handoff are left out, because the nodes send them again. `stopping`: numbers of its
+    instances that were ordered to stop.
     """
     return {
         "plan": migration.plain_plan, "back": migration.undo is not None,
