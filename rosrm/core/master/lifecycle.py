@@ -54,8 +54,8 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None or state.hosts.condition_of(host) is HostCondition.DETACHED:
         return  # the slave's last message had all instances that it left running
-    is_next = state.hosts.note_statuses(host, event.sequence, now)
-    if is_next is None:
+    place = state.hosts.note_statuses(host, event.sequence, now)
+    if place == "late":
         return
     note_on_host(state, host, event.failing_plugins(), now)
     if event.complete:
@@ -63,7 +63,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
         state.hosts.set_report_due(host, report_due=False)
         reconcile(state, host, event.statuses, now)
         return
-    if not is_next:
+    if place == "after a gap":
         state.send(host, ReportInstances())
     for status in event.statuses:
         _take_status(state, host, status, now)

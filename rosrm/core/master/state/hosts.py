@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -334,18 +334,16 @@ class HostTable(HostColumns):
             self.report_due[host.column] = report_due
             self.changed()
 
-    def note_statuses(self, host: Host, sequence: int, now: float) -> bool | None:
-        """Note the sequence of a status batch.
-
-        Returns:
-            None: older than the newest; True: the next; False: one before it was missed.
-        """
+    def note_statuses(
+        self, host: Host, sequence: int, now: float
+    ) -> Literal["late", "next", "after a gap"]:
+        """Note the sequence of a status batch, and return its place in the order of batches."""
         newest = int(self.status_sequence[host.column])
         if sequence <= newest:
-            return None
+            return "late"
         self.status_sequence[host.column] = sequence
         self.last_contact[host.column] = now
-        return sequence == newest + 1
+        return "next" if sequence == newest + 1 else "after a gap"
 
     def is_accepting(self, host: Host) -> bool:
         """Return True if a host is under all its limits and has asked for work."""
