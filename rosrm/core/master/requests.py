@@ -47,19 +47,21 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     fault = _submission_fault(state, event)
     if fault:
         raise RequestRefused(fault)
-    live = (one.spec for one in state.processes.values() if not one.phase.is_terminal)
-    shared = shared_nodes(event.specs, live)
-    for spec in event.specs:
-        process = Process(
-            spec, state.next_order, ProcessPhase.QUEUED, now, wall=state.wall,
-            born=state.next_instance,
-        )  # fmt: skip
+    wall, born, first = state.wall, state.next_instance, state.next_order
+    processes = [
+        Process(spec, order, ProcessPhase.QUEUED, now, wall=wall, born=born)
+        for order, spec in enumerate(event.specs, first)
+    ]
+    nodes = {process.node for process in processes}
+    users = [one for one in state.processes.values() if one.node in nodes]
+    live = [one for one in users if not one.phase.is_terminal]
+    shared = shared_nodes((one.name, one.node) for one in [*processes, *live])
+    for process in processes:
         state.next_order += 1
         state.add_process(process)
         state.enqueue(process, now)
-        state.record(
-            now, EventKind.SUBMITTED, f"{spec.name} was submitted", process=spec.name, by=event.by
-        )
+        message = f"{process.name} was submitted"
+        state.record(now, EventKind.SUBMITTED, message, process=process.name, by=event.by)
         state.save(process)
     warnings = "".join(f". Warning: {one}" for one in shared)
     state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))

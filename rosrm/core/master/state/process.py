@@ -8,6 +8,7 @@ from enum import Enum
 from math import inf
 from typing import Any, Final
 
+from rosrm.core.master.graph_names import node_of
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
@@ -175,6 +176,7 @@ class Process:
         standby_tries: standbys that were lost, one after the other.
         standby_reason: condition of its standby, for listings.
         demand: its demand, with the version of the learned needs in it.
+        node: the node that it adds to the ROS graph, as `node_of` returns it.
     """
 
     spec: ProcessSpec
@@ -204,9 +206,10 @@ class Process:
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     demand: tuple[int, Demand] | None = None
     plain: Plain = field(init=False)
+    node: str = field(init=False)
 
     def __post_init__(self) -> None:
-        self.plain = Plain(self.spec)
+        self.plain, self.node = Plain(self.spec), node_of(self.spec)
 
     @property
     def name(self) -> str:
