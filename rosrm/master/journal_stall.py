@@ -19,18 +19,6 @@ from rosrm.core.master.recovery.journal_stall import note_readings
 
 #: Most status batches kept for later; slaves are asked again for the rest.
 _MOST_STATUSES: Final = 10_000
-#: Requests that are refused.
-_REFUSED: Final = (
-    happened.HostRegistered,
-    happened.SubmissionReceived,
-    happened.CancelRequested,
-    happened.RestartRequested,
-    happened.MigrationRequested,
-    happened.CheckpointRequested,
-    happened.RestoreRequested,
-    happened.HostStateRequested,
-    happened.PruneRequested,
-)
 #: Events that are dropped, because they recur.
 _DROPPED: Final = (happened.TimePassed, happened.UsagesReceived, happened.PeerRefused)
 
@@ -63,7 +51,7 @@ class JournalStall:
         for event in events:
             if isinstance(event, happened.ReadingsReceived):
                 note_readings(state, event, self.core_now)
-            elif isinstance(event, _REFUSED):
+            elif isinstance(event, happened.HostRegistered | happened.ClientRequest):
                 reply(Reply(event.request, False, "journal", self.refusal))
             elif isinstance(event, happened.ProcessRequested | happened.KeptStatesReceived):
                 self._newest[type(event), event.host_id] = event  # replaces older ones

@@ -11,7 +11,7 @@ import time
 import pytest
 from std_msgs.msg import Int64, String
 
-from rosrm.core.slave.watches import Watch
+from rosrm.core.slave.watches import NoState, Watch
 from rosrm.model.values import Health, MigrationPolicy, RestartPolicy
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.health import HealthMonitor
@@ -314,5 +314,5 @@ def test_a_name_that_is_none_harms_nobody(stage) -> None:
     heard, trouble = ear.topic((1,), time.monotonic())
     assert heard is None
     assert "cannot be listened to" in trouble
-    assert ear.state(time.monotonic() + 60.0) == ""
+    assert ear.state(time.monotonic() + 60.0) is NoState.NO_ANSWER
     ear.close()

@@ -119,7 +119,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     from rosrm.config.host import load_host
     from rosrm.config.kinds import kind_of
     from rosrm.config.work import load_work
-    from rosrm.core.master.graph_names import shared_nodes
+    from rosrm.core.master.graph_names import node_of, shared_nodes
 
     root = read(file)
     match kind.value if kind else kind_of(root):
@@ -142,7 +142,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             for warning in _misspelt_needs(root, registry):  # also for a wrong file
                 typer.echo(warning, err=True)
             specs = load_work(file, registry)
-            for warning in shared_nodes(specs):
+            for warning in shared_nodes((spec.name, node_of(spec)) for spec in specs):
                 typer.echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)
             numbers = ((jobs, "job"), (len(specs) - jobs, "service"))

@@ -7,6 +7,7 @@ anything else of that batch: intent is durable before it is acted on.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from rosrm.extensions.contracts import Intent, Record
 from rosrm.model.orders import Order, StartInstance, StopInstance
@@ -16,6 +17,8 @@ from rosrm.model.values import Assignment, InstanceId
 #: Id of an order, unique within one run of the master: its number, or its series and number
 #: (`PendingOrders`).
 OrderId = int | tuple[str, int]
+#: Code of a refused request.
+RefusalCode = Literal["invalid", "journal", "name_taken", "unknown"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +92,11 @@ class PublishStateConfig:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Answer a request that came with an event."""
+    """Answer a request that came with an event; `code` is that of a refusal."""
 
     request: int
     accepted: bool = True
-    code: str = ""
+    code: Literal[RefusalCode, ""] = ""
     message: str = ""
     host_id: int = 0
     host: str = ""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -25,8 +26,21 @@ from rosrm.model.values import (
     SnapshotReport,
 )
 
-#: Code of an answer to an order.
-BAD_RESULT: Final = "bad_result"
+
+class OrderOutcome(Enum):
+    """Outcome of an order by its answer."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    BAD_RESULT = "bad_result"
+    TIMEOUT = "timeout"
+
+
+#: Code of the answer of an executor that ran to its end, but returned no JSON object.
+BAD_RESULT: Final = OrderOutcome.BAD_RESULT.value
+
+#: The outcomes that the code of an answer tells apart; every other code is a refusal.
+_BY_CODE: Final = {one.value: one for one in (OrderOutcome.BAD_RESULT, OrderOutcome.TIMEOUT)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,9 +235,10 @@ class PruneRequested:
 
 @dataclass(frozen=True, slots=True)
 class OrderAnswered:
-    """A slave answered a `SendOrder`, or did not in time (code "timeout").
+    """A slave answered a `SendOrder`, or did not in time.
 
-    The code `BAD_RESULT`: an executor ran to its end, but answered no JSON object.
+    Attributes:
+        code: of a refusal, as the slave sent it, or the value of an `OrderOutcome`.
     """
 
     order: OrderId
@@ -231,6 +246,23 @@ class OrderAnswered:
     code: str = ""
     message: str = ""
     result: Mapping[str, Any] | None = None
+
+    @classmethod
+    def missing(cls, order: OrderId, why: str = "no answer in time") -> OrderAnswered:
+        """Return the event for an order without an answer."""
+        return cls(order, False, OrderOutcome.TIMEOUT.value, why)
+
+    @property
+    def outcome(self) -> OrderOutcome:
+        """Return the outcome of the order."""
+        if self.accepted:
+            return OrderOutcome.ACCEPTED
+        return _BY_CODE.get(self.code, OrderOutcome.REFUSED)
+
+    @property
+    def reason(self) -> str:
+        """Return why the order was not accepted, in words where the slave gave any."""
+        return self.message or self.code
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,15 +304,8 @@ class TimePassed:
     """Time passed without another event; deadlines are checked."""
 
 
-Event = (
-    HostRegistered
-    | HostLeft
-    | ProcessRequested
-    | ReadingsReceived
-    | StatusesReceived
-    | UsagesReceived
-    | KeptStatesReceived
-    | SubmissionReceived
+ClientRequest = (
+    SubmissionReceived
     | CancelRequested
     | RestartRequested
     | MigrationRequested
@@ -288,6 +313,15 @@ Event = (
     | RestoreRequested
     | HostStateRequested
     | PruneRequested
+)
+#: Events that are answered by a `Reply`.
+Request = HostRegistered | HostLeft | ProcessRequested | ClientRequest
+Event = (
+    Request
+    | ReadingsReceived
+    | StatusesReceived
+    | UsagesReceived
+    | KeptStatesReceived
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Final
 
 from rosrm.model.values import ProcessSpec
@@ -11,20 +11,15 @@ from rosrm.wording import listed
 _RUN: Final = ("ros2", "run")
 
 
-def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = ()) -> list[str]:
+def shared_nodes(processes: Iterable[tuple[str, str]]) -> list[str]:
     """Return a sentence for each node name that several processes put into the ROS graph.
 
-    Args:
-        specs: processes to be submitted; each sentence is about at least one of them.
-        others: live processes.
+    `processes`: the name of each, with its node as `node_of` returns it.
     """
     users: dict[str, list[str]] = {}
-    for spec in specs:
-        if node := _node_of(spec):
-            users.setdefault(node, []).append(spec.name)
-    for spec in others if users else ():
-        if (node := _node_of(spec)) in users:
-            users[node].append(spec.name)
+    for name, node in processes:
+        if node:
+            users.setdefault(node, []).append(name)
     return [
         f"{listed(names)} put {node} into the ROS graph; give each node a name of its own"
         for node, names in users.items()
@@ -32,8 +27,8 @@ def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = (
     ]
 
 
-def _node_of(spec: ProcessSpec) -> str:
-    """Return the node that a process adds to the graph; "" if its spec does not tell.
+def node_of(spec: ProcessSpec) -> str:
+    """Return the node that a process adds to the graph, in words; "" if its spec does not tell.
 
     rosrm appends its name rule to the arguments of the user, and the first rule counts.
     """

@@ -10,22 +10,17 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
 from rosrm.core.master.assignment.reservations import learn_from
 from rosrm.core.master.hosts import readoption
-from rosrm.core.master.master_state import (
-    WAITING,
-    DesiredState,
-    Instance,
-    MasterState,
-    Process,
-    ProcessPhase,
-)
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover
 from rosrm.core.master.plugin_failures import note_on_host
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.learned_needs import NO_NEEDS
 from rosrm.core.master.state.migration import End, Migration
+from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import FenceInstance, Order, ReportInstances, StopInstance
 from rosrm.model.plan import Start
-from rosrm.model.values import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind, RestartPolicy
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, Kind, RestartPolicy
 from rosrm.wording import standing
 
 #: Phase of a process by the state of its owning instance.
@@ -55,12 +50,12 @@ _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, Instan
 
 
 def statuses_received(state: MasterState, event: happened.StatusesReceived, now: float) -> None:
-    """Apply the status reports of a slave in order; late ones are known already."""
+    """Apply the status reports of a slave in order; drop late ones, which are known already."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None or state.hosts.condition_of(host) is HostCondition.DETACHED:
-        return  # the last message of a slave that leaves processes running has all that it holds
-    is_next = state.hosts.note_statuses(host, event.sequence, now)
-    if is_next is None:
+        return  # the slave's last message had all instances that it left running
+    place = state.hosts.note_statuses(host, event.sequence, now)
+    if place == "late":
         return
     note_on_host(state, host, event.failing_plugins(), now)
     if event.complete:
@@ -68,10 +63,10 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
         state.hosts.set_report_due(host, report_due=False)
         reconcile(state, host, event.statuses, now)
         return
-    if not is_next:
+    if place == "after a gap":
         state.send(host, ReportInstances())
     for status in event.statuses:
-        take_status(state, host, status, now)
+        _take_status(state, host, status, now)
 
 
 def reconcile(
@@ -86,8 +81,8 @@ def reconcile(
     held = {status.instance: status for status in statuses}
     state.skip_numbers(max((one.number for one in held), default=0))
     for status in held.values():
-        take_status(state, host, status, now)
-    for instance in [state.instances[number] for number in sorted(host.instances)]:
+        _take_status(state, host, status, now)
+    for instance in state.instances_of(host):
         if instance.id in held:
             continue
         if instance.state is None and (not registering or _yet_to_start(state, instance)):
@@ -104,7 +99,7 @@ def _yet_to_start(state: MasterState, instance: Instance) -> bool:
     )
 
 
-def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
+def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
     """Apply the status of one instance."""
     instance = state.instances.get(status.instance.number)
     if instance is None or instance.host is not host or instance.id != status.instance:
@@ -127,7 +122,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     if process is None:
         return
     if process.restarts != status.restarts:
-        process.phase_before_loss = None  # a new run began while its host was silent
+        process.phase_before_loss = None  # it was restarted while its host was silent
     process.restarts = status.restarts
     if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_instance(state, instance, now)
@@ -143,7 +138,7 @@ def _follow(
 ) -> None:  # fmt: skip
     """Set the phase of a process by the status of its owning instance."""
     before = process.phase
-    phase = phase_of(process, instance)
+    phase = _phase_of(process, instance)
     state.set_phase(process, phase, now, status.message)
     if phase is not before:
         # A job has no ready state: it runs to its end.
@@ -160,7 +155,7 @@ def _follow(
             state.save(process)
 
 
-def phase_of(process: Process, owner: Instance) -> ProcessPhase:
+def _phase_of(process: Process, owner: Instance) -> ProcessPhase:
     """Return the phase of a process by the state of the instance that owns its name."""
     if process.wanted is not DesiredState.RUN:
         return ProcessPhase.STOPPING
@@ -175,7 +170,7 @@ def _handle_unknown_instance(
     The master tracks it until it has ended: it repeats the order to stop, and starts no successor.
     """
     if readoption.readopt(state, host, status, now):
-        take_status(state, host, status, now)
+        _take_status(state, host, status, now)
         return
     if status.state.ended:
         return
@@ -201,14 +196,13 @@ def _handle_unknown_instance(
 
 def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
     """Track an instance that is only to end; the readings show its usage, so none is reserved."""
-    nothing = state.hosts.fractions_of(host, EMPTY)
-    adopted = state.reserve(instance, host, now, EMPTY, frozenset(), nothing)
+    adopted = state.add_instance(instance, host, now, NO_NEEDS)
     adopted.stopping = True
     return adopted
 
 
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
-    """Order an instance to stop for good; the order is repeated until it has ended."""
+    """Order an instance to stop for good; `tick` repeats the order until it has ended."""
     instance.stopping = True
     order: Order = FenceInstance(instance.id) if instance.at_once else StopInstance(instance.id)
     state.send(instance.host, order)
@@ -229,13 +223,10 @@ def _ended(
     learn_from(state, process.spec, instance, status)
     learn_run_time(state, process.spec, status)
     end = _end(process, instance, status, before)
-    _note_end_of_standby(state, instance, end)
-    migration = state.migrations.get(process.name)
-    if migration is not None:
-        migration.ended[instance.id.number] = end
-        state.save_migration(migration)
-        if status.state is InstanceState.REFUSED and not _recalled(migration, instance):
-            exclude(process, instance.host, status)
+    migration = _note_end(state, instance, end)
+    refused = status.state is InstanceState.REFUSED
+    if migration is not None and refused and not _recalled(migration, instance):
+        exclude(process, instance.host, status)
     if process.owner != instance.id.number:
         state.record(
             now, EventKind.INSTANCE_ENDED, f"{instance.id} ended on {instance.host.name}"
@@ -260,15 +251,27 @@ def _end(
         process.spec.kind is Kind.JOB
         and status.succeeded
         and before is not InstanceState.STOPPING
-        and status.run_time > 0.0  # else it was stopped before it was started
+        and status.run_time > 0.0  # otherwise it was stopped before it was started
     )  # fmt: skip
-    ordered_to_end = (
-        instance.stopping or instance.recalled or process.wanted is DesiredState.REQUEUE
+    ordered = (
+        instance.stopping
+        or instance.recalled
+        or process.wanted is DesiredState.REQUEUE
+        or status.state is InstanceState.WITHDRAWN  # the slave stopped it without an order
     )
-    ordered_to_end = (
-        ordered_to_end or status.state is InstanceState.WITHDRAWN
-    )  # the slave stopped it, no order did
-    return End(status, ordered=ordered_to_end and not completed, completed=completed)
+    return End(status, ordered=ordered and not completed, completed=completed)
+
+
+def _note_end(state: MasterState, instance: Instance, end: End) -> Migration | None:
+    """Note an end in the migration of the process, which is returned, or in that of its standby."""
+    name, number = instance.id.process, instance.id.number
+    standby, migration = state.standbys.get(name), state.migrations.get(name)
+    if standby is not None and standby.destination == instance.id:
+        standby.ended[number] = end
+    if migration is not None:
+        migration.ended[number] = end
+        state.save_migration(migration)
+    return migration
 
 
 def conclude(state: MasterState, process: Process, end: End, host: Host, now: float) -> None:
@@ -334,9 +337,8 @@ def _finish(
 def _requeue(state: MasterState, process: Process, host: Host, now: float, reason: str) -> None:
     """Return a process to its place in the queue once no other instance of it may be active."""
     state.record(
-        now, EventKind.QUEUED,
-        f"{process.name} returns to the queue: {reason}", process=process.name,
-        host=host.name,
+        now, EventKind.QUEUED, f"{process.name} returns to the queue: {reason}",
+        process=process.name, host=host.name,
     )  # fmt: skip
     process.wanted = DesiredState.REQUEUE
     for instance in state.instances_of(process):
@@ -362,12 +364,9 @@ def note_awaited_ends(state: MasterState, process: Process, now: float) -> None:
 
 def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
     """Queue or cancel a process as desired, unless an instance of it may still run."""
-    if (
-        process.owner
-        or process.instances
-        or process.name in state.migrations
-        or process.phase.is_terminal
-    ):
+    if process.owner or process.instances or process.phase.is_terminal:
+        return False
+    if process.name in state.migrations:
         return False
     if process.wanted is DesiredState.CANCEL:
         state.set_phase(process, ProcessPhase.CANCELLED, now)
@@ -380,12 +379,6 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
     return True
 
 
-def _note_end_of_standby(state: MasterState, instance: Instance, end: End) -> None:
-    standby = state.standbys.get(instance.id.process)
-    if standby is not None and standby.destination == instance.id:
-        standby.ended[instance.id.number] = end
-
-
 def gone(
     state: MasterState, instance: Instance, now: float, reason: str, *, comes_again: bool = True
 ) -> None:
@@ -396,12 +389,9 @@ def gone(
         return
     status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
     end = End(status, gone=comes_again)
-    _note_end_of_standby(state, instance, end)
-    migration = state.migrations.get(process.name)
-    if migration is not None:
-        migration.ended[instance.id.number] = end
-        state.save_migration(migration)
-    elif process.owner == instance.id.number:
+    if _note_end(state, instance, end) is not None:
+        return  # the current plan handles this end
+    if process.owner == instance.id.number:
         conclude(state, process, end, instance.host, now)
     else:
         requeue_if_clear(state, process, now)
@@ -431,7 +421,7 @@ def note_phase(state: MasterState, process: Process, owner: Instance, now: float
         reason = f"{host.name} {unreachable}{_what_follows(process) if lost else ''}"
         state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
     else:
-        state.set_phase(process, phase_of(process, owner), now)
+        state.set_phase(process, _phase_of(process, owner), now)
 
 
 def _what_follows(process: Process) -> str:

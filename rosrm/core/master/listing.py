@@ -8,15 +8,10 @@ from typing import Any, Final
 from rosrm.core.master.assignment.assign import decide_now
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
-from rosrm.core.master.master_state import (
-    DesiredState,
-    Instance,
-    MasterState,
-    Process,
-    ProcessPhase,
-)
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy
 
@@ -29,7 +24,7 @@ _CONDITION: Final = {
     HostCondition.DETACHED: "detached",
 }
 #: Conditions in which a host reports: one that leaves reports until its instances have ended.
-_HEARD: Final = (HostCondition.UP, HostCondition.LEFT)
+_REPORTING: Final = (HostCondition.UP, HostCondition.LEFT)
 _OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
 #: Phases that a slave observes: while its host is silent they are unknown.
 _OBSERVED: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF)
@@ -74,14 +69,12 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     seen = owner.seen if owner else {}
     silence = _silence(state, owner, now)
     phase = process.phase.value
-    reason = reason_of(state, process) or _of_standby(process) or _awaited_node(process, owner)
+    standby = process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
+    reason = reason_of(state, process) or standby or _awaited_node(process, owner)
     if silence and process.phase in _OBSERVED:
         phase, reason = "unknown", f"{silence}; last known: {phase}"
-    if (
-        owner is not None
-        and process.wanted is DesiredState.CANCEL
-        and process.name not in state.migrations
-    ):
+    cancelled = process.wanted is DesiredState.CANCEL and process.name not in state.migrations
+    if owner is not None and cancelled:
         reason += _awaited(state, owner.host, now)
     elif owner is not None and process.phase is ProcessPhase.STOPPING:
         reason = _stopped_by_slave(state, owner, process.spec.stop, reason)
@@ -97,8 +90,8 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
 
 
 def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
-    """Return why readings of an instance are old; "" where its host reports."""
-    if owner is None or state.hosts.condition_of(owner.host) in _HEARD:
+    """Return why readings of an instance are old; "" if its host reports."""
+    if owner is None or state.hosts.condition_of(owner.host) in _REPORTING:
         return ""
     age = now - float(state.hosts.last_contact[owner.host.column])
     return f"{owner.host.name} has been silent for {age:.0f} s"
@@ -129,10 +122,6 @@ def _host_of(process: Process, owner: Instance | None) -> str:
     return process.image.host if process.image is not None else process.ended_on
 
 
-def _of_standby(process: Process) -> str:
-    return process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
-
-
 def _awaited_node(process: Process, owner: Instance | None) -> str:
     """Return the node that a running process must show to be ready; "" for none."""
     if owner is None or process.phase is not ProcessPhase.STARTING:
@@ -151,15 +140,14 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         return None
     row = process_row(state, process, now)
     decision, age = process.decision, now - process.decided_at
-    if process.phase in (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE):
-        now_decided = decide_now(state, process)
-        now_decided.kind = "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
-        decision, age = now_decided, 0.0
+    if process.phase in WAITING:
+        current = decide_now(state, process)
+        current.kind = "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
+        decision, age = current, 0.0
+    reasons = (_reason(state, process, row), _advice(state, process))
     return {
         "process": name, "state": row.state, "host": row.host,
-        "reason": "; ".join(
-            filter(None, (_reason(state, process, row), _advice(state, process)))
-        ),
+        "reason": "; ".join(filter(None, reasons)),
         "decision": None if decision is None else {**decision, "elapsed": age},
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 from math import inf
 from operator import attrgetter
@@ -15,12 +15,12 @@ from rosrm.core.master.hosts.fencing import fence_of
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.master.state.capabilities import HostCapabilities
+from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
-from rosrm.core.master.state.learned_needs import LearnedNeeds
+from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.migration import Migration, migration_to_dict
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
@@ -42,25 +42,12 @@ _HISTORY: Final = 12
 _RESERVED: Final = 1000
 #: Phases between the rejoin of a host and its report of its instances.
 _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
-#: Phases of processes that wait for a host.
-WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 #: Most removed processes of which replicas are still dropped.
 _MOST_REMOVED: Final = 10_000
 #: Faster than `fields_to_plain`, because a process is saved in the turn of its decision.
 _journaled_of: Final = attrgetter(*JOURNALED)
 #: No instance gets a number as large as this.
 _LARGEST: Final = 2**53
-
-__all__ = [
-    "WAITING",
-    "DesiredState",
-    "Instance",
-    "MasterState",
-    "Migration",
-    "Process",
-    "ProcessPhase",
-    "larger",
-]
 
 
 @dataclass(slots=True)
@@ -88,11 +75,12 @@ class MasterState:
     Attributes:
         declared: declarations in the offers of the selected plugins.
         terminal: names of the terminal processes, in the order in which they ended.
-        standbys: process name to the handoff whose destination is its standby.
+        standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for one and are not terminal.
         held_since: time since when placement waits for first requests for work; inf: it does not.
         contact_since: time since when at least one host reports; inf: none does.
-        journal_gap: the journal gap, if there is one.
+        unowned_instances: name to the instances of it that may still run, without a process.
+        capability_answers: by strategy and host, for strategies that do not work on every host.
         plugins: guards every call of a plugin.
     """
 
@@ -132,7 +120,7 @@ class MasterState:
         self.placed_at: tuple[int, ...] = ()
         self.plugins = PluginCalls()
         self.replication = ReplicationState()
-        self.host_capabilities = HostCapabilities()
+        self.capability_answers: dict[tuple[str, str], Answer] = {}
         self.images = Images()
         self.pending_orders = PendingOrders()
         self.periodic = Periodic()
@@ -144,7 +132,7 @@ class MasterState:
         self.held_since = inf
         self.journal_gap = JournalGap()
         self.missing_since: dict[int, float] = {}
-        self.reviewed = float("-inf")
+        self.reviewed = -inf
         self.demands: dict[Any, Demand] = {}
         self._out: list[Command] = []
         self._unsaved: dict[str, Process] = {}
@@ -171,7 +159,7 @@ class MasterState:
         self, now: float, kind: EventKind, message: str, *, process: str = "", host: str = "",
         facts: Mapping[str, Any] = EMPTY, by: str = "",
     ) -> None:  # fmt: skip
-        """Write a line of the event record; `by` is the client that asked for it."""
+        """Write a line of the event record; `by` is the client that requested it."""
         if by:
             message, facts = f"{message} (by {by})", {**facts, "by": by}
         message = one_line(message)
@@ -189,6 +177,7 @@ class MasterState:
     def _intent_of(self, process: Process) -> Intent:
         owner, left = self.instances.get(process.owner), process.left_behind
         phase, _, began = process.phase_before_loss or (process.phase, 0.0, process.wall)
+        standby = self.standbys.get(process.name)
         held = {str(number): self.instances[number].host.name for number in process.instances}
         aliases = {
             str(number): alias
@@ -200,17 +189,13 @@ class MasterState:
             {
                 "spec": process.plain, "phase": phase.value, "since": began,
                 "host": owner.host.name if owner else process.ended_on, "instances": held,
-                "node_names": aliases, "standby": self._standby_of(process),
+                "node_names": aliases, "standby": standby and migration_to_dict(standby, ()),
                 "left_behind": left and astuple(left),
                 "image": process.image and to_plain(process.image),
                 **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
                 "excluded": dict(process.excluded),
             },
         )  # fmt: skip
-
-    def _standby_of(self, process: Process) -> Mapping[str, Any] | None:
-        migration = self.standbys.get(process.name)
-        return None if migration is None else migration_to_dict(migration, ())
 
     def save_migration(self, migration: Migration) -> None:
         """Persist the progress of a migration, as it stands after the current event."""
@@ -273,7 +258,7 @@ class MasterState:
         self._update_terminal(process)
 
     def _update_terminal(self, process: Process) -> None:
-        """Update `over`, which stays in the order in which processes ended."""
+        """Update `terminal`, which stays in the order in which processes ended."""
         if not process.phase.is_terminal:
             self.terminal.pop(process.name, None)
             if process.spec.standby.wanted:
@@ -283,7 +268,7 @@ class MasterState:
             self.wants_standby.discard(process.name)
 
     def collect_garbage(self) -> None:
-        """Forget ended processes beyond the newest `keep_ended` that cannot run any more."""
+        """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
         excess = len(self.terminal) - self.settings.keep_ended
         if excess <= 0:
             return
@@ -292,11 +277,11 @@ class MasterState:
             self.remove_process(name)
 
     def is_gone(self, process: Process) -> bool:
-        """Return True if no instance of an ended process may run and no standby is known."""
+        """Return True if no instance of a terminal process may run, and no standby."""
         return not process.instances and process.name not in self.standbys
 
     def remove_process(self, name: str) -> None:
-        """Remove an ended process of which no instance may run from memory and journal."""
+        """Remove a terminal process from memory and journal; none of its instances may run."""
         del self.terminal[name]
         if self.declared.has_snapshots(self.processes.pop(name).spec):
             self._note_removed(name)
@@ -315,7 +300,7 @@ class MasterState:
             self.emit(Intent("removed", oldest, None))
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
-        """Queue a process at its place in the line."""
+        """Queue a process at its place."""
         process.owner, process.ended_on = 0, ""
         process.wanted = DesiredState.RUN
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
@@ -327,9 +312,14 @@ class MasterState:
             self.queue.remove(process.name)
         self.set_aside.discard(process.name)
 
-    def instances_of(self, process: Process) -> Iterable[Instance]:
-        """Return every instance of a process that may still run."""
-        return [self.instances[number] for number in sorted(process.instances)]
+    def instances_of(self, owner: Process | Host) -> list[Instance]:
+        """Return every instance of a process, or on a host, that may still run."""
+        return [self.instances[number] for number in sorted(owner.instances)]
+
+    def images_on(self, host: Host) -> list[str]:
+        """Return the names of the checkpointed processes whose image is on a host."""
+        images = ((name, self.processes[name].image) for name in sorted(self.images.of))
+        return [name for name, image in images if image is not None and image.host == host.name]
 
     def owned_by(self, instance: Instance) -> Process | None:
         """Return the process whose name this instance owns; None: it is not the owner."""
@@ -358,46 +348,38 @@ class MasterState:
             self.next_instance = seen + _RESERVED
             self._reserve_numbers()  # the slave may never report it again
 
-    def add_instance(
-        self, instance: InstanceId, spec: ProcessSpec, host: Host, now: float
-    ) -> Instance:
-        """Add an instance of a spec, with a reservation on its host."""
-        estimate = self.learned.estimate(spec, self.settings.default_needs)
-        need = self.hosts.fractions_of(host, estimate.amounts, estimate.estimated)
-        return self.reserve(instance, host, now, estimate.amounts, estimate.estimated, need)
+    def estimate(self, spec: ProcessSpec) -> Estimate:
+        """Return the needs of one instance of a spec."""
+        return self.learned.estimate(spec, self.settings.default_needs)
 
     def _numbers_of(self, name: str) -> set[int]:
-        """Return the set of instance numbers of a name, known or not."""
+        """Return the set of instance numbers of a name, with a process or without one."""
         process = self.processes.get(name)
-        return (
-            self.unowned_instances.setdefault(name, set()) if process is None else process.instances
-        )
+        if process is not None:
+            return process.instances
+        return self.unowned_instances.setdefault(name, set())
 
-    def reserve(
-        self, instance: InstanceId, host: Host, now: float, amounts: Mapping[str, float],
-        estimated: frozenset[str], need: FloatArray,
+    def add_instance(
+        self, instance: InstanceId, host: Host, now: float, needs: Estimate | Demand,
+        fractions: FloatArray | None = None,
     ) -> Instance:  # fmt: skip
-        """Add an instance, with a reservation on its host.
+        """Add an instance, and reserve its needs on its host.
 
-        `need`, (R,), is `amounts` as fractions of the host's capacity.
+        `fractions`, (R,): the needs as shares of the host's capacity, where they are known already.
         """
-        reserved = need.copy()
-        reserved[reserved == np.inf] = 0.0
-        added = Instance(instance, host, now, amounts, estimated, reserved)
+        if fractions is None:
+            fractions = self.hosts.fractions_of(host, needs.amounts, needs.estimated)
+        reserved = np.where(fractions < np.inf, fractions, 0.0)
+        added = Instance(instance, host, now, needs.amounts, needs.estimated, reserved)
         self.instances[instance.number] = added
         host.instances.add(instance.number)
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
         return added
 
-    def reserve_ranked(
-        self, instance: InstanceId, host: Host, now: float, ranking: Ranking
-    ) -> Instance:
-        """Add an instance with the reservation of the ranking that chose the host."""
-        demand = ranking.demand
-        return self.reserve(
-            instance, host, now, demand.amounts, demand.estimated, ranking.need[:, host.column]
-        )
+    def reserve(self, instance: InstanceId, host: Host, now: float, ranking: Ranking) -> None:
+        """Add an instance on the host that a ranking has chosen."""
+        self.add_instance(instance, host, now, ranking.demand, ranking.need[:, host.column])
 
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""
@@ -413,12 +395,12 @@ class MasterState:
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
         shadow: bool = False, restored: bool = False,
     ) -> Assignment:  # fmt: skip
-        """Return the assignment by which a slave runs an instance."""
+        """Return the assignment by which a slave runs an instance of a known process."""
         fence = fence_of(spec, self.settings)
         kept_on: tuple[str, ...] = ()
         kept_from = 0
         if self.declared.has_snapshots(spec):
-            first_instance = self.processes[spec.name].born if spec.name in self.processes else 0
+            first_instance = self.processes[spec.name].born
             kept_from = max(1, first_instance)  # 0 says that there are no snapshots
             if not shadow and not restored:
                 kept_on = self.replication.in_reach(spec.name, first_instance, self.hosts)
@@ -430,15 +412,6 @@ class MasterState:
     def note_decision(
         self, process: Process, decision: Decision, kind: DecisionKind, now: float
     ) -> None:
-        """Remember the newest decision about a process, for `explain`."""
+        """Note the newest decision about a process, for `explain`."""
         decision.kind = kind
-        process.decision = decision
-        process.decided_at = now
-
-
-def larger(first: Mapping[str, float], second: Mapping[str, float]) -> Mapping[str, float]:
-    """Return the larger amount of each resource."""
-    if not second:
-        return first
-    names = {**first, **second}
-    return {name: max(first.get(name, 0.0), second.get(name, 0.0)) for name in names}
+        process.decision, process.decided_at = decision, now

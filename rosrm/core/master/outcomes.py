@@ -1,9 +1,11 @@
-"""Outcomes of the steps of a plan, and of requests that may be turned down."""
+"""Outcomes of the steps of a plan, and of requests that may be refused."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+
+from rosrm.core.master.commands import RefusalCode
 
 
 class StepProgress(Enum):
@@ -36,10 +38,18 @@ def done_if(condition: bool) -> StepProgress:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A plan, a destination or a setting that was asked for is not available.
+    """A requested plan, destination or setting is not available.
 
     Attributes:
         reason: a sentence.
     """
 
     reason: str
+
+
+class RequestRefused(Exception):
+    """A client's request is refused, and nothing has changed; the message goes to the client."""
+
+    def __init__(self, message: str, code: RefusalCode = "invalid") -> None:
+        super().__init__(message)
+        self.code = code

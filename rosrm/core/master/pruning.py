@@ -8,9 +8,11 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.hosts.liveness import lease_of
-from rosrm.core.master.master_state import DesiredState, MasterState, Process, ProcessPhase
-from rosrm.core.master.requests import count, known_host, known_processes, refuse
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.outcomes import RequestRefused
+from rosrm.core.master.requests import count, known_host, known_processes
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
 from rosrm.model.event_kinds import EventKind
 from rosrm.wording import counted, listed
@@ -21,10 +23,7 @@ _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
 def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
     """Remove the named processes and hosts, or all that ended or left; all of them, or none."""
     if event.names or event.hosts:
-        found = _named(state, event, now)
-        if found is None:
-            return
-        processes, hosts = found
+        processes, hosts = _named(state, event, now)
     else:
         ended = [state.processes[name] for name in state.terminal]
         processes = [process for process in ended if not _why_not_pruned(state, process)]
@@ -47,23 +46,14 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
 
 def _named(
     state: MasterState, event: happened.PruneRequested, now: float
-) -> tuple[list[Process], list[Host]] | None:
-    """Return the processes and hosts that a request names; None: it was refused."""
-    processes = known_processes(state, event.request, event.names)
-    if processes is None:
-        return None
-    hosts = []
-    for name in dict.fromkeys(event.hosts):
-        host = known_host(state, event.request, name)
-        if host is None:
-            return None
-        hosts.append(host)
+) -> tuple[list[Process], list[Host]]:
+    """Return the processes and hosts that a request names; refuse it if one cannot be removed."""
+    processes = known_processes(state, event.names)
+    hosts = [known_host(state, name) for name in dict.fromkeys(event.hosts)]
     faults = [_why_not_pruned(state, process) for process in processes]
     faults += [_why_not_pruned_host(state, host, now) for host in hosts]
-    for fault in faults:
-        if fault:
-            refuse(state, event.request, f"{fault}. Nothing was removed")
-            return None
+    for fault in filter(None, faults):
+        raise RequestRefused(f"{fault}. Nothing was removed")
     return processes, hosts
 
 
@@ -89,7 +79,7 @@ def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:
             f"again. Stop its slave if it runs; a host can be pruned once it has left or is lost, "
             f"which is after {lease_of(state, host):g} s of silence"
         )
-    held = [state.instances[number] for number in sorted(host.instances)]
+    held = state.instances_of(host)
     owned = [one.id.process for one in held if (process := state.owned_by(one)) is not None
              and process.wanted is not DesiredState.CANCEL]  # fmt: skip
     if owned and condition is HostCondition.LEFT:
@@ -101,10 +91,8 @@ def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:
     for instance in held:
         if instance.id.process in state.migrations:
             return f"{instance.id.process} is moving from or to {host.name}"
-    for name in state.images.of:
-        image = state.processes[name].image
-        if image is not None and image.host == host.name:
-            return f"the image of {name} is on {host.name}; cancel {name} first"
+    for name in state.images_on(host):
+        return f"the image of {name} is on {host.name}; cancel {name} first"
     return ""
 
 
@@ -115,11 +103,11 @@ def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
         the processes that may still run there, and the command that stops them; "" if none may.
     """
     ends_all = state.hosts.condition_of(host) is HostCondition.LEFT
-    held = [] if ends_all else [state.instances[number] for number in sorted(host.instances)]
     state.hosts.prune(host)
-    for number in sorted(host.instances):
-        lifecycle.gone(state, state.instances[number], now, f"{host.name} was pruned")
-    names = list(dict.fromkeys(instance.id.process for instance in held))
+    held = state.instances_of(host)
+    for instance in held:
+        lifecycle.gone(state, instance, now, f"{host.name} was pruned")
+    names = [] if ends_all else list(dict.fromkeys(instance.id.process for instance in held))
     for process in [state.processes[name] for name in names if name in state.processes]:
         if process.phase is ProcessPhase.CANCELLED:
             process.reason = f"it may still run on {host.name}, which was removed"

@@ -1,29 +1,29 @@
 """The master's reducer: (state, event, now) -> commands. Each kind of event is one row below.
 
 ======================  =========================================================================
-what happened           what the core does
+event                   action of the core
 ======================  =========================================================================
-HostRegistered          takes the host in, compares what it holds with what is intended
+HostRegistered          registers the host, reconciles its instances with the desired ones
 HostLeft                gives it no more work; its processes return to the queue as they end, or
-                        are out of reach where the slave left them running
-ProcessRequested        notes that the host asks; places what waits
-ReadingsReceived        notes readings; places what waits
+                        are out of reach if the slave left them running
+ProcessRequested        notes the open request of the host; places queued processes
+ReadingsReceived        stores readings; places queued processes
 StatusesReceived        moves processes through their phases; drives migrations
-UsagesReceived          lowers what is counted in flight by what now shows
-KeptStatesReceived      notes which states a host keeps
-SubmissionReceived      refuses or queues all of them; places
-CancelRequested         takes out of the queue, or stops
-RestartRequested        restarts where it runs, or queues anew what has ended
+UsagesReceived          lowers reservations by the usage that readings now show
+KeptStatesReceived      replaces the known snapshots and replicas of a host
+SubmissionReceived      refuses or queues all of them; places queued processes
+CancelRequested         removes processes from the queue, or stops them
+RestartRequested        restarts running processes in place, or queues ended ones again
 MigrationRequested      begins a migration
 CheckpointRequested     begins to dump a process into an image
 RestoreRequested        begins to restore a process from its image
 HostStateRequested      cordons, uncordons, drains
 PruneRequested          removes ended processes and departed hosts from the listings
-OrderAnswered           notes that a slave took an order or refused it
-HandoffReported         notes how far the nodes of a handoff are
+OrderAnswered           notes that a slave has accepted or refused an order
+HandoffReported         notes the reported phase of a handoff's source or destination
 AssignmentWithdrawn     queues the process again at its old place
-PeerRefused             records it
-TimePassed              looks at every deadline: silence, delivery, steps, hysteresis
+PeerRefused             records the refusal
+TimePassed              checks every deadline: silence, delivery, steps, hysteresis
 ======================  =========================================================================
 """
 
@@ -37,10 +37,11 @@ from rosrm.core.master import answers, lifecycle, plugin_failures, pruning, requ
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import place_waiting
 from rosrm.core.master.checkpoint import replication
-from rosrm.core.master.commands import Command
+from rosrm.core.master.commands import Command, Reply
 from rosrm.core.master.hosts import registration
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import executor, handoff
+from rosrm.core.master.outcomes import RequestRefused
 
 _Handler = Callable[[MasterState, Any, float], None]
 
@@ -82,7 +83,11 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
     Returns:
         Commands to carry out, in order; records and intents first become durable.
     """
-    HANDLERS[type(event)](state, event, now)
+    try:
+        HANDLERS[type(event)](state, event, now)
+    except RequestRefused as refusal:
+        assert isinstance(event, happened.Request)
+        state.emit(Reply(event.request, False, refusal.code, str(refusal)))
     executor.advance_all(state, now)
     place_waiting(state, now)
     plugin_failures.note(state, now)

@@ -13,11 +13,12 @@ from rosrm.core.master.checkpoint import image_requests, images, replication
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
-from rosrm.core.master.master_state import WAITING, DesiredState, MasterState, Process, ProcessPhase
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
 from rosrm.core.master.migration.start import why_busy
-from rosrm.core.master.outcomes import Rejected
+from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import no_standby
@@ -26,12 +27,6 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RestartInstance
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import counted, listed, no_such
-
-
-def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
-    """Refuse a request; nothing has changed."""
-    state.emit(Reply(request, False, code, message))
-
 
 #: Kind of the record of each action on a host.
 _HOST_EVENTS: Final = {
@@ -48,29 +43,25 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     """Queue all of the processes, or refuse all."""
     taken = _taken(state, event)
     if taken:
-        refuse(state, event.request, taken, "name_taken")
-        return
+        raise RequestRefused(taken, "name_taken")
     fault = _submission_fault(state, event)
     if fault:
-        refuse(state, event.request, fault)
-        return
-    live = (one.spec for one in state.processes.values() if not one.phase.is_terminal)
-    shared = shared_nodes(event.specs, live)
-    for spec in event.specs:
-        process = Process(
-            spec,
-            state.next_order,
-            ProcessPhase.QUEUED,
-            now,
-            wall=state.wall,
-            born=state.next_instance,
-        )
+        raise RequestRefused(fault)
+    wall, born, first = state.wall, state.next_instance, state.next_order
+    processes = [
+        Process(spec, order, ProcessPhase.QUEUED, now, wall=wall, born=born)
+        for order, spec in enumerate(event.specs, first)
+    ]
+    nodes = {process.node for process in processes}
+    users = [one for one in state.processes.values() if one.node in nodes]
+    live = [one for one in users if not one.phase.is_terminal]
+    shared = shared_nodes((one.name, one.node) for one in [*processes, *live])
+    for process in processes:
         state.next_order += 1
         state.add_process(process)
         state.enqueue(process, now)
-        state.record(
-            now, EventKind.SUBMITTED, f"{spec.name} was submitted", process=spec.name, by=event.by
-        )
+        message = f"{process.name} was submitted"
+        state.record(now, EventKind.SUBMITTED, message, process=process.name, by=event.by)
         state.save(process)
     warnings = "".join(f". Warning: {one}" for one in shared)
     state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
@@ -173,20 +164,17 @@ def count(number: int) -> str:
 # --- cancel, restart --------------------------------------------------------------------------
 
 
-def known_processes(state: MasterState, request: int, names: Iterable[str]) -> list[Process] | None:
-    """Return the processes of these names; an unknown name refuses the whole request."""
+def known_processes(state: MasterState, names: Iterable[str]) -> list[Process]:
+    """Return the processes of these names; refuse the request for an unknown name."""
     unknown = [name for name in names if name not in state.processes]
     if unknown:
-        refuse(state, request, no_such("process", unknown, reversed(state.processes)), "unknown")
-        return None
+        raise RequestRefused(no_such("process", unknown, reversed(state.processes)), "unknown")
     return [state.processes[name] for name in dict.fromkeys(names)]
 
 
 def cancel_requested(state: MasterState, event: happened.CancelRequested, now: float) -> None:
-    """Take processes out of the queue, or stop them."""
-    processes = known_processes(state, event.request, event.names)
-    if processes is None:
-        return
+    """Remove processes from the queue, or stop them."""
+    processes = known_processes(state, event.names)
     terminal = [process.name for process in processes if process.phase.is_terminal]
     for process in processes:
         if not process.phase.is_terminal:
@@ -215,12 +203,9 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
 def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
     process.wanted, process.left_behind = DesiredState.CANCEL, None
     state.record(
-        now,
-        EventKind.CANCEL_REQUESTED,
-        f"{process.name} is to be cancelled",
-        process=process.name,
-        by=by,
-    )
+        now, EventKind.CANCEL_REQUESTED, f"{process.name} is to be cancelled",
+        process=process.name, by=by,
+    )  # fmt: skip
     if process.phase in WAITING:
         state.unqueue(process)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
@@ -228,12 +213,7 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
             now, EventKind.CANCELLED, f"{process.name} cancelled in the queue", process=process.name
         )
     elif process.image is not None and process.name not in state.migrations:
-        images.drop(state, process)
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(
-            now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
-            process=process.name,
-        )  # fmt: skip
+        images.cancel(state, process, now)
     elif process.owner == 0 and process.name not in state.migrations:
         # Its owner has ended, and former instances are being stopped.
         if not lifecycle.requeue_if_clear(state, process, now):
@@ -247,14 +227,11 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
 
 def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:
     """Restart running processes in place; queue ended ones again."""
-    processes = known_processes(state, event.request, event.names)
-    if processes is None:
-        return
+    processes = known_processes(state, event.names)
     for process in processes:
         fault = _restart_fault(state, process)
         if fault:
-            refuse(state, event.request, f"{fault}. Nothing was restarted")
-            return
+            raise RequestRefused(f"{fault}. Nothing was restarted")
     for process in processes:
         _restart(state, process, now, event.by)
     state.emit(Reply(event.request, message=f"{count(len(processes))} restarted"))
@@ -278,12 +255,9 @@ def _restart_fault(state: MasterState, process: Process) -> str:
 
 def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
     state.record(
-        now,
-        EventKind.RESTART_REQUESTED,
-        f"a restart of {process.name} was requested",
-        process=process.name,
-        by=by,
-    )
+        now, EventKind.RESTART_REQUESTED, f"a restart of {process.name} was requested",
+        process=process.name, by=by,
+    )  # fmt: skip
     if process.phase.is_terminal or process.image is not None:
         images.drop(state, process)
         replication.begin_anew(state, process)
@@ -305,20 +279,12 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
 
 def migration_requested(state: MasterState, event: happened.MigrationRequested, now: float) -> None:
     """Begin the migration of a process."""
-    processes = known_processes(state, event.request, [event.name])
-    if processes is None:
-        return
-    host = None
-    if event.host is not None:
-        host = known_host(state, event.request, event.host)
-        if host is None:
-            return
-    (process,) = processes
-    rejected = try_move(state, process, asked_for(event.by), now, host=host)
+    (process,) = known_processes(state, [event.name])
+    host = None if event.host is None else known_host(state, event.host)
+    rejected = try_move(state, process, _cause(event.by), now, host=host)
     if rejected is not None:
         _note_refused_move(state, process, rejected.reason, now)
-        refuse(state, event.request, rejected.reason)
-        return
+        raise RequestRefused(rejected.reason)
     name = state.migrations[process.name].destination_host.name
     state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
 
@@ -348,48 +314,38 @@ def _begin(
     begin: Callable[[MasterState, Process, str, float], Rejected | None],
     now: float,
 ) -> None:
-    processes = known_processes(state, event.request, [event.name])
-    if processes is None:
-        return
-    rejected = begin(state, processes[0], asked_for(event.by), now)
+    (process,) = known_processes(state, [event.name])
+    rejected = begin(state, process, _cause(event.by), now)
     if rejected is not None:
-        refuse(state, event.request, rejected.reason)
-        return
+        raise RequestRefused(rejected.reason)
     migration = state.migrations[event.name]
     message = f"{event.name}: {migration.progress_text}"
     state.emit(Reply(event.request, message=message, host=migration.source_host.name))
 
 
-def asked_for(by: str) -> str:
+def _cause(by: str) -> str:
     """Return the cause, for records, of a change that a client requested."""
     return f"asked for by {by}" if by else "asked for"
 
 
-def known_host(state: MasterState, request: int, name: str) -> Host | None:
-    """Return the host of a name; a name that is not listed refuses the whole request."""
+def known_host(state: MasterState, name: str) -> Host:
+    """Return the host of a name; refuse the request for a name that is not listed."""
     host = state.hosts.by_name.get(name)
-    if host is not None and not host.pruned:
-        return host
-    there = sorted(host.name for host in state.hosts.listed())
-    refuse(state, request, no_such("host", [name], there), "unknown")
-    return None
+    if host is None or host.pruned:
+        there = sorted(host.name for host in state.hosts.listed())
+        raise RequestRefused(no_such("host", [name], there), "unknown")
+    return host
 
 
 def host_state_requested(
     state: MasterState, event: happened.HostStateRequested, now: float
 ) -> None:
     """Cordon, uncordon or drain a host."""
-    host = known_host(state, event.request, event.host)
-    if host is None:
-        return
+    host = known_host(state, event.host)
     kind = _HOST_EVENTS.get(event.action)
     if kind is None:
-        refuse(
-            state,
-            event.request,
-            f"unknown action {event.action!r}; there are: cordon, uncordon, drain",
-        )
-        return
+        fault = f"unknown action {event.action!r}; there are: {', '.join(_HOST_EVENTS)}"
+        raise RequestRefused(fault)
     state.hosts.set_closed(
         host, cordoned=event.action != "uncordon", draining=event.action == "drain"
     )
@@ -399,7 +355,5 @@ def host_state_requested(
     done = kind.removeprefix("host_")
     state.record(now, kind, f"{host.name} is {done}", host=host.name, by=event.by)
     reconsider_set_aside(state, now)
-    phrases = f"{host.name} is {done}"
-    if host.draining:
-        phrases = f"{phrases}: {departures(state, host)}"
-    state.emit(Reply(event.request, message=phrases))
+    details = f": {departures(state, host)}" if host.draining else ""
+    state.emit(Reply(event.request, message=f"{host.name} is {done}{details}"))

@@ -14,16 +14,11 @@ from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
 from rosrm.core.master.lifecycle import stop_instance
-from rosrm.core.master.master_state import (
-    DesiredState,
-    Instance,
-    MasterState,
-    Process,
-    ProcessPhase,
-)
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import evict_from_hosts
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
+from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.orders import ReportInstances
 
 #: Seconds between two ticks; this work need not be done with every event.
@@ -83,11 +78,9 @@ def _cancel_prefetch(state: MasterState, instance: Instance, now: float) -> None
     """Return a prefetched process to its place in the queue, because its slot stays taken."""
     review_slots(state, instance.host, now)
     process = state.owned_by(instance)
-    if (
-        process is not None
-        and process.wanted is DesiredState.RUN
-        and process.name not in state.migrations
-    ):
+    if process is None or process.name in state.migrations:
+        return
+    if process.wanted is DesiredState.RUN:
         process.wanted = DesiredState.REQUEUE
         state.save(process)
         stop_instance(state, instance, now)

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from rosrm.core.slave.watches import NO_ANSWER, Observation, Watch
+from rosrm.core.slave.watches import NoState, Observation, Watch
 from rosrm.model.values import Assignment, Health
 
 #: Seconds between two looks.
@@ -127,7 +127,8 @@ class InstanceHealth:
         passed = min(gap, self._stride)
         self._looked = now
         self._stopped.note(seen.stopped, passed)
-        self._lifecycle.note(seen.state not in (None, self._watch.checks.lifecycle), passed)
+        allowed = (NoState.NOT_YET, self._watch.checks.lifecycle)
+        self._lifecycle.note(seen.state not in allowed, passed)
         if self._watch.topics:
             self._rate.look(seen, now, passed, missed=gap > self._stride)
         reasons = "; ".join(self._reasons(seen))
@@ -139,7 +140,7 @@ class InstanceHealth:
             yield f"stopped by a signal (SIGSTOP) for {self._stopped.seconds:.1f} s"
         if self._lifecycle.seconds > wanted.timeout:
             silent = f"no answer from {' or '.join(self._watch.services)}"
-            found = silent if seen.state == NO_ANSWER else f"lifecycle state {seen.state}"
+            found = silent if seen.state is NoState.NO_ANSWER else f"lifecycle state {seen.state}"
             lasted = self._lifecycle.seconds
             yield f"{found} for {lasted:.1f} s, the state {wanted.lifecycle} is required"
         lasted = self._rate.amiss.seconds

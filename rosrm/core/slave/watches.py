@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from enum import Enum
 
 from rosrm.model.values import Health
 
-#: Lifecycle state of a node that does not answer.
-NO_ANSWER: Final = ""
+
+class NoState(Enum):
+    """Reason why the lifecycle state of a node is not known."""
+
+    NOT_YET = "the node has not been asked, or may still answer"
+    NO_ANSWER = "the node does not answer"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +57,13 @@ class Observation:
         stopped: a signal has stopped its session leader.
         messages: messages on its topic; None: the topic cannot be received.
         trouble: why the topic cannot be received; "": it can.
-        state: of its lifecycle, or `NO_ANSWER`; None: not known yet.
+        state: label of its lifecycle state, or the reason why there is none.
     """
 
     stopped: bool = False
     messages: int | None = None
     trouble: str = ""
-    state: str | None = None
+    state: str | NoState = NoState.NOT_YET
 
 
 @dataclass(frozen=True, slots=True)

@@ -209,7 +209,7 @@ class HostLinks:
         link = self._links.get(command.host_id)
         if link is None:  # expected from the journal, not registered yet
             why = "the host does not report"
-            self._handle(happened.OrderAnswered(command.order_id, False, "timeout", why))
+            self._handle(happened.OrderAnswered.missing(command.order_id, why))
             return
         request = order_to_msg(command.order)
         deadline = now + seconds_of(command.order) + self._order_timeout
@@ -244,7 +244,7 @@ def _order_answered(
     order: OrderId, response: srv.ControlHost.Response | None
 ) -> happened.OrderAnswered:
     if response is None:
-        return happened.OrderAnswered(order, False, "timeout", "no answer in time")
+        return happened.OrderAnswered.missing(order)
     answer = response.answer
     fault = version_refusal(answer.protocol_version, "a slave")
     if fault:

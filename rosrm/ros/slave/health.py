@@ -17,7 +17,7 @@ from typing import Any, Final
 from rclpy.node import Node
 from rclpy.qos import qos_profile_services_default
 
-from rosrm.core.slave.watches import NO_ANSWER, Watch
+from rosrm.core.slave.watches import NoState, Watch
 from rosrm.ros import qos
 from rosrm.ros.polling import message_type, polled_subscription, waiting
 from rosrm.ros.slave.graph import GraphWatch
@@ -45,9 +45,9 @@ class HealthMonitor:
         """Return the messages since the last check, or None and why the topic cannot be checked."""
         return (None, "") if self._topic is None else self._topic.look(pids, now)
 
-    def state(self, now: float) -> str | None:
-        """Return the lifecycle state, or `NO_ANSWER`; None: not known yet."""
-        return None if self._state is None else self._state.look(now)
+    def state(self, now: float) -> str | NoState:
+        """Return the lifecycle state, or why it is not known."""
+        return NoState.NOT_YET if self._state is None else self._state.look(now)
 
     def close(self) -> None:
         """Destroy the subscription and the clients."""
@@ -135,7 +135,7 @@ class _StateMonitor:
     def __init__(self, node: Node, watch: Watch, now: float) -> None:
         self._node = node
         self._clients: list[Any] = []
-        self._state: str | None = None
+        self._state: str | NoState = NoState.NOT_YET
         self._period = min(_ASK_PERIOD, watch.checks.timeout / _ASKS)
         self._asked = -math.inf
         self._answered = now
@@ -147,11 +147,11 @@ class _StateMonitor:
                 )
                 self._clients.append(client)
 
-    def look(self, now: float) -> str | None:
+    def look(self, now: float) -> str | NoState:
         for client in self._clients:
             self._take_answer(client, now)
         if now - self._answered > self._period + _PATIENCE:
-            self._state = NO_ANSWER
+            self._state = NoState.NO_ANSWER
         if now - self._asked >= self._period:
             self._asked = now
             for client in self._clients:

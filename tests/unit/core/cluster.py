@@ -22,9 +22,10 @@ import rosrm_migration.plugin
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.commands import Command, Reply, SendOrder
-from rosrm.core.master.master_state import MasterState, Process
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
+from rosrm.core.master.state.process import Process
 from rosrm.core.slave import events
 from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
 from rosrm.extensions.declared_fields import Declared

@@ -18,8 +18,8 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import demand_of
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
-from rosrm.core.master.master_state import DesiredState, ProcessPhase
 from rosrm.core.master.state.hosts import HostCondition, HostTable
+from rosrm.core.master.state.process import DesiredState, ProcessPhase
 from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.model.values import (

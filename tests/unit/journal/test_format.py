@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.master.master_state import WAITING, MasterState
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.images import UnwantedImage
+from rosrm.core.master.state.process import WAITING
 from rosrm.extensions.contracts import Intent
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.codec import to_plain

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rosrm.core.slave import events
 from rosrm.core.slave.commands import Command, Fail, Remember
 from rosrm.core.slave.health import LOOK_PERIOD, InstanceHealth, resolve, watch_of
-from rosrm.core.slave.watches import Awaited, Memo, Observation, Watch
+from rosrm.core.slave.watches import Awaited, Memo, NoState, Observation, Watch
 from rosrm.model.values import (
     Assignment,
     Health,
@@ -145,13 +145,13 @@ def test_what_is_stopped_for_too_long_is_unhealthy() -> None:
     ("state", "said"),
     [
         ("inactive", "lifecycle state inactive for 4."),
-        ("", "no answer from /robot/lidar/get_state for 4."),
+        (NoState.NO_ANSWER, "no answer from /robot/lidar/get_state for 4."),
     ],
 )
 def test_another_lifecycle_state_or_no_answer(state, said) -> None:
     """Both fail the check; a state that is not known yet does not."""
     node = Node(Health(lifecycle="active", timeout=4.0))
-    assert node.looks(10.0, state=None) == ""
+    assert node.looks(10.0, state=NoState.NOT_YET) == ""
     assert node.looks(10.0, state="active") == ""
     assert node.looks(3.0, state=state) == ""
     assert node.looks(0.3, state="active") == ""
@@ -163,7 +163,7 @@ def test_another_lifecycle_state_or_no_answer(state, said) -> None:
 def test_the_verdict_has_every_finding() -> None:
     """The message has all findings in one line."""
     node = Node(Health("~/scan", 5.0, "active", 4.0))
-    while "~/scan" not in (verdict := node.looks(20.0, rate=0.0, state="")):
+    while "~/scan" not in (verdict := node.looks(20.0, rate=0.0, state=NoState.NO_ANSWER)):
         assert node.now < 60.0, verdict
     assert "no answer" in verdict
 

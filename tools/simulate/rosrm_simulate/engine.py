@@ -230,6 +230,6 @@ class Simulation(World[Machine]):
         if machine.up:
             machine.receive(sent)
             return
-        timeout = happened.OrderAnswered(sent.order_id, False, "timeout", "no answer in time")
+        timeout = happened.OrderAnswered.missing(sent.order_id)
         seconds = seconds_of(sent.order) + self.state.settings.order_retry
         self.after(seconds, partial(self.tell, timeout))

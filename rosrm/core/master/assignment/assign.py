@@ -11,7 +11,7 @@ import numpy as np
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign
 from rosrm.core.master.hosts import capabilities
-from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, larger
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.journal_gap import why_no_work
 from rosrm.core.master.scheduling.decision import Decision, decide
 from rosrm.core.master.scheduling.feasibility import (
@@ -23,6 +23,7 @@ from rosrm.core.master.scheduling.feasibility import (
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import EMPTY
 from rosrm.wording import listed
@@ -31,21 +32,21 @@ _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACH
 _STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
 #: Seconds for which placement waits at most for the first request of a host that has registered.
 _FIRST_REQUEST: Final = 1.0
-_NOBODY: Final[frozenset[str]] = frozenset()
 
 
 def demand_of(state: MasterState, process: Process) -> Demand:
-    """Return the demand of a process; rebuild it only after a change.
+    """Return the demand of a process.
 
-    Changes that count: the learned needs, and the hosts with a replica of the snapshot.
+    It is built again after a change of the learned needs, or of the hosts with a replica of its
+    snapshot.
     """
     version = state.learned.version
     near = state.replication.replicas.hosts_of(process.name, process.born)
     known = process.demand
     if known is None or known[0] != version or known[1].near != near:
-        estimate = state.learned.estimate(process.spec, state.settings.default_needs)
+        needs = state.estimate(process.spec)
         demand = Demand(
-            process.spec, estimate.amounts, estimate.estimated, dict(process.excluded), near=near,
+            process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
             reads=state.declared.reads,
         )  # fmt: skip
         # Equal processes share one: thousands of them may wait.
@@ -65,10 +66,9 @@ def demand_to_move(
         **process.excluded, **unable(state, process, source), **lacking,
         source: "it is the source of the move",
     }  # fmt: skip
-    return Demand(
-        process.spec, *demand_amounts(state, process, seen), excluded, headroom,
-        reads=state.declared.reads,
-    )  # fmt: skip
+    amounts, guessed = demand_amounts(state, process, seen)
+    reads = state.declared.reads
+    return Demand(process.spec, amounts, guessed, excluded, headroom, reads=reads)
 
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
@@ -81,11 +81,12 @@ def demand_amounts(
 ) -> tuple[Mapping[str, float], frozenset[str]]:
     """Return the amount that a process needs of each resource, and the resources that are guessed.
 
-    An amount that was measured is not a guess.
+    An amount that was measured (`seen`) is not a guess.
     """
-    estimate = state.learned.estimate(process.spec, state.settings.default_needs)
-    amounts = larger(estimate.amounts, seen)
-    guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
+    needs = state.estimate(process.spec)
+    names = {**needs.amounts, **seen}
+    amounts = {name: max(needs.amounts.get(name, 0.0), seen.get(name, 0.0)) for name in names}
+    guessed = {name for name in needs.estimated if amounts[name] > seen.get(name, 0.0)}
     return amounts, frozenset(guessed)
 
 
@@ -120,7 +121,7 @@ def decide_now(state: MasterState, process: Process) -> Decision:
 
 
 def place_waiting(state: MasterState, now: float) -> None:
-    """Assign from the queue until its head fits nowhere (`backfill`: until no process fits)."""
+    """Assign queued processes until the head fits nowhere (`backfill`: until no process fits)."""
     head = state.queue.head()
     if head is None or state.placed_at == _versions(state):
         return
@@ -161,7 +162,7 @@ def _first_request_awaited(state: MasterState, now: float) -> str:
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a snapshot and do not block those behind them."""
     if not np.isin(state.hosts.condition, _AWAY).any():
-        return _NOBODY
+        return frozenset()
     names = (name for name in state.queue if awaits_states(state, state.processes[name], now))
     passed_over = frozenset(names)
     for name in passed_over:
@@ -177,7 +178,7 @@ def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float)
 
 def _next_in_line(state: MasterState, passed_over: frozenset[str]) -> str | None:
     if not passed_over:
-        return state.queue.head()
+        return state.queue.head()  # quicker, and thousands may wait
     return next((name for name in state.queue if name not in passed_over), None)
 
 
@@ -224,7 +225,7 @@ def _assign(
     host = state.hosts.hosts[column]
     instance = state.new_instance_id(process)
     state.queue.remove(process.name)
-    state.reserve_ranked(instance, host, now, ranking)
+    state.reserve(instance, host, now, ranking)
     ranking.took()
     process.owner, process.left_behind, process.exit_code = instance.number, None, None
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
@@ -249,11 +250,9 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
         state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
         state.set_aside.add(process.name)
         state.record(
-            now,
-            EventKind.SET_ASIDE,
-            f"{process.name} is set aside: {process.reason}",
+            now, EventKind.SET_ASIDE, f"{process.name} is set aside: {process.reason}",
             process=process.name,
-        )
+        )  # fmt: skip
     state.save(process)
 
 
@@ -276,24 +275,22 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
     if not state.set_aside:
         return
     judged: dict[object, str] = {}
-    for process in sorted(
-        (state.processes[name] for name in state.set_aside), key=lambda one: one.order
-    ):
+    aside = [state.processes[name] for name in state.set_aside]
+    for process in sorted(aside, key=lambda one: one.order):
         demand = demand_of(state, process)
         if demand.key not in judged:
             judged[demand.key] = why_never(state.hosts, demand)
         if judged[demand.key]:
             _keep_aside(state, process, judged[demand.key], now)
-            continue
-        if not a_known_host_may(state.hosts, demand):
-            continue
-        state.set_aside.discard(process.name)
-        state.enqueue(process, now)
-        state.record(
-            now, EventKind.QUEUED, f"{process.name} returns to the queue: a host may take it now",
-            process=process.name,
-        )  # fmt: skip
-        state.save(process)
+        elif a_known_host_may(state.hosts, demand):
+            state.set_aside.discard(process.name)
+            state.enqueue(process, now)
+            state.record(
+                now, EventKind.QUEUED,
+                f"{process.name} returns to the queue: a host may take it now",
+                process=process.name,
+            )  # fmt: skip
+            state.save(process)
 
 
 def _record_waiting(state: MasterState, process: Process, demand: Demand, now: float) -> None:
@@ -314,10 +311,5 @@ def _record_wait_reason(
     """Record the reason for which a process waits, once per reason."""
     if process.reason != reason:
         process.reason = reason
-        state.record(
-            now,
-            EventKind.WAITS,
-            f"{process.name} waits: {reason}",
-            process=process.name,
-            facts=facts,
-        )
+        message = f"{process.name} waits: {reason}"
+        state.record(now, EventKind.WAITS, message, process=process.name, facts=facts)

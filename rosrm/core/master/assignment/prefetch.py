@@ -11,14 +11,15 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core.master.master_state import Instance, MasterState
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.process import Instance
 from rosrm.model.values import InstanceState, InstanceStatus, Kind, ProcessSpec
 
 #: Seconds: jobs that run no longer than this on average are short.
-SHORT: Final = 0.5
+_SHORT: Final = 0.5
 #: Seconds after which a job that was thought short has proved otherwise.
-PROVED_LONG: Final = 4 * SHORT
+PROVED_LONG: Final = 4 * _SHORT
 #: Weight of the newest run in the mean.
 _NEWEST: Final = 0.3
 
@@ -35,11 +36,7 @@ def review_slots(state: MasterState, host: Host, now: float) -> None:
     most = host.description.max_processes
     if not most:
         return
-    running = [
-        instance
-        for instance in (state.instances[number] for number in host.instances)
-        if instance.is_running
-    ]
+    running = [instance for instance in state.instances_of(host) if instance.is_running]
     ahead = len(running) >= most and all(_ends_soon(state, one, now) for one in running)
     state.hosts.set_bound(host, most + ahead)
 
@@ -49,7 +46,7 @@ def _ends_soon(state: MasterState, instance: Instance, now: float) -> bool:
     if process is None or process.spec.kind is not Kind.JOB:
         return False
     expected = state.run_times.get(process.spec.program)
-    return expected is not None and expected <= SHORT and now - instance.since < PROVED_LONG
+    return expected is not None and expected <= _SHORT and now - instance.since < PROVED_LONG
 
 
 def waits_too_long(instance: Instance, now: float) -> bool:

@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from rosrm.core.master.master_state import Instance, MasterState
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.process import Instance
 from rosrm.extensions.contracts import Intent
 from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
 
@@ -23,12 +24,12 @@ def settle_reservation(state: MasterState, instance: Instance, now: float) -> No
         hidden = amount - instance.seen.get(resource, 0.0)
         if hidden > 0.0 and not (instance.settled and resource in instance.estimated):
             left[resource] = hidden
-    need = table.fractions_of(instance.host, left, instance.estimated)
-    need = np.where(need < np.inf, need, 0.0)
-    change = need.copy()
+    fractions = table.fractions_of(instance.host, left, instance.estimated)
+    reserved = np.where(fractions < np.inf, fractions, 0.0)
+    change = reserved.copy()
     change[: len(instance.reserved)] -= instance.reserved
     if np.any(change):
-        instance.reserved = need
+        instance.reserved = reserved
         table.add_reservation(instance.host, change)
 
 

@@ -1,4 +1,4 @@
-"""Checkpoint and restore of a process on its own host: beginning and outcome.
+"""Checkpoint and restore of a process on its own host: begin and outcome.
 
 Both are plans like those of migrations, and `executor` carries them out: undone before the commit,
 rolled forward after it. A checkpoint commits to a checkpoint image (`images`), and no instance owns
@@ -13,12 +13,16 @@ from rosrm.core.master.assignment.assign import demand_to_restore, ranking_of
 from rosrm.core.master.checkpoint import images
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration.start import destination_node, proposed, why_busy, why_no_executor
+from rosrm.core.master.migration.start import (
+    move_of,
+    planned,
+    why_busy,
+    why_no_executor,
+)
 from rosrm.core.master.migration.steps import instances_are_gone, title
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.scheduling.decision import verdict_of
 from rosrm.core.master.scheduling.ranking import Ranking
-from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import DesiredState, Image, Instance, Process, ProcessPhase
 from rosrm.extensions.contracts import Imaging
@@ -55,7 +59,8 @@ def begin_checkpoint(
     refusal = capabilities.fault(state, name, owner.host, owner.host)
     if refusal:
         return Rejected(f"{process.name} cannot be checkpointed: {refusal}")
-    move = _planned(state, process, owner.id, owner.host, owner.node_name or process.name)
+    node = owner.node_name or process.name
+    move = move_of(state, process, owner.id, owner.host, owner.host, node)
     return _begin(state, process, move, name, Aim.CHECKPOINT, now, cause=cause)
 
 
@@ -123,7 +128,7 @@ def begin_restore(state: MasterState, process: Process, cause: str, now: float) 
             f"not fit there now: {why or 'no room'}"
         )
     source = InstanceId(process.name, image.number)
-    move = _planned(state, process, source, host, image.node_name or process.name)
+    move = move_of(state, process, source, host, host, image.node_name or process.name)
     return _begin(
         state, process, move, image.strategy, Aim.RESTORE, now, cause=cause, ranking=ranking
     )
@@ -155,16 +160,6 @@ def _why_no_restore(state: MasterState, process: Process) -> str:
 # --- both -------------------------------------------------------------------------------------
 
 
-def _planned(
-    state: MasterState, process: Process, source: InstanceId, host: Host, node: str
-) -> Move:
-    """Return the input of a strategy for a process that stays on its host."""
-    return Move(
-        process.spec, source, host.name, state.new_instance_id(process), host.name,
-        state.new_instance_id(process), int(state.wall), node,
-    )  # fmt: skip
-
-
 def _begin(
     state: MasterState, process: Process, move: Move, strategy: str, aim: Aim, now: float,
     *, cause: str, ranking: Ranking | None = None,
@@ -173,27 +168,22 @@ def _begin(
 
     `ranking`: the reservation at the destination follows it.
     """
-    plan = proposed(state, strategy, move, aim)
-    if isinstance(plan, Rejected):
-        return plan
-    host = state.hosts.by_name[move.source_host]
-    migration = Migration(
-        process.name, plan, strategy, move.source, host, move.destination, host, cause, now,
-        move.source_node, destination_node(plan, move), state.wall, aim=aim,
-    )  # fmt: skip
+    migration = planned(state, strategy, move, cause, now, aim)
+    if isinstance(migration, Rejected):
+        return migration
     lacking = why_no_executor(state, migration)
     if lacking:
         return Rejected(lacking)
     state.migrations[process.name] = migration
     if ranking is not None:
-        state.reserve_ranked(migration.destination, host, now, ranking)
+        state.reserve(migration.destination, migration.destination_host, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, migration.progress_text)
     state.record(
         now, _BEGUN[aim], f"{process.name}: {migration.progress_text}; {cause}",
-        process=process.name,
-        host=host.name,
+        process=process.name, host=move.destination_host,
         facts={
-            "strategy": strategy, "cause": cause, "steps": [title(step) for step in plan.steps],
+            "strategy": strategy, "cause": cause,
+            "steps": [title(step) for step in migration.plan.steps],
             "source": move.source.number, "destination": move.destination.number,
         },
     )  # fmt: skip
@@ -220,8 +210,8 @@ def commit_to_image(
 def leave_behind(state: MasterState, migration: Migration, step: Execute) -> bool:
     """Return True if a plan that may not stop can skip an executor, because nothing needs the step.
 
-    Anything frozen on that host is still frozen. When the host returns, it is
-    killed, not re-adopted.
+    Anything frozen on that host is still frozen. When the host returns, it is killed, not
+    re-adopted.
     """
     if migration.aim is Aim.CHECKPOINT:
         if migration.undo is None or migration.source.number not in migration.ended:
@@ -238,26 +228,18 @@ def leave_behind(state: MasterState, migration: Migration, step: Execute) -> boo
 
 def _remove_unmade(state: MasterState, migration: Migration) -> None:
     """Remove the partial image that an undone checkpoint may have left on its host."""
-    commit = migration.plan.steps[migration.commit_index]
-    if isinstance(commit, Commit):
-        number = migration.source.number
-        images.remove(state, migration.process, migration.source_host.name, commit.image, number)
+    host, drop = migration.source_host.name, migration.commit.image
+    images.remove(state, migration.process, host, drop, migration.source.number)
 
 
 def settle(state: MasterState, process: Process, migration: Migration, now: float) -> None:
     """Set the phase after a plan that ends with an image; drop the image of a cancelled process."""
     if process.wanted is DesiredState.CANCEL:
-        images.drop(state, process, migration.destination.number)
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(
-            now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
-            process=process.name,
-        )  # fmt: skip
+        images.cancel(state, process, now, migration.destination.number)
     else:
         process.wanted = DesiredState.RUN
-        trouble = (
-            f"it was not restored: {migration.failure}" if migration.aim is Aim.RESTORE else ""
-        )
+        failed = migration.aim is Aim.RESTORE
+        trouble = f"it was not restored: {migration.failure}" if failed else ""
         images.note_checkpointed(state, process, now, trouble)
     state.save(process)
 

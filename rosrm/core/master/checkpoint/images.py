@@ -12,10 +12,11 @@ is cancelled or restarted    is removed once its host reports; until then the re
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.events import OrderOutcome
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.images import UnwantedImage
 from rosrm.core.master.state.pending_orders import ImageRemoval
 from rosrm.core.master.state.process import Image, Process, ProcessPhase
@@ -23,9 +24,6 @@ from rosrm.extensions.contracts import Intent
 from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
-
-if TYPE_CHECKING:
-    from rosrm.core.master.master_state import MasterState
 
 #: Seconds for a removal, and until a failed removal is retried.
 _PATIENCE: Final = 30.0
@@ -62,7 +60,7 @@ def why_away(state: MasterState, image: Image) -> str:
 
 
 def reason_of(state: MasterState, process: Process) -> str:
-    """Return the place and condition of a process's image, else the reason of the process."""
+    """Return place and condition of a process's image, else the reason of the process."""
     image = process.image
     if image is None or process.phase is not ProcessPhase.CHECKPOINTED:
         return process.reason
@@ -74,11 +72,18 @@ def reason_of(state: MasterState, process: Process) -> str:
 # --- removal of unwanted images ---------------------------------------------------------------
 
 
+def cancel(state: MasterState, process: Process, now: float, *numbers: int) -> None:
+    """Cancel a checkpointed process; the arguments are those of `drop`."""
+    drop(state, process, *numbers)
+    state.set_phase(process, ProcessPhase.CANCELLED, now)
+    message = f"{process.name} cancelled; its image is removed"
+    state.record(now, EventKind.CANCELLED, message, process=process.name)
+
+
 def drop(state: MasterState, process: Process, *numbers: int) -> None:
     """Detach the image of a process, if it has one, and have it removed.
 
-    Args:
-        numbers: of other instances under which the image may lie on its host.
+    `numbers`: of other instances under which the image may lie on its host.
     """
     image = process.image
     if image is not None:
@@ -98,15 +103,12 @@ def remove(
 def review(state: MasterState, now: float) -> None:
     """Order hosts that are up to remove unwanted images."""
     for number, one in state.images.unwanted.items():
-        host = state.hosts.by_name.get(one.host)
-        if host is None or now < one.ask_at:
-            continue
-        if state.hosts.condition_of(host) is not HostCondition.UP:
-            continue
-        arguments = {"process": one.process, "numbers": list(one.numbers)}
-        removal = RunExecutor(one.drop, arguments, _PATIENCE)
-        one.order = state.send(host, removal, ImageRemoval(number))
-        one.ask_at = now + _PATIENCE + _ASK_AGAIN
+        host = state.hosts.up(one.host)
+        if host is not None and now >= one.ask_at:
+            arguments = {"process": one.process, "numbers": list(one.numbers)}
+            removal = RunExecutor(one.drop, arguments, _PATIENCE)
+            one.order = state.send(host, removal, ImageRemoval(number))
+            one.ask_at = now + _PATIENCE + _ASK_AGAIN
 
 
 def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
@@ -115,7 +117,7 @@ def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, 
     if one is None or one.order != event.order:
         return
     one.order = None
-    if event.accepted or event.code == happened.BAD_RESULT:  # it ran without a result
+    if event.outcome in (OrderOutcome.ACCEPTED, OrderOutcome.BAD_RESULT):  # the executor ran
         del state.images.unwanted[number]
         state.record(
             now, EventKind.IMAGE_REMOVED, f"the image of {one.process} was removed from {one.host}",
@@ -126,8 +128,7 @@ def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, 
     one.ask_at = now + _ASK_AGAIN
     state.record(
         now, EventKind.IMAGE_LEFT,
-        f"the image of {one.process} was not removed from {one.host}: "
-        f"{event.message or event.code}; tried again",
+        f"the image of {one.process} was not removed from {one.host}: {event.reason}; tried again",
         process=one.process, host=one.host, facts={"number": number},
     )  # fmt: skip
 
@@ -141,11 +142,7 @@ def _save(state: MasterState) -> None:
 
 
 def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
-    """Restore the unwanted images from the journal.
-
-    Args:
-        cluster: the journal's table of that name.
-    """
+    """Restore the unwanted images from the journal's table `cluster`."""
     for number, one in cluster.get(_KEY, {}).items():
         known = fields_from_plain(UnwantedImage, one, _JOURNALED)
         state.images.unwanted[int(number)] = UnwantedImage(**known)

@@ -3,7 +3,7 @@
 ==================================  ==========================================================
 observed                            ordered
 ==================================  ==========================================================
-a process asks for them, and runs   `execute` of its strategy's step, at the policy's pace
+a process requests them, and runs   `execute` of its strategy's step, at the policy's pace
 a dump fails                        recorded once, and retried at the same pace
 an instance with images is gone     its images are removed from its host
 ==================================  ==========================================================
@@ -16,10 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import inf
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.pending_orders import PeriodicCheckpoint
@@ -33,9 +34,6 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
 from rosrm.model.plan import Execute
 from rosrm.wording import size
-
-if TYPE_CHECKING:
-    from rosrm.core.master.master_state import MasterState
 
 #: Seconds between two reviews.
 _LOOK_EVERY: Final = 1.0
@@ -59,7 +57,7 @@ def review(state: MasterState, now: float) -> None:
 
 
 def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
-    """Note the result of the dump under way of an instance."""
+    """Note the result of an instance's dump under way."""
     dumped = state.periodic.of.get(number)
     if dumped is not None and dumped.order == event.order:
         _note(state, dumped, event, now)
@@ -80,14 +78,14 @@ def of_process(state: MasterState, process: Process, now: float) -> Mapping[str,
 
 
 def _review(state: MasterState, process: Process, now: float) -> None:
-    strategy: object = state.strategies.get(process.spec.migration.strategy or "")
+    name = process.spec.migration.strategy or ""
+    strategy: object = state.strategies.get(name)
     owner = state.instances.get(process.owner)
     if owner is None or not implements(strategy, PeriodicImaging):
         return
     number, host = process.owner, owner.host
     dumped = state.periodic.of.get(number)
     if dumped is None:
-        name = process.spec.migration.strategy or ""
         discard = _discard_of(state, name)
         dumped = state.periodic.of[number] = Dumped(process.name, host.name, name, discard, now)
     if dumped.order is not None and dumped.asked != host.description.incarnation:
@@ -98,7 +96,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
     if isinstance(pace, Rejected):
         _record_trouble(state, dumped, pace.reason, now)
     elif pace is not None and now >= dumped.since + pace:
-        trouble = capabilities.fault(state, process.spec.migration.strategy or "", host, host)
+        trouble = capabilities.fault(state, name, host, host)
         if trouble:
             _record_trouble(state, dumped, trouble, now)
         else:
@@ -186,7 +184,7 @@ def _order(
 def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
     dumped.order, dumped.since = None, now
     if not event.accepted:
-        _record_trouble(state, dumped, event.message or event.code, now)
+        _record_trouble(state, dumped, event.reason, now)
         return
     result = event.result or {}
     dumped.size = int(_number(result.get("size")))
@@ -225,8 +223,8 @@ def _remove(state: MasterState, number: int, dumped: Dumped) -> bool:
 
     A host that is not up removes them when it registers.
     """
-    host = state.hosts.by_name.get(dumped.host)
-    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+    host = state.hosts.up(dumped.host)
+    if host is None:
         return True
     if isinstance(dumped.discard, Rejected):
         dumped.discard = _discard_of(state, dumped.strategy)

@@ -1,7 +1,7 @@
 """Snapshot replication: placement of replicas by the checkpoint policy, and their removal.
 
 A node keeps its newest snapshot on its own host without an order. The master repeats each order to
-a slave until the slave's report confirms it; nothing of this is durable. Each stateful process is
+a slave until the slave's report confirms it. Nothing of this is durable. Each stateful process is
 reviewed about once a second.
 
 ==========================================  =====================================================
@@ -30,9 +30,10 @@ from collections.abc import Mapping
 from typing import Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.master_state import MasterState, Process, ProcessPhase
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.pending_orders import Replication
+from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.core.master.state.replicas import Replica, ReplicationOrder
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
@@ -55,7 +56,7 @@ _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
 def kept_states_received(
     state: MasterState, event: happened.KeptStatesReceived, now: float
 ) -> None:
-    """Record all replicas that a host reports."""
+    """Note all snapshots and replicas that a host reports."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is not None:
         note_states(state, host, event.states, now)
@@ -64,7 +65,7 @@ def kept_states_received(
 def note_states(
     state: MasterState, host: Host, states: tuple[SnapshotReport, ...], now: float
 ) -> None:
-    """Replace the known replicas of a host by its complete report."""
+    """Replace the known snapshots and replicas of a host by its complete report."""
     # The journal may be lost: no instance may get a number that a snapshot has already.
     state.skip_numbers(max((one.instance.number for one in states), default=0))
     state.replication.replicas.replace(host.name, states, now)
@@ -103,9 +104,9 @@ def _was_left_on(process: Process, host: str) -> bool:
 
 def note_answer(state: MasterState, process: str, event: happened.OrderAnswered) -> None:
     """Note that a slave has accepted or refused the newest choice for a process."""
-    told = state.replication.last_orders.get(process)
-    if told is not None and told.order == event.order:
-        told.accepted = event.accepted
+    last = state.replication.last_orders.get(process)
+    if last is not None and last.order == event.order:
+        last.accepted = event.accepted
 
 
 # --- requests -------------------------------------------------------------------------------
@@ -122,21 +123,21 @@ def begin_anew(state: MasterState, process: Process) -> None:
 
 def review(state: MasterState, now: float) -> None:
     """Review a share of the processes with replicas, so that each is reviewed once a second."""
-    replication_state = state.replication
-    names = replication_state.replicas.processes()
-    if len(replication_state.dropped_at) > _REMEMBERED:
-        replication_state.dropped_at.clear()
-    share = min(1.0, (now - replication_state.reviewed_at) / _LOOK_EVERY)
-    replication_state.reviewed_at = now
-    if not replication_state.waiting:
-        replication_state.waiting = names[::-1]
+    known = state.replication
+    names = known.replicas.processes()
+    if len(known.dropped_at) > _REMEMBERED:
+        known.dropped_at.clear()
+    share = min(1.0, (now - known.reviewed_at) / _LOOK_EVERY)
+    known.reviewed_at = now
+    if not known.waiting:
+        known.waiting = names[::-1]
     for _ in range(math.ceil(share * len(names))):
-        if not replication_state.waiting:
+        if not known.waiting:
             return
-        name = replication_state.waiting.pop()
+        name = known.waiting.pop()
         process = state.processes.get(name)
         if process is None:
-            replication_state.last_orders.pop(name, None)
+            known.last_orders.pop(name, None)
             _drop_removed(state, name, now)
         else:
             _review(state, process, now)
@@ -165,31 +166,28 @@ def _choose(
 ) -> None:
     """Ask the policy, and send its choice to the slave if it is new there."""
     choice = _choice(state, process, host, replicas, now)
-    told = state.replication.last_orders.get(process.name)
-    chosen = choice is not None or (told is not None and told.by_policy)
+    last = state.replication.last_orders.get(process.name)
+    by_policy = choice is not None or (last is not None and last.by_policy)
     if choice is None:
-        choice = (
-            told.choice if told is not None and chosen else _current_choice(process, host, replicas)
-        )
-    if not chosen and not choice.hosts:
+        keeps = last if by_policy else None
+        choice = keeps.choice if keeps else _current_choice(process, host, replicas)
+    if not by_policy and not choice.hosts:
         return  # no other host has a replica, and the policy has chosen none
-    incarnation = host.description.incarnation
-    known = (
-        told is not None
-        and (told.number, told.incarnation) == (process.owner, incarnation)
-        and _is_same(told.choice, choice)
-    )  # fmt: skip
-    if told is not None:
-        told.by_policy = chosen
-    if told is not None and known and (told.accepted or now - told.at < state.settings.order_retry):
-        return
+    incarnation, is_new = host.description.incarnation, True
+    if last is not None:
+        last.by_policy = by_policy
+        is_new = (last.number, last.incarnation) != (process.owner, incarnation)
+        is_new = is_new or not _is_same(last.choice, choice)
+        recent = now - last.at < state.settings.order_retry
+        if not is_new and (last.accepted or recent):
+            return
     instance = InstanceId(process.name, process.owner)
     replicate = ReplicateSnapshot(instance, choice.hosts, choice.every)
     order = state.send(host, replicate, Replication(process.name))
     state.replication.last_orders[process.name] = ReplicationOrder(
-        process.owner, incarnation, choice, order, now, chosen
+        process.owner, incarnation, choice, order, now, by_policy
     )
-    if not known and (told is None or set(told.choice.hosts) != set(choice.hosts)):
+    if is_new and (last is None or set(last.choice.hosts) != set(choice.hosts)):
         where = ", ".join(choice.hosts) or "no other host"
         state.record(
             now, EventKind.KEPT_ON, f"the state of {process.name} is kept on {where}",
@@ -200,7 +198,7 @@ def _choose(
 
 def _current_choice(
     process: Process, host: Host, replicas: Mapping[str, Replica]
-) -> CheckpointChoice:  # fmt: skip
+) -> CheckpointChoice:
     """Choose the other hosts with a replica that is not from before the last submission."""
     kept = (name for name, one in replicas.items() if one.number >= process.born)
     return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
@@ -218,10 +216,10 @@ def _choice(
 
     A policy that raises or breaks its contract is recorded by name.
     """
-    replication_state = state.replication
-    if replication_state.policy is None:
+    policy, policy_name = state.replication.policy, state.replication.policy_name
+    if policy is None:
         return CheckpointChoice(())
-    kept = replication_state.replicas.hosts_of(process.name, process.born)
+    kept = state.replication.replicas.hosts_of(process.name, process.born)
     others = tuple(name for name in kept if name != host.name)
     hosts = {
         one.name: one.description.labels
@@ -233,13 +231,9 @@ def _choice(
         process.spec, host.name, None if since is None else now - since,
         _newest_size(replicas), others, hosts,
     )  # fmt: skip
-    policy = replication_state.policy
     try:
         return state.plugins.ask(
-            "checkpoint",
-            replication_state.policy_name,
-            "choose",
-            lambda: sound_choice(policy.choose(view), view),
+            "checkpoint", policy_name, "choose", lambda: sound_choice(policy.choose(view), view)
         )
     except PluginError:
         return None
@@ -283,24 +277,22 @@ def _is_stale(
     """Return True if, as far as the master knows, no instance will start from a replica."""
     if replica.number < process.born or process.phase in _DONE:
         return True
-    owner, last_order = (
-        state.instances.get(process.owner),
-        state.replication.last_orders.get(process.name),
-    )
+    owner = state.instances.get(process.owner)
     if owner is None or process.phase is not ProcessPhase.RUNNING or host == owner.host.name:
         return False
-    if last_order is None or not last_order.by_policy or last_order.number != process.owner:
+    last = state.replication.last_orders.get(process.name)
+    if last is None or not last.by_policy or last.number != process.owner:
         return False
-    if host in last_order.choice.hosts:
+    if host in last.choice.hosts:
         return False
     # Keep an undesired replica until a newer one exists elsewhere.
-    better = last_order.choice.hosts or (owner.host.name,)
+    better = last.choice.hosts or (owner.host.name,)
     return any(name in replicas and replicas[name].age > replica.age for name in better)
 
 
 def _drop(state: MasterState, process: str, name: str, replica: Replica, now: float) -> None:
-    host = state.hosts.by_name.get(name)
-    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+    host = state.hosts.up(name)
+    if host is None:
         return  # it reports its replicas again when it rejoins
     at = state.replication.dropped_at.get((process, name), -math.inf)
     if now - at < state.settings.order_retry:

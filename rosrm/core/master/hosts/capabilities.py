@@ -14,11 +14,13 @@ Nothing of this is durable. Until a host has answered, nothing is moved to or fr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import inf
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.events import OrderOutcome
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.plugin_failures import why_broken
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -30,9 +32,6 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
 from rosrm.wording import listed
 
-if TYPE_CHECKING:
-    from rosrm.core.master.master_state import MasterState
-
 #: Seconds for an answer, and until a host that did not answer is asked again.
 _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 10.0
@@ -40,45 +39,34 @@ _ASK_AGAIN: Final = 10.0
 
 def ask_hosts(state: MasterState, now: float) -> None:
     """Ask every host that is up and has not been asked, or did not answer."""
-    for name, strategy in _checking(state):
-        for host in state.hosts.hosts:
-            if state.hosts.condition_of(host) is HostCondition.UP:
-                _ask(state, name, strategy, host, now)
-
-
-def _checking(state: MasterState) -> Iterator[tuple[str, HostChecking]]:
     for name, strategy in state.strategies.items():
         if implements(strategy, HostChecking):
-            yield name, strategy
+            for host in state.hosts.hosts:
+                if state.hosts.condition_of(host) is HostCondition.UP:
+                    _ask(state, name, strategy, host, now)
 
 
 def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now: float) -> None:
-    known = state.host_capabilities.answers.get((name, host.name))
+    known = state.capability_answers.get((name, host.name))
     incarnation = host.description.incarnation
     if known is not None and known.incarnation == incarnation and now < known.ask_at:
         return
+    answer = Answer(incarnation, ask_at=now + _ASK_AGAIN)
+    state.capability_answers[name, host.name] = answer
     try:
-        ability = state.plugins.ask(
+        executor = state.plugins.ask(
             "migration", name, "ability", lambda: required(strategy.ability, str)
         )
     except PluginError as error:
-        answer = Answer(
-            incarnation, reason=f"its ability is not known: {error}", ask_at=now + _ASK_AGAIN
-        )
-        state.host_capabilities.answers[name, host.name] = answer
+        answer.reason = f"its ability is not known: {error}"
         return
-    if ability not in host.description.executors:
-        reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
+    if executor not in host.description.executors:
         # Asked again, because the slave reports broken plugins only after its registration.
-        state.host_capabilities.answers[name, host.name] = Answer(
-            incarnation, reason=reason, ask_at=now + _ASK_AGAIN
-        )
+        answer.reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
         return
     query = CapabilityQuery(name, host.name)
-    order = state.send(host, RunExecutor(ability, timeout=_PATIENCE), query)
-    state.host_capabilities.answers[name, host.name] = Answer(
-        incarnation, order, ask_at=now + _PATIENCE + _ASK_AGAIN
-    )
+    answer.order = state.send(host, RunExecutor(executor, timeout=_PATIENCE), query)
+    answer.ask_at += _PATIENCE
 
 
 def note_answer(
@@ -86,16 +74,16 @@ def note_answer(
 ) -> None:
     """Note the answer of a host about a strategy, unless the host was asked again since."""
     strategy, host = query.strategy, query.host
-    answer = state.host_capabilities.answers[strategy, host]
+    answer = state.capability_answers[strategy, host]
     if answer.order != event.order:
         return
     if event.accepted:
         answer.facts = {key: str(value) for key, value in (event.result or {}).items()}
         answer.reason, answer.ask_at = "", inf
-    elif event.code == "timeout":
+    elif event.outcome is OrderOutcome.TIMEOUT:
         answer.ask_at = now + _ASK_AGAIN
     else:
-        answer.reason, answer.ask_at = event.message or event.code, inf
+        answer.reason, answer.ask_at = event.reason, inf
         state.record(
             now, EventKind.STRATEGY_ABSENT, f"{strategy} does not work on {host}: {answer.reason}",
             host=host, facts={"strategy": strategy},
@@ -113,7 +101,7 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
         return ""
     facts = []
     for host in (source, destination):
-        answer = state.host_capabilities.answers.get((strategy, host.name))
+        answer = state.capability_answers.get((strategy, host.name))
         if answer is None or answer.facts is None:
             return _absent(strategy, answer, [host.name])
         facts.append(answer.facts)
@@ -130,7 +118,7 @@ def faults(state: MasterState, strategy: str, source: Host) -> list[str]:
     """Return why a strategy cannot move anything from a host to others, an equal reason once."""
     absent: dict[str, tuple[Answer | None, list[str]]] = {}
     others: dict[str, None] = {}
-    answers = state.host_capabilities.answers
+    answers = state.capability_answers
     here = answers.get((strategy, source.name))
     for host in state.hosts.listed():
         found = "" if host is source else fault(state, strategy, source, host)

@@ -45,7 +45,9 @@ def review_liveness(state: MasterState, now: float) -> None:
     past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
     for column in np.flatnonzero(up & ~fresh & ~past_lease):
         _suspect(state, table.hosts[column], float(age[column]), now)
-    _note_contact(state, bool((up & ~past_lease).any()), now)
+    # A master that receives nothing from any host may itself be cut off.
+    in_contact = (up & ~past_lease).any()
+    state.contact_since = min(state.contact_since, now) if in_contact else inf
     for column in np.flatnonzero(past_lease):
         _lose(state, table.hosts[column], float(age[column]), float(lease[column]), now)
     for column in np.flatnonzero((suspect | lost) & fresh):
@@ -65,14 +67,6 @@ def lease_end(state: MasterState, host: Host) -> float:
 def _grace(state: MasterState) -> FloatArray:
     """Return the seconds, (H,), by which hosts that report seldom may be silent for longer."""
     return np.maximum(0.0, _REPORTS_MISSED * state.hosts.period - state.settings.suspect)
-
-
-def _note_contact(state: MasterState, in_contact: bool, now: float) -> None:
-    """Note the time since when at least one host is up.
-
-    A master that receives nothing from any host may itself be cut off.
-    """
-    state.contact_since = min(state.contact_since, now) if in_contact else inf
 
 
 def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:

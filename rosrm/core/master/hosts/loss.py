@@ -30,16 +30,16 @@ import numpy as np
 from rosrm.core.master import lifecycle
 from rosrm.core.master.hosts import readoption
 from rosrm.core.master.hosts.fencing import ended_after_loss
-from rosrm.core.master.master_state import (
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration import failover, handoff
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.process import (
     DesiredState,
     Instance,
-    MasterState,
+    LeftBehind,
     Process,
     ProcessPhase,
 )
-from rosrm.core.master.migration import failover, handoff
-from rosrm.core.master.state.hosts import Host, HostCondition
-from rosrm.core.master.state.process import LeftBehind
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim
 
@@ -60,16 +60,15 @@ def detach(state: MasterState, host: Host, lease_end: float, now: float) -> None
 
 
 def _note_phases(state: MasterState, host: Host, now: float) -> None:
-    for number in host.instances:
-        process = state.owned_by(state.instances[number])
+    for instance in state.instances_of(host):
+        process = state.owned_by(instance)
         if process is not None and process.name not in state.migrations:
-            lifecycle.note_phase(state, process, state.instances[number], now)
+            lifecycle.note_phase(state, process, instance, now)
 
 
 def mark_rejoined(state: MasterState, host: Host, now: float) -> None:
     """Restore the phases of a lost host's processes from their last status when it rejoins."""
-    for number in host.instances:
-        instance = state.instances[number]
+    for instance in state.instances_of(host):
         process = state.owned_by(instance)
         if process is None or process.name in state.migrations:
             continue
@@ -87,8 +86,7 @@ def review_lost_hosts(state: MasterState, now: float) -> None:
 def _review(state: MasterState, host: Host, now: float) -> None:
     if now < host.lost_since:
         return
-    for number in sorted(host.instances):
-        instance = state.instances[number]
+    for instance in state.instances_of(host):
         if _is_given_up(state, instance, now):
             _give_up(state, instance, now)
 
@@ -120,12 +118,8 @@ def _may_be_active(state: MasterState, instance: Instance) -> bool:
     migration = state.migrations.get(instance.id.process)
     if migration is None or migration.committed or migration.destination != instance.id:
         return False
-    number = instance.id.number
-    alone = (
-        migration.plan.overlap == 0.0
-        and number in migration.launched
-        and number not in migration.suspended
-    )
+    may_run = instance.id.number in migration.launched - migration.suspended
+    alone = may_run and migration.plan.overlap == 0.0
     return alone or handoff.was_switched(migration)
 
 
@@ -144,9 +138,6 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
 
 def _may_be_readopted(process: Process, instance: Instance) -> bool:
     """Return True if the instance owns the name and was not ordered to stop."""
-    runs_on = process.wanted is DesiredState.RUN and not instance.stopping
-    return (
-        runs_on
-        and process.owner == instance.id.number
-        and process.spec.host_loss.then == "elsewhere"
-    )
+    is_owner = process.owner == instance.id.number
+    to_run = process.wanted is DesiredState.RUN and not instance.stopping
+    return is_owner and to_run and process.spec.host_loss.then == "elsewhere"

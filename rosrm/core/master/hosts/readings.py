@@ -1,4 +1,4 @@
-"""Intake of readings: a batch of a thousand hosts in a few numpy calls."""
+"""Storage of readings: a batch of a thousand hosts in a few numpy calls."""
 
 from __future__ import annotations
 

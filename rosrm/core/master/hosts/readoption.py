@@ -6,9 +6,9 @@ job that has completed in between is complete. If a successor has started, the i
 
 from __future__ import annotations
 
-from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.process import LeftBehind
+from rosrm.core.master.state.process import WAITING, LeftBehind, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import SetRestartPolicy
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
@@ -23,11 +23,7 @@ def readopt_all(state: MasterState, host: Host, now: float) -> None:
 
 
 def readopt(state: MasterState, host: Host, status: InstanceStatus, now: float) -> bool:
-    """Re-adopt one reported instance that was given up, as `readopt_all` does.
-
-    Returns:
-        False: the instance is not one that can be re-adopted.
-    """
+    """Re-adopt one reported instance that was given up; return False if that is impossible."""
     process = state.processes.get(status.instance.process)
     left = None if process is None else process.left_behind
     if process is None or left is None or process.phase not in WAITING:
@@ -42,7 +38,8 @@ def _readopt(
     state: MasterState, process: Process, left: LeftBehind, host: Host, now: float
 ) -> None:
     state.unqueue(process)
-    instance = state.add_instance(InstanceId(process.name, left.number), process.spec, host, now)
+    again = InstanceId(process.name, left.number)
+    instance = state.add_instance(again, host, now, state.estimate(process.spec))
     # A state is set, unlike for a new assignment: if the host does not hold it, it is gone.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
     process.owner, process.left_behind = left.number, None

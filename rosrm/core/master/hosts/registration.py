@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from math import inf
+from typing import Final
 
 import numpy as np
 
@@ -11,13 +13,16 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.reservations import settle_reservation
 from rosrm.core.master.checkpoint import replication
-from rosrm.core.master.commands import Reply
+from rosrm.core.master.commands import RefusalCode, Reply
 from rosrm.core.master.hosts import loss
 from rosrm.core.master.hosts.liveness import lease_end, mark_up
 from rosrm.core.master.hosts.readings import take_readings
-from rosrm.core.master.master_state import DesiredState, MasterState, ProcessPhase
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.recovery.journal_gap import note_seen
+from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.process import DesiredState, ProcessPhase
 from rosrm.extensions.contracts import Intent
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
@@ -27,7 +32,7 @@ from rosrm.model.values import InstanceStatus
 from rosrm.wording import counted
 
 #: Seconds between two records of the same fault of the same host.
-_RECORD_PERIOD = 10.0
+_RECORD_PERIOD: Final = 10.0
 
 
 def host_registered(state: MasterState, event: happened.HostRegistered, now: float) -> None:
@@ -35,19 +40,17 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     description = event.description
     fault = description_fault(description)
     if fault:
-        _refuse_host(state, event, "invalid", fault, now)
-        return
+        raise _refusal(state, event, fault, "invalid", now)
     known = state.hosts.by_name.get(description.name)
     if known is not None and known.description.incarnation == description.incarnation:
         _registered_again(state, known, event, now)
         return
     taken = _name_taken(state, known, event)
     if taken:
-        _refuse_host(state, event, "name_taken", taken, now)
-        return
+        raise _refusal(state, event, taken, "name_taken", now)
     is_new = known is None or known.pruned
     host = state.hosts.register(description, now)
-    host.failing.clear()  # the slave reports what fails in this run
+    host.failing.clear()  # the slave reports the plugins that fail in this run
     if is_new:
         save_host(state, host)
     state.record(
@@ -62,20 +65,15 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     note_seen(state, host.name, event.journal_seen, now)
     replication.note_states(state, host, event.kept, now)  # replicas decide on placement
     loss.mark_rejoined(state, host, now)
-    stopping = [number for number in sorted(host.instances) if state.instances[number].stopping]
+    stopping = [instance for instance in state.instances_of(host) if instance.stopping]
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
-    _stop_again(state, stopping, now)
+    for instance in stopping:  # the former run of the slave may not have carried out the order
+        if instance.id.number in state.instances:
+            lifecycle.stop_instance(state, instance, now)
     _clear_exclusions(state, host)
     _execute_again(state, host)
     reconsider_set_aside(state, now)
     state.emit(Reply(event.request, host_id=host.host_id))
-
-
-def _stop_again(state: MasterState, stopping: list[int], now: float) -> None:
-    """Repeat at once the stops that the former run of a slave may not have carried out."""
-    for number in stopping:
-        if number in state.instances:
-            lifecycle.stop_instance(state, state.instances[number], now)
 
 
 def _live(held: Iterable[InstanceStatus]) -> str:
@@ -91,15 +89,16 @@ def _execute_again(state: MasterState, host: Host) -> None:
             migration.begun = False
 
 
-def _refuse_host(
-    state: MasterState, event: happened.HostRegistered, code: str, why: str, now: float
-) -> None:
+def _refusal(
+    state: MasterState, event: happened.HostRegistered, why: str, code: RefusalCode, now: float
+) -> RequestRefused:
+    """Return the refusal of a registration, and record it."""
     known = state.hosts.by_name.get(event.description.name)
     if known is None:
         state.record(now, EventKind.HOST_REFUSED, why, host=event.description.name)
     else:  # a slave whose name is taken retries for a moment
         _record_seldom(state, known, EventKind.HOST_REFUSED, now, why)
-    state.emit(Reply(event.request, False, code, why))
+    return RequestRefused(why, code)
 
 
 def _registered_again(
@@ -107,8 +106,8 @@ def _registered_again(
 ) -> None:
     """Answer a repeated registration: the first answer was lost, or the request arrived twice.
 
-    Keep all later reports of the slave. The instances in this request may be outdated, so order a
-    full report in sequence.
+    All later reports of the slave count. The instances in this request may be outdated, so the
+    master orders a full report in sequence.
     """
     state.hosts.last_contact[host.column] = now
     replication.note_states(state, host, event.kept, now)
@@ -123,8 +122,8 @@ def _registered_again(
 def _clear_exclusions(state: MasterState, host: Host) -> None:
     """Clear the exclusions and reasons that stem from the former run of a host's slave.
 
-    The slave may have now what it lacked. The master also stops instances there that may have run
-    on while the slave was away.
+    The slave may now have the files and plugins that it lacked. Instances of cancelled processes
+    that were still running there are stopped by the registration.
     """
     for name in state.terminal:
         process = state.processes[name]
@@ -149,17 +148,8 @@ def _name_taken(state: MasterState, known: Host | None, event: happened.HostRegi
 
 def save_host(state: MasterState, host: Host) -> None:
     """Persist the desired state of a host."""
-    state.emit(
-        Intent(
-            "host",
-            host.name,
-            {
-                "host_id": host.host_id,
-                "cordoned": host.cordoned,
-                "draining": host.draining,
-            },
-        )
-    )
+    desired = {"host_id": host.host_id, "cordoned": host.cordoned, "draining": host.draining}
+    state.emit(Intent("host", host.name, desired))
 
 
 def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
@@ -169,16 +159,15 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
     """
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
-        state.emit(Reply(event.request, False, "unknown", "this host is not registered"))
-        return
+        raise RequestRefused("this host is not registered", "unknown")
     if event.kept:
         _detach(state, host, event.kept, now)
         state.emit(Reply(event.request))
         return
     state.hosts.set_condition(host, HostCondition.LEFT)
     state.record(now, EventKind.HOST_LEFT, f"{host.name} leaves: its slave stops", host=host.name)
-    for number in sorted(host.instances):
-        process = state.owned_by(state.instances[number])
+    for instance in state.instances_of(host):
+        process = state.owned_by(instance)
         if process is not None and process.wanted is DesiredState.RUN:
             process.wanted = DesiredState.REQUEUE
             state.save(process)
@@ -198,11 +187,10 @@ def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], no
 
 
 def process_requested(state: MasterState, event: happened.ProcessRequested, now: float) -> None:
-    """Note the open request for work of a host; the answer follows when there is work."""
+    """Note the open request of a host; the answer follows when there is work."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
-        state.emit(Reply(event.request, False, "unknown", "register first"))
-        return
+        raise RequestRefused("register first", "unknown")
     state.hosts.ask(host)
 
 
@@ -215,21 +203,21 @@ def readings_received(state: MasterState, event: happened.ReadingsReceived, now:
     for row in np.flatnonzero(refused):
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
         if host is not None:
-            _record_seldom(
-                state, host, EventKind.READING_REFUSED, now,
+            fault = (
                 f"a reading of {host.name} was refused (NaN, negative, absurd, or a limit outside "
-                f"0..1): usage {_shown(event.usage[row])}, limit {_shown(event.limit[row])}",
-            )  # fmt: skip
+                f"0..1): usage {_shown(event.usage[row])}, limit {_shown(event.limit[row])}"
+            )
+            _record_seldom(state, host, EventKind.READING_REFUSED, now, fault)
 
 
-def _shown(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+def _shown(values: FloatArray) -> str:
     return "[" + ", ".join(f"{value:.3g}" for value in values[:8]) + ", …]"
 
 
 def _record_seldom(
     state: MasterState, host: Host, kind: EventKind, now: float, message: str
 ) -> None:
-    if now - host.recorded_at.get(kind, float("-inf")) >= _RECORD_PERIOD:
+    if now - host.recorded_at.get(kind, -inf) >= _RECORD_PERIOD:
         host.recorded_at[kind] = now
         state.record(now, kind, message, host=host.name)
 
@@ -244,13 +232,8 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
         if instance is None or instance.host is not host:
             continue
         if not (np.isfinite(cpu) and np.isfinite(memory) and cpu >= 0.0 and memory >= 0.0):
-            _record_seldom(
-                state,
-                host,
-                EventKind.READING_REFUSED,
-                now,
-                f"a usage of {instance.id} was refused (NaN or negative)",
-            )
+            fault = f"a usage of {instance.id} was refused (NaN or negative)"
+            _record_seldom(state, host, EventKind.READING_REFUSED, now, fault)
             continue
         instance.seen = {"cpu": float(cpu), "memory": float(memory)}
         for resource, amount in instance.seen.items():

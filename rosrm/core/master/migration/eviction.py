@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
+from math import inf
 from typing import Final
 
 from rosrm.core.master.assignment.assign import demand_amounts, demand_to_move, ranking_of
 from rosrm.core.master.hosts import capabilities
-from rosrm.core.master.master_state import DesiredState, Instance, MasterState, Process
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.start import (
     begin_move,
     moves_under_way,
@@ -29,14 +30,15 @@ from rosrm.core.master.scheduling.feasibility import may_ever_take
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.process import DesiredState, Instance, Process
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
 from rosrm.wording import counted, few, listed
 
 #: Least seconds between two records, with different reasons, that nothing can leave a host.
-_RECORD_PERIOD = 10.0
+_RECORD_PERIOD: Final = 10.0
 #: Most reasons against hosts in one answer.
-_MOST_SAID: Final = 3
+_MOST_REASONS: Final = 3
 _ALONE: Final = "there is no other host"
 
 
@@ -69,9 +71,8 @@ def _note_limits(state: MasterState, now: float) -> None:
             host.over_since.setdefault(name, now)
             if name not in host.over_at:
                 state.record(
-                    now, EventKind.OVER_LIMIT,
-                    f"{host.name} reached its limit of {name}", host=host.name,
-                    facts={"resource": name},
+                    now, EventKind.OVER_LIMIT, f"{host.name} reached its limit of {name}",
+                    host=host.name, facts={"resource": name},
                 )  # fmt: skip
             host.over_at[name] = now
         for name in host.over_since.keys() - names:
@@ -95,7 +96,7 @@ def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
 
 def _evict(state: MasterState, host: Host, now: float) -> None:
     if any(migration.source_host is host for migration in state.migrations.values()):
-        return  # first await the effect of the current migration
+        return  # the effect of the current migration is awaited first
     for resource, since in list(host.over_since.items()):
         if now - since >= state.settings.hysteresis:
             _evict_for_resource(state, host, resource, now)
@@ -120,12 +121,12 @@ def _evict_for_resource(state: MasterState, host: Host, resource: str, now: floa
 
 
 def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
-    held = [state.instances[number] for number in host.instances]
+    held = state.instances_of(host)
     owned = [instance for instance in held if state.owned_by(instance) is not None]
-    return sorted(owned, key=lambda one: (-usage_to_free(one, resource), one.id.number))
+    return sorted(owned, key=lambda one: (-_usage_to_free(one, resource), one.id.number))
 
 
-def usage_to_free(instance: Instance, resource: str) -> float:
+def _usage_to_free(instance: Instance, resource: str) -> float:
     """Return the usage that leaves the host with an instance, in base units of the resource."""
     return instance.seen.get(resource, instance.demand.get(resource, 0.0))
 
@@ -136,7 +137,7 @@ def _why_not_now(
     refusal = why_immovable(state, process)
     if refusal:
         return refusal
-    if usage_to_free(instance, resource) <= 0.0:
+    if _usage_to_free(instance, resource) <= 0.0:
         return f"{process.name} uses no {resource}"
     since_move, cooldown = now - process.moved_at, state.settings.cooldown
     if since_move < cooldown:
@@ -211,7 +212,7 @@ def _is_alone(state: MasterState, source: Host) -> bool:
 def _and_why(state: MasterState, process: Process, source: Host) -> str:
     """Return a few of the reasons of the strategy against hosts; "" for none."""
     faults = capabilities.faults(state, process.spec.migration.strategy or "", source)
-    return "".join(f"; {fault}" for fault in few(faults, _MOST_SAID))
+    return "".join(f"; {fault}" for fault in few(faults, _MOST_REASONS))
 
 
 # --- drain ------------------------------------------------------------------------------------
@@ -229,13 +230,13 @@ def departures(state: MasterState, host: Host) -> str:
 
 def _leaving(state: MasterState, host: Host) -> list[str]:
     """Return the processes with an instance on a host that will leave it or end."""
-    held = [state.instances[number] for number in host.instances]
+    held = state.instances_of(host)
     return sorted({one.id.process for one in held if not _why_it_stays(state, one)})
 
 
 def _staying(state: MasterState, host: Host) -> list[str]:
     """Return the reasons of the processes that cannot leave a host, an equal one once."""
-    held = [state.instances[number] for number in sorted(host.instances)]
+    held = state.instances_of(host)
     reasons = [(one.id.process, reason) for one in held if (reason := _why_it_stays(state, one))]
     return _grouped(reasons + _images_on(state, host))
 
@@ -251,21 +252,17 @@ def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
         predicate = reason.removeprefix(f"{name} ")
         names[predicate, predicate != reason].append(name)
     return [
-        f"{alike[0] if len(alike) == 1 else f'each of {listed(alike)}'} {predicate_text}"
-        if of_it
-        else predicate_text
-        for (predicate_text, of_it), alike in names.items()
+        f"{alike[0] if len(alike) == 1 else f'each of {listed(alike)}'} {text}" if named else text
+        for (text, named), alike in names.items()
     ]
 
 
 def _why_it_stays(state: MasterState, instance: Instance) -> str:
     """Return why an instance can neither leave its host nor is about to end; "" if it can."""
     process, source = state.owned_by(instance), instance.host
-    if (
-        process is None
-        or process.wanted is not DesiredState.RUN
-        or process.name in state.migrations
-    ):
+    if process is None or process.wanted is not DesiredState.RUN:
+        return ""
+    if process.name in state.migrations:
         return ""
     reason = why_never_movable(state, process)
     if reason:
@@ -285,9 +282,9 @@ def _note_drained(state: MasterState, host: Host, now: float) -> None:
     """Record once that no process which can leave a host is left on it."""
     if state.hosts.why_unreachable(host):
         return
-    held = (state.instances[number] for number in host.instances)
-    was, host.drained = host.drained, all(_why_it_stays(state, one) for one in held)
-    if host.drained and not was:
+    held, before = state.instances_of(host), host.drained
+    host.drained = all(_why_it_stays(state, one) for one in held)
+    if host.drained and not before:
         state.record(
             now, EventKind.HOST_DRAINED, f"{host.name} is drained: {departures(state, host)}",
             host=host.name,
@@ -312,12 +309,9 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
 
 def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
     """Return a reason for each image on a host: it is restored in place, so it cannot leave."""
-    names = sorted(state.images.of)
-    of_host = ((name, state.processes[name].image) for name in names)
     return [
         (name, f"{name} is checkpointed: its image stays on {host.name}")
-        for name, image in of_host
-        if image is not None and image.host == host.name
+        for name in state.images_on(host)
     ]
 
 
@@ -326,7 +320,7 @@ def _record_nothing_moves(
 ) -> None:
     why = "; ".join(_grouped(reasons)[:8]) or "it runs no process of this cluster"
     key = f"nothing_moves {what}"
-    soon = now - host.recorded_at.get(key, float("-inf")) < _RECORD_PERIOD
+    soon = now - host.recorded_at.get(key, -inf) < _RECORD_PERIOD
     if soon or host.blocked.get(what) == why:
         return
     host.recorded_at[key], host.blocked[what] = now, why

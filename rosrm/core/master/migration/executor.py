@@ -13,7 +13,7 @@ any       cannot be done      it is left out: an instance that has ended never s
                               An executor that ran and returned no object counts as done
 back      destination active  forward to the commit: in a handoff the destination itself decides;
                               in a restore an executor has found that the process runs
-standby   comes to SWITCH     it is paused, and goes forward once the source has ended
+standby   is SWITCH           it is paused, and goes forward once the source has ended
 ========  ==================  ==============================================================
 
 Cancelling a process turns its migration back; a stuck one is given up, and all its instances are
@@ -24,25 +24,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import inf
-from typing import Any, Final
+from typing import Final
 
 from rosrm.core.master import lifecycle
 from rosrm.core.master.checkpoint import image_requests, images
-from rosrm.core.master.master_state import (
-    DesiredState,
-    MasterState,
-    Migration,
-    Process,
-    ProcessPhase,
-)
+from rosrm.core.master.events import OrderOutcome
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover, handoff
-from rosrm.core.master.migration.steps import (
-    begin,
-    outcome_of,
-    title,
-)
+from rosrm.core.master.migration.steps import begin, outcome_of, title
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
-from rosrm.core.master.state.migration import End
+from rosrm.core.master.state.migration import End, Migration
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import (
     Aim,
@@ -90,13 +82,11 @@ def advance_standby(state: MasterState, migration: Migration, now: float) -> Ste
             if not begin(state, migration, step, now):
                 return StepProgress.PENDING
             if isinstance(step, Configure):
-                migration.deadline = (
-                    inf  # a primary that is silent for long is no fault of its standby
-                )
+                migration.deadline = inf  # the silence of a primary is no fault of its standby
             outcome = outcome_of(state, migration, step, now)
             if outcome is not StepProgress.DONE:
                 return outcome
-        _go_on(state, migration, now)
+        _to_next_step(state, migration, now)
     return StepProgress.DONE
 
 
@@ -109,8 +99,8 @@ def _advance(state: MasterState, migration: Migration, now: float) -> bool:
     ):
         _conclude(state, migration, now)
         return False
-    if isinstance(step, Start) and migration.undo is not None and not _goes_on(state, migration):
-        _go_on(state, migration, now)
+    if isinstance(step, Start) and migration.undo is not None and not _resumes(state, migration):
+        _to_next_step(state, migration, now)
         return True
     if not begin(state, migration, step, now):
         return False
@@ -120,7 +110,7 @@ def _advance(state: MasterState, migration: Migration, now: float) -> bool:
     if isinstance(outcome, StepFailed):
         _failed(state, migration, step, outcome.reason, now)
     else:
-        _next(state, migration, step, now)
+        _done(state, migration, step, now)
     return migration.begun or not migration.stuck
 
 
@@ -140,7 +130,7 @@ def _choose_direction(state: MasterState, migration: Migration, now: float) -> N
             _begin_undo(state, migration, reason, now)
 
 
-def _next(state: MasterState, migration: Migration, step: Step, now: float) -> None:
+def _done(state: MasterState, migration: Migration, step: Step, now: float) -> None:
     what = _COMMITTED[migration.aim] if isinstance(step, Commit) else f"{title(step)}: done"
     state.record(
         now, EventKind.MIGRATION_STEP, f"{migration.process}: {what}", process=migration.process,
@@ -152,7 +142,7 @@ def _next(state: MasterState, migration: Migration, step: Step, now: float) -> N
     elif isinstance(step, Start) and migration.undo is not None:
         process.owner = step.instance.number
         state.save(process)
-    _go_on(state, migration, now)
+    _to_next_step(state, migration, now)
 
 
 def _commit(state: MasterState, migration: Migration, step: Commit, now: float) -> None:
@@ -176,9 +166,11 @@ def _cannot_be_done(state: MasterState, migration: Migration, step: Step, now: f
     if isinstance(step, Execute):
         # A retry would give the same bad result. In a restore, the result may say that the
         # destination is active, so that plan waits until the plugin is corrected.
-        done = migration.bad_result and migration.aim is not Aim.RESTORE
+        answer = migration.answer
+        bad = answer is not None and answer.outcome is OrderOutcome.BAD_RESULT
+        done = bad and migration.aim is not Aim.RESTORE
         return done or image_requests.leave_behind(state, migration, step)
-    if not isinstance(step, (Start, AwaitReady)):
+    if not isinstance(step, Start | AwaitReady):
         return False
     instance = state.instances.get(step.instance.number)
     if instance is not None and instance.state is InstanceState.HELD:
@@ -187,8 +179,8 @@ def _cannot_be_done(state: MasterState, migration: Migration, step: Step, now: f
     return step.instance.number in migration.ended
 
 
-def _go_on(state: MasterState, migration: Migration, now: float) -> None:
-    """Go to the next step, or the next undo."""
+def _to_next_step(state: MasterState, migration: Migration, now: float) -> None:
+    """Turn to the next step, or the next undo."""
     migration.index += 1
     migration.begun = False
     migration.retry_at = now
@@ -214,7 +206,7 @@ def _failed(state: MasterState, migration: Migration, step: Step, reason: str, n
         _begin_undo(state, migration, reason, now)
         return
     if _cannot_be_done(state, migration, step, now):
-        _go_on(state, migration, now)
+        _to_next_step(state, migration, now)
         return
     migration.begun = False
     migration.retry_at = now + state.settings.order_retry
@@ -224,31 +216,23 @@ def _failed(state: MasterState, migration: Migration, step: Step, reason: str, n
         process = state.processes[migration.process]
         why = f"its {migration.aim.value} cannot be {end} yet: {reason}; the master tries again"
         state.set_phase(process, ProcessPhase.STUCK, now, why)
-        state.record(
-            now,
-            EventKind.MIGRATION_STUCK,
-            f"{migration.process} is stuck: {why}",
-            process=migration.process,
-        )
+        message = f"{process.name} is stuck: {why}"
+        state.record(now, EventKind.MIGRATION_STUCK, message, process=process.name)
 
 
 def _begin_undo(state: MasterState, migration: Migration, reason: str, now: float) -> None:
     """Undo every step so far before the commit, the current one included, newest first."""
     migration.failure = reason
     migration.begin_undo()
-    state.record(
-        now,
-        EventKind.MIGRATION_UNDONE,
-        f"the {migration.aim.value} of {migration.process} is undone: {reason}",
-        process=migration.process,
-    )
+    message = f"the {migration.aim.value} of {migration.process} is undone: {reason}"
+    state.record(now, EventKind.MIGRATION_UNDONE, message, process=migration.process)
     state.save_migration(migration)
 
 
 def _go_forward(state: MasterState, migration: Migration, now: float) -> None:
     """Turn forward again, because the destination is active and owns the name."""
-    migration.undo, migration.index, migration.begun = None, migration.commit_index, False
-    migration.retry_at = now
+    migration.undo, migration.index = None, migration.plan.steps.index(migration.commit)
+    migration.begun, migration.retry_at = False, now
     if migration.stuck:
         _not_stuck(state, migration, now)
     state.record(
@@ -267,16 +251,14 @@ def _undo_reason(state: MasterState, migration: Migration) -> str:
     end = migration.ended.get(migration.source.number)
     if end is None:
         return ""
-    excused = (
+    expected = (
         _was_ordered_to_stop(migration, migration.source)
         or handoff.is_switching(migration)
         or _has_left_in_image(migration)
     )
-    return (
-        f"{migration.source} ended during the {migration.aim.value}"
-        if end.completed or not excused
-        else ""
-    )
+    if expected and not end.completed:
+        return ""
+    return f"{migration.source} ended during the {migration.aim.value}"
 
 
 def _has_left_in_image(migration: Migration) -> bool:
@@ -287,8 +269,8 @@ def _has_left_in_image(migration: Migration) -> bool:
     )
 
 
-def _goes_on(state: MasterState, migration: Migration) -> bool:
-    """Return True if the source shall run on: the process is neither cancelled nor completed."""
+def _resumes(state: MasterState, migration: Migration) -> bool:
+    """Return True if the source is to run again: its process is neither cancelled nor completed."""
     end = migration.ended.get(migration.source.number)
     completed = end is not None and end.completed
     return not completed and state.processes[migration.process].wanted is DesiredState.RUN
@@ -322,27 +304,21 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
     for name in migration.source_host.over_since:
         migration.source_host.over_since[name] = now  # first await the effect of this migration
     kind, message = image_requests.ending_of(migration)
+    durations = {
+        name: result["seconds"] for name, result in migration.results.items() if "seconds" in result
+    }
     state.record(
-        now, kind, message,
-        process=migration.process,
+        now, kind, message, process=migration.process,
         host=(migration.destination_host if moved else migration.source_host).name,
         facts={
             "from": migration.source_host.name, "to": migration.destination_host.name,
             "seconds": now - migration.started, "cause": migration.cause,
-            "strategy": migration.strategy,
-            "parts": _parts(migration),
+            "strategy": migration.strategy, "parts": durations,
         },
     )  # fmt: skip
-    if kind == "stayed" and process.decision and process.decision["kind"] == "migrated":
+    if kind is EventKind.STAYED and process.decision and process.decision["kind"] == "migrated":
         process.decision = {**process.decision, "kind": kind}
     _settle_owner(state, process, migration, now)
-
-
-def _parts(migration: Migration) -> dict[str, Any]:
-    """Return the durations that executors report, by their names."""
-    return {
-        name: result["seconds"] for name, result in migration.results.items() if "seconds" in result
-    }
 
 
 def _settle_owner(state: MasterState, process: Process, migration: Migration, now: float) -> None:
@@ -364,11 +340,8 @@ def _end_of_owner(process: Process, migration: Migration) -> End:
     """Return the end of the owner as it would be without the migration."""
     end = migration.ended[process.owner]
     policy = process.spec.restart
-    if (
-        process.owner == migration.source.number
-        and _was_ordered_to_stop(migration, migration.source)
-        and not end.completed
-    ):
+    was_source = process.owner == migration.source.number
+    if was_source and not end.completed and _was_ordered_to_stop(migration, migration.source):
         return replace(end, ordered=True)
     if process.owner in migration.suspended and lifecycle.restarts_after(policy, end.status):
         how = migration.how_ended(InstanceId(process.name, process.owner))

@@ -7,16 +7,17 @@ destination to take over, and the plan continues as usual, forward or back.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.state.migration import End, Migration
+from rosrm.core.master.state.migration import End
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Step
 
-_OVER: Final = frozenset({ReportPhase.FAILED, ReportPhase.ABORTED})
+#: Reports of a standby that no longer follows the state of its primary.
+_GIVEN_UP: Final = frozenset({ReportPhase.FAILED, ReportPhase.ABORTED})
 
 
 def index_of(phase: HandoffPhase, steps: Sequence[Step]) -> int:
@@ -34,9 +35,9 @@ def is_ready(state: MasterState, process: Process) -> bool:
         return False
     if process.wanted is DesiredState.CANCEL:
         return False
-    reported: Mapping[ReportPhase, str] = standby.phases_of(standby.destination)
+    reported = standby.phases_of(standby.destination)
     instance = state.instances.get(standby.destination.number)
-    follows = ReportPhase.READY in reported and not reported.keys() & _OVER
+    follows = ReportPhase.READY in reported and not reported.keys() & _GIVEN_UP
     return follows and instance is not None and not instance.stopping
 
 
@@ -46,9 +47,10 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     Returns:
         False: no standby could take over, or the primary has completed as intended.
     """
-    if _succeeded(end) or not is_ready(state, process):
+    succeeded = end.status.succeeded and not end.ordered and not end.gone
+    if succeeded or not is_ready(state, process):
         return False
-    migration: Migration = state.standbys.pop(process.name)
+    migration = state.standbys.pop(process.name)
     migration.ended[migration.source.number] = end
     migration.index, migration.begun = index_of(HandoffPhase.SWITCH, migration.plan.steps), False
     migration.started, migration.wall = now, state.wall
@@ -56,21 +58,15 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     process.wanted = DesiredState.RUN
     process.left_behind, process.standby_reason = None, ""
     state.migrations[process.name] = migration
-    state.set_phase(
-        process, ProcessPhase.MIGRATING, now, f"its standby takes over: {migration.cause}"
-    )
+    why, host = migration.cause, migration.destination_host.name
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {why}")
+    details = f" ({end.status.message})" if end.status.message else ""
     state.record(
         now, EventKind.FAILED_OVER,
-        f"the standby of {process.name} on {migration.destination_host.name} takes over: "
-        f"{migration.cause}"
-        + (f" ({end.status.message})" if end.status.message else ""),
-        process=process.name, host=migration.destination_host.name,
+        f"the standby of {process.name} on {host} takes over: {why}{details}",
+        process=process.name, host=host,
         facts={"source": migration.source.number, "destination": migration.destination.number},
     )  # fmt: skip
     state.save(process)
     state.save_migration(migration)
     return True
-
-
-def _succeeded(end: End) -> bool:
-    return end.status.succeeded and not end.ordered and not end.gone

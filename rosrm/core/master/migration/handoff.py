@@ -14,7 +14,12 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress, done_if
+from rosrm.core.master.outcomes import (
+    StepFailed,
+    StepOutcome,
+    StepProgress,
+    done_if,
+)
 from rosrm.core.master.state.migration import HandoffReports, Migration
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
@@ -135,8 +140,7 @@ def _note(
         details = f": {event.message}" if is_news else ""
         message = f"{migration.process}#{event.instance} {_REPORTS[event.phase]}{details}"
         state.record(
-            now, EventKind.HANDOFF_REPORTED, message,
-            process=migration.process,
+            now, EventKind.HANDOFF_REPORTED, message, process=migration.process,
             facts={"phase": event.phase.name, "sequence": event.sequence},
         )  # fmt: skip
     reports.phases[event.phase] = reports.message = event.message
@@ -171,7 +175,7 @@ def is_switching(migration: Migration) -> bool:
 # --- outcome of a phase -----------------------------------------------------------------------
 
 
-def outcome(step: Configure, state: MasterState, migration: Migration) -> StepOutcome:
+def outcome(state: MasterState, migration: Migration, step: Configure) -> StepOutcome:
     """Return the outcome of the current phase."""
     return _OUTCOMES[step.phase](state, migration) if step.awaited else StepProgress.DONE
 
@@ -214,12 +218,8 @@ def _resuming(state: MasterState, migration: Migration) -> StepOutcome:
     resumed = ReportPhase.RESUMED in migration.phases_of(migration.source)
     ended = migration.source.number not in state.instances
     # A source without the protocol reports nothing, and never stopped publishing.
-    deaf = not was_switched(migration) and not migration.phases_of(migration.source)
-    return done_if(resumed or ended or deaf)
-
-
-def _at_once(state: MasterState, migration: Migration) -> StepOutcome:
-    return StepProgress.DONE
+    unaware = not was_switched(migration) and not migration.phases_of(migration.source)
+    return done_if(resumed or ended or unaware)
 
 
 _OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Migration], StepOutcome]]] = {
@@ -227,7 +227,7 @@ _OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Migration], StepOu
     HandoffPhase.SWITCH: _switching,
     HandoffPhase.ABORT: _aborting,
     HandoffPhase.RESUME: _resuming,
-    HandoffPhase.DONE: _at_once,
+    HandoffPhase.DONE: lambda _state, _migration: StepProgress.DONE,
 }
 
 
@@ -245,14 +245,14 @@ def was_switched(migration: Migration) -> bool:
 def timed_out(state: MasterState, migration: Migration, step: Configure, now: float) -> StepOutcome:
     """Return the outcome of a phase after its time-out, as `outcome` does."""
     if step.phase is HandoffPhase.RESUME and not was_switched(migration):
-        return StepProgress.DONE  # it was never ordered to be silent
+        return StepProgress.DONE  # the source was never ordered to be silent
     if step.phase is HandoffPhase.ABORT:
         instance = state.instances[migration.destination.number]
         if not instance.stopping:
             _stop_silent_destination(state, migration, now)
             return StepProgress.PENDING
     what = f"{TITLES[step.phase]} took longer than {step.timeout:g} s"
-    return StepFailed(f"{what}: {_waited(migration)}")
+    return StepFailed(f"{what}: {_newest_reports(migration)}", timed_out=True)
 
 
 def _stop_silent_destination(state: MasterState, migration: Migration, now: float) -> None:
@@ -269,22 +269,20 @@ def _stop_silent_destination(state: MasterState, migration: Migration, now: floa
     state.save_migration(migration)
 
 
-def _waited(migration: Migration) -> str:
+def _newest_reports(migration: Migration) -> str:
     """Return the newest report of source and destination, for a time-out."""
-    source, destination = (
-        migration.handoff_reports.get(migration.source.number),
-        migration.handoff_reports.get(migration.destination.number),
-    )
-    if source is None and destination is None:
+    if not migration.handoff_reports:
         return (
             "neither node has reported. Do they use rosrm.node? One that keeps only the "
             "paper's constraints needs `protocol: paper` in the options of its migration"
         )
-    reported = [
-        f"{instance} has not reported"
-        if reports is None
-        else f"{instance} {_REPORTS[list(reports.phases)[-1]]}"
-        + (f": {reports.message}" if reports.message else "")
-        for instance, reports in ((migration.destination, destination), (migration.source, source))
-    ]
-    return "; ".join(reported)
+    both = (migration.destination, migration.source)
+    return "; ".join(f"{one} {_newest_report(migration, one)}" for one in both)
+
+
+def _newest_report(migration: Migration, instance: InstanceId) -> str:
+    reports = migration.handoff_reports.get(instance.number)
+    if reports is None:
+        return "has not reported"
+    details = f": {reports.message}" if reports.message else ""
+    return f"{_REPORTS[list(reports.phases)[-1]]}{details}"

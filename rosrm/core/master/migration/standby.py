@@ -8,7 +8,7 @@ the process             action on its standby
 ======================  =====================================================================
 runs, has none          one is started on another host that has room, as a shadow
 has one that runs       `state_config` names source and standby, until the standby is READY
-has one that gave up    it is stopped; another one is started after a while, ever longer
+has one that gave up    it is stopped; another one is started after a time that doubles
 waits for its restart   the primary is stopped for good, and its end hands over to the standby
 moves                   it is kept until the migration is committed, because that may fail
 has ended               the standby is stopped
@@ -74,7 +74,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         _wait(state, process, f"it can have no standby: {why}", now)
         return False
     state.standbys[process.name] = migration
-    state.reserve_ranked(migration.destination, host, now, ranking)
+    state.reserve(migration.destination, host, now, ranking)
     state.record(
         now, EventKind.STANDBY_BEGUN, f"the standby of {process.name} starts on {host.name}",
         process=process.name, host=host.name, facts={"number": migration.destination.number},
@@ -105,13 +105,11 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
         for label in process.spec.standby.apart_by:
             value = host.description.labels.get(label)
             if value is None:
-                excluded.setdefault(
-                    host.name, f"it has no label {label!r}, in which the standby must differ"
-                )
+                why = f"it has no label {label!r}, in which the standby must differ"
+                excluded.setdefault(host.name, why)
             elif value == labels.get(label):
-                excluded.setdefault(
-                    host.name, f"it has {label}={value} as the host of the primary has"
-                )
+                why = f"it has {label}={value} as the host of the primary has"
+                excluded.setdefault(host.name, why)
     return Demand(process.spec, own.amounts, own.estimated, excluded, reads=state.declared.reads)
 
 
@@ -127,24 +125,19 @@ def _wait(state: MasterState, process: Process, why: str, now: float) -> None:
 
 
 def _review(state: MasterState, migration: Migration, now: float) -> None:
-    process, instance = (
-        state.processes[migration.process],
-        state.instances.get(migration.destination.number),
-    )
+    process = state.processes[migration.process]
+    instance = state.instances.get(migration.destination.number)
     move = state.migrations.get(migration.process)
-    if (
-        process.wanted is DesiredState.CANCEL
-        or process.phase.is_terminal
-        or (move and move.committed)
-    ):
-        end_standby(state, process, now)
+    has_ended = process.wanted is DesiredState.CANCEL or process.phase.is_terminal
+    if has_ended or (move and move.committed):
+        _end(state, process, now)
     elif move is not None:
         return
     elif instance is None:
         how = migration.how_ended(migration.destination)
         _lost(state, process, migration, f"{migration.destination} ended: {how}", now)
     elif process.owner != migration.source.number:
-        end_standby(state, process, now)
+        _end(state, process, now)
     elif instance.host.draining:
         _lost(state, process, migration, f"{instance.host.name} is being drained", now)
     elif (gave_up := _why_given_up(migration)) is not None:
@@ -192,11 +185,11 @@ def _lost(state: MasterState, process: Process, migration: Migration, why: str, 
         f"{process.name} has no standby: {why}; the master starts another one in {wait:g} s",
         process=process.name, host=migration.destination_host.name,
     )  # fmt: skip
-    end_standby(state, process, now)
+    _end(state, process, now)
     process.standby_reason = f"it has no standby: {why}"
 
 
-def end_standby(state: MasterState, process: Process, now: float) -> None:
+def _end(state: MasterState, process: Process, now: float) -> None:
     """Stop the standby of a process, if it has one."""
     migration = state.standbys.pop(process.name, None)
     if migration is None:

@@ -6,17 +6,20 @@ from dataclasses import replace
 from typing import Final
 
 from rosrm.core.master.checkpoint.images import reason_of
-from rosrm.core.master.master_state import MasterState, Migration, Process, ProcessPhase
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.steps import title
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.plugin_failures import why_broken
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.migration import Migration
+from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.errors import PluginError, describe_fault
 from rosrm.extensions.plugin_calls import required
 from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
+from rosrm.model.values import InstanceId
 from rosrm.wording import listed, standing
 
 #: Method of a strategy that plans for each aim.
@@ -29,7 +32,7 @@ def begin_move(
     """Begin a planned migration to a host that has room for the process by a ranking."""
     destination, cause = migration.destination_host, migration.cause
     state.migrations[process.name] = migration
-    state.reserve_ranked(migration.destination, destination, now, ranking)
+    state.reserve(migration.destination, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
     state.record(
         now, EventKind.MIGRATION_BEGUN,
@@ -38,8 +41,8 @@ def begin_move(
         process=process.name, host=destination.name,
         facts={
             "from": migration.source_host.name, "to": destination.name,
-            "strategy": migration.strategy,
-            "cause": cause, "steps": [title(step) for step in migration.plan.steps],
+            "strategy": migration.strategy, "cause": cause,
+            "steps": [title(step) for step in migration.plan.steps],
             "overlap": migration.plan.overlap, "source": migration.source.number,
             "destination": migration.destination.number,
         },
@@ -53,18 +56,36 @@ def plan_move(
 ) -> Migration | Rejected:
     """Return the planned migration of a running process, or why there is no plan."""
     source = state.instances[process.owner]
-    name = process.spec.migration.strategy or ""
-    move = Move(
-        process.spec, source.id, source.host.name, state.new_instance_id(process),
-        destination.name, state.new_instance_id(process), int(state.wall),
-        source.node_name or process.name,
+    strategy, node = process.spec.migration.strategy or "", source.node_name or process.name
+    move = move_of(state, process, source.id, source.host, destination, node)
+    return planned(state, strategy, move, cause, now)
+
+
+def move_of(
+    state: MasterState, process: Process, source: InstanceId, here: Host, there: Host, node: str
+) -> Move:
+    """Return the input of a strategy that plans for a process; both hosts may be the same.
+
+    `node`: name of the source's node, without its namespace.
+    """
+    return Move(
+        process.spec, source, here.name, state.new_instance_id(process), there.name,
+        state.new_instance_id(process), int(state.wall), node,
     )  # fmt: skip
-    plan = proposed(state, name, move)
+
+
+def planned(
+    state: MasterState, strategy: str, move: Move, cause: str, now: float, aim: Aim = Aim.MOVE
+) -> Migration | Rejected:
+    """Return the migration that executes the plan of a strategy, or why there is no plan."""
+    plan = proposed(state, strategy, move, aim)
     if isinstance(plan, Rejected):
         return plan
+    hosts = state.hosts.by_name
     return Migration(
-        process.name, plan, name, source.id, source.host, move.destination, destination, cause,
-        now, move.source_node, destination_node(plan, move), state.wall,
+        move.spec.name, plan, strategy, move.source, hosts[move.source_host], move.destination,
+        hosts[move.destination_host], cause, now, move.source_node, _destination_node(plan, move),
+        state.wall, aim=aim,
     )  # fmt: skip
 
 
@@ -87,9 +108,8 @@ def why_immovable(state: MasterState, process: Process) -> str:
     if process.phase is ProcessPhase.CHECKPOINTED:
         return f"{process.name} is checkpointed: {reason_of(state, process)}; restore it first"
     if process.phase is not ProcessPhase.RUNNING:
-        return (
-            f"{process.name} {standing(process.phase.value)}; only a running process can be moved"
-        )
+        stands = standing(process.phase.value)
+        return f"{process.name} {stands}; only a running process can be moved"
     standby = state.standbys.get(process.name)
     others = process.instances - {process.owner, standby.destination.number if standby else 0}
     if others:
@@ -137,11 +157,9 @@ def _lacking(state: MasterState, migration: Migration) -> tuple[str, Host] | Non
     """Return an executor that a plan names and the host that lacks it."""
     if migration.strategy not in state.declared.executors:
         return None  # its offer is unknown
-    commit = migration.plan.steps[migration.commit_index]
-    named = [*executors_of(migration.plan)]
-    if isinstance(commit, Commit) and commit.image:
-        named.append((commit.image, migration.source_host.name))
-    for executor, name in named:
+    image = migration.commit.image
+    dropping = [(image, migration.source_host.name)] if image else []
+    for executor, name in [*executors_of(migration.plan), *dropping]:
         host = state.hosts.by_name[name]
         if _has_not(host, executor):
             return executor, host
@@ -161,20 +179,14 @@ def _lacks(state: MasterState, migration: Migration, executor: str, hosts: list[
     faults = [f"on {name} {reason}" for name, reason in broken if reason]
     if faults:
         return f"{lacking}: {faults[0]}; then restart its slave"
-    return (
-        f"{lacking}: install {brought_by} "
-        f"on {hosts[0] if one else 'them'} and restart {'its slave' if one else 'their slaves'}"
-    )
+    where, slaves = (hosts[0], "its slave") if one else ("them", "their slaves")
+    return f"{lacking}: install {brought_by} on {where} and restart {slaves}"
 
 
 def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | Rejected:
-    """Return the plan of a strategy, or why there is none, with the name of a strategy that raises.
+    """Return the plan of a named strategy, or why there is none.
 
-    Args:
-        state: guards the call, and holds the declarations of the strategy's offer.
-        name: of the strategy.
-        move: to be planned; the strategy's options are added to it.
-        aim: of the plan.
+    The options of the strategy are added to `move`. A strategy that raises is named.
     """
 
     def ask() -> Plan | Rejected:
@@ -209,7 +221,7 @@ def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
     return ""
 
 
-def destination_node(plan: Plan, move: Move) -> str:
+def _destination_node(plan: Plan, move: Move) -> str:
     """Return the name of the destination's node, without its namespace."""
     starts = (step for step in plan.steps if isinstance(step, Start))
     aliases = [step.node_name for step in starts if step.instance == move.destination]

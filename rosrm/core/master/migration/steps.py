@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import singledispatch
 from typing import Any, Final
 
 from rosrm.core.master import lifecycle
-from rosrm.core.master.events import BAD_RESULT, OrderAnswered
-from rosrm.core.master.master_state import MasterState, Migration
+from rosrm.core.master.events import OrderAnswered, OrderOutcome
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import handoff
-from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress, done_if
-from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.outcomes import (
+    StepFailed,
+    StepOutcome,
+    StepProgress,
+    done_if,
+)
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.pending_orders import MigrationStep
 from rosrm.model.orders import Order, RunExecutor, SetRestartPolicy, StartInstance, StopInstance
 from rosrm.model.plan import (
@@ -50,7 +55,7 @@ def begin(state: MasterState, migration: Migration, step: Step, now: float) -> b
         return True
     if now < migration.retry_at or _is_expected(state, migration, step):
         return False
-    migration.begun, migration.answer, migration.bad_result = True, None, False
+    migration.begun, migration.answer = True, None
     migration.deadline = now + max(step.timeout, 0.0)
     _give_order(state, migration, step, now)
     return True
@@ -73,7 +78,7 @@ def _is_expected(state: MasterState, migration: Migration, step: Step) -> bool:
 
 def outcome_of(state: MasterState, migration: Migration, step: Step, now: float) -> StepOutcome:
     """Return the outcome of the current step; repeat its order or end it at its time-out."""
-    outcome = _outcome(step, state, migration, now)
+    outcome = _outcome(state, migration, step, now)
     if outcome is StepProgress.PENDING:
         _give_order_again(state, migration, step, now)
         if now >= migration.deadline:
@@ -88,10 +93,11 @@ def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
     whatever the answer.
     """
     migration = state.migrations.get(process)
-    if migration is None or migration.order != event.order or event.code == "timeout":
+    if migration is None or migration.order != event.order:
         return
-    migration.answer = (event.accepted, event.message or event.code)
-    migration.bad_result = event.code == BAD_RESULT
+    if event.outcome is OrderOutcome.TIMEOUT:
+        return
+    migration.answer = event
     step = migration.current_step
     if event.accepted and event.result and isinstance(step, Execute):
         migration.results[step.executor] = event.result
@@ -112,19 +118,12 @@ def _give_order(state: MasterState, migration: Migration, step: Step, now: float
     if isinstance(step, Start) and _in_the_way(state, migration, step, now):
         return
     host = state.hosts.by_name[step.host]
-    order = _order_of(state, migration, step, host, now)
-    migration.order, migration.order_at = (
-        state.send(host, order, MigrationStep(migration.process)),
-        now,
-    )
+    order, purpose = _order_of(state, migration, step, now), MigrationStep(migration.process)
+    migration.order, migration.order_at = state.send(host, order, purpose), now
 
 
 def _order_of(
-    state: MasterState,
-    migration: Migration,
-    step: Start | Stop | Execute | SetRestart,
-    host: Host,
-    now: float,
+    state: MasterState, migration: Migration, step: Start | Stop | Execute | SetRestart, now: float
 ) -> Order:
     """Return the order of a step; note in its migration what the order changes."""
     if isinstance(step, Stop):
@@ -136,16 +135,14 @@ def _order_of(
             migration.suspended.add(step.instance.number)
             state.save_migration(migration)
         return SetRestartPolicy(step.instance, step.restart)
-    return _start(state, migration, step, host, now)
+    return _start(state, migration, step, now)
 
 
 def _arguments(migration: Migration, step: Execute) -> Mapping[str, Any]:
     return {**step.arguments, "results": migration.results} if migration.results else step.arguments
 
 
-def _start(
-    state: MasterState, migration: Migration, step: Start, host: Host, now: float
-) -> StartInstance:
+def _start(state: MasterState, migration: Migration, step: Start, now: float) -> StartInstance:
     process = state.processes[migration.process]
     spec, number = process.spec, step.instance.number
     migration.launched.add(number)
@@ -153,18 +150,17 @@ def _start(
         migration.suspended.add(number)
     state.save_migration(migration)
     if number not in state.instances and number not in migration.ended:
-        state.add_instance(step.instance, spec, host, now)
+        state.add_instance(step.instance, state.hosts.by_name[step.host], now, state.estimate(spec))
         state.save(process)
     instance = state.instances.get(number)
     if instance is not None and instance.node_name != step.node_name:
         instance.node_name = step.node_name
         state.save(process)
     remapped = replace(spec, remappings={**spec.remappings, **step.remappings})
-    return StartInstance(
-        state.assignment(
-            step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
-        )
+    assignment = state.assignment(
+        step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
     )
+    return StartInstance(assignment)
 
 
 def _in_the_way(state: MasterState, migration: Migration, step: Start, now: float) -> bool:
@@ -208,7 +204,7 @@ def _has_waited(migration: Migration, step: Step) -> bool:
 
 
 def _timed_out(state: MasterState, migration: Migration, step: Step, now: float) -> StepOutcome:
-    """Return the outcome of a step after its time-out, as `_outcome` does."""
+    """Return the outcome of a step after its time-out."""
     if isinstance(step, Configure):
         return handoff.timed_out(state, migration, step, now)
     if isinstance(step, AwaitReleased):
@@ -216,84 +212,73 @@ def _timed_out(state: MasterState, migration: Migration, step: Step, now: float)
     return StepFailed(f"{title(step)} took longer than {step.timeout:g} s", timed_out=True)
 
 
-@singledispatch
-def _outcome(step: Any, state: MasterState, migration: Migration, now: float) -> StepOutcome:
-    """Return the outcome of the current step."""
-    raise TypeError(step)
+def _outcome(state: MasterState, migration: Migration, step: Step, now: float) -> StepOutcome:
+    """Return the outcome of the current step before its time-out."""
+    match step:
+        case Start():
+            return _of_start(state, migration, step)
+        case AwaitReady():
+            return _of_wait(state, migration, step, now)
+        case AwaitReleased():
+            return done_if(handoff.is_released(state, migration, step.instance))
+        case Stop():
+            return done_if(step.instance.number not in state.instances)
+        case Configure():
+            return handoff.outcome(state, migration, step)
+        case SetRestart():
+            return _of_restart_policy(state, migration, step)
+        case Commit():
+            return StepProgress.DONE
+        case Execute():
+            return _of_executor(state, migration, step)
 
 
-@_outcome.register
-def _(step: Start, state: MasterState, migration: Migration, now: float) -> StepOutcome:
+def _of_start(state: MasterState, migration: Migration, step: Start) -> StepOutcome:
     if step.instance.number in migration.ended:
-        return StepFailed(
-            f"{step.instance} ended on {step.host}: {migration.how_ended(step.instance)}"
-        )
-    instance = state.instances.get(step.instance.number)
+        return _ended(migration, step)
+    instance, answer = state.instances.get(step.instance.number), migration.answer
     if instance is None:
         return StepProgress.PENDING  # another instance has to end first
-    if migration.answer is not None and not migration.answer[0]:
-        return StepFailed(f"{step.host} refused to start {step.instance}: {migration.answer[1]}")
+    if answer is not None and not answer.accepted:
+        return StepFailed(f"{step.host} refused to start {step.instance}: {answer.reason}")
     return done_if(instance.is_running)
 
 
-@_outcome.register
-def _(step: AwaitReady, state: MasterState, migration: Migration, now: float) -> StepOutcome:
+def _of_wait(state: MasterState, migration: Migration, step: AwaitReady, now: float) -> StepOutcome:
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return StepFailed(
-            f"{step.instance} ended on {step.host}: {migration.how_ended(step.instance)}"
-        )
-    settled = instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
-    return done_if(settled)
+        return _ended(migration, step)
+    return done_if(instance.state is InstanceState.READY and now >= instance.ready_at + step.settle)
 
 
-@_outcome.register
-def _(step: AwaitReleased, state: MasterState, migration: Migration, now: float) -> StepOutcome:
-    return done_if(handoff.is_released(state, migration, step.instance))
+def _ended(migration: Migration, step: Start | AwaitReady) -> StepFailed:
+    how = migration.how_ended(step.instance)
+    return StepFailed(f"{step.instance} ended on {step.host}: {how}")
 
 
-@_outcome.register
-def _(step: Stop, state: MasterState, migration: Migration, now: float) -> StepOutcome:
-    return done_if(step.instance.number not in state.instances)
-
-
-@_outcome.register
-def _(step: Configure, state: MasterState, migration: Migration, now: float) -> StepOutcome:
-    return handoff.outcome(step, state, migration)
-
-
-@_outcome.register
-def _(step: SetRestart, state: MasterState, migration: Migration, now: float) -> StepOutcome:
+def _of_restart_policy(state: MasterState, migration: Migration, step: SetRestart) -> StepOutcome:
     if step.instance.number not in state.instances:
         return StepProgress.DONE  # it has ended: there is nothing to restart
-    if migration.answer is None:
-        return StepProgress.PENDING
-    accepted, message = migration.answer
-    if accepted:
-        return StepProgress.DONE
+    answer = migration.answer
+    if answer is None or answer.accepted:
+        return done_if(answer is not None)
     what = f"the restart policy of {step.instance}"
-    return StepFailed(f"{step.host} did not change {what}: {message}")
+    return StepFailed(f"{step.host} did not change {what}: {answer.reason}")
 
 
-@_outcome.register
-def _(step: Commit, state: MasterState, migration: Migration, now: float) -> StepOutcome:
-    return StepProgress.DONE
-
-
-@_outcome.register
-def _(step: Execute, state: MasterState, migration: Migration, now: float) -> StepOutcome:
-    if migration.answer is None:
-        away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
-        # A frozen instance must not wait for a long time-out. A plan that may not stop waits for
-        # the host as long as an instance of it may be there.
-        turns = migration.undo is None and not migration.committed
-        if away and (turns or instances_are_gone(state, migration, step)):
-            return StepFailed(f"{step.host} {away}")
-        return StepProgress.PENDING
-    accepted, message = migration.answer
-    if accepted:
+def _of_executor(state: MasterState, migration: Migration, step: Execute) -> StepOutcome:
+    answer = migration.answer
+    if answer is not None and answer.accepted:
         return StepProgress.DONE
-    return StepFailed(f"{step.executor} failed on {step.host}: {message}")
+    if answer is not None:
+        return StepFailed(f"{step.executor} failed on {step.host}: {answer.reason}")
+    away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
+    # A frozen instance must not wait for a long time-out. A plan that may not stop waits for the
+    # host as long as an instance of it may be there.
+    may_stop = migration.undo is None and not migration.committed
+    if away and (may_stop or instances_are_gone(state, migration, step)):
+        return StepFailed(f"{step.host} {away}")
+    return StepProgress.PENDING
 
 
 def instances_are_gone(state: MasterState, migration: Migration, step: Execute) -> bool:
@@ -304,9 +289,8 @@ def instances_are_gone(state: MasterState, migration: Migration, step: Execute) 
     host = state.hosts.by_name[step.host]
     if migration.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:
         return False
-    return all(
-        one.host is not host for one in state.instances_of(state.processes[migration.process])
-    )
+    process = state.processes[migration.process]
+    return all(one.host is not host for one in state.instances_of(process))
 
 
 def title(step: Step) -> str:

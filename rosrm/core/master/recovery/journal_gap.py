@@ -1,4 +1,4 @@
-"""Journal gap: records that the journal has lost, as far as hosts show, and the master's response.
+"""Journal gap: records that the journal has lost, as hosts show, and the master's response.
 
 A power failure (with `sync: normal`), a damaged write-ahead log or a restored older copy silently
 removes the newest part of a journal. Its decisions are unknown: submissions, and the hosts on which
@@ -11,8 +11,8 @@ reported yet. So the master assigns no work
 An unknown instance is stopped when its host registers, and a queued process of the same name waits
 for that end.
 
-A master that ends while it waits leaves the wait to the next one, as an intent `unheard`. A loss
-that hosts have shown is waited for again, for a whole lease.
+A master that ends while it waits leaves the wait to the next one, as an intent `unheard`. After a
+loss that hosts have shown, the next master waits again for a whole lease.
 """
 
 from __future__ import annotations
@@ -30,27 +30,25 @@ _KEY: Final = "unheard"
 
 
 def begin(state: MasterState, newest: int, now: float, *, machine_rebooted: bool) -> None:
-    """Begin the wait of a master that starts.
-
-    Args:
-        state: as it was restored.
-        newest: sequence of the newest record that the journal holds.
-        machine_rebooted: the machine was rebooted, and the last master had not stopped before.
+    """Begin the wait of a master that starts, with its restored state.
 
     Afterwards `intent` is to become durable, together with the mark that distinguishes the next
     start from this one.
+
+    Args:
+        newest: sequence of the newest record that the journal holds.
+        machine_rebooted: the machine was rebooted, and the last master had not stopped before.
     """
-    state.journal_gap.newest, state.journal_gap.started = newest, now
-    state.journal_gap.machine_rebooted = state.journal_gap.machine_rebooted or machine_rebooted
+    gap = state.journal_gap
+    gap.newest, gap.started = newest, now
+    gap.machine_rebooted = gap.machine_rebooted or machine_rebooted
 
 
 def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
     """Take over the wait of a former master from the intents `cluster`."""
-    stored = cluster.get(_KEY, {})
-    state.journal_gap.machine_rebooted, state.journal_gap.records_missing = (
-        bool(stored.get("fell")),
-        bool(stored.get("short")),
-    )
+    stored, gap = cluster.get(_KEY, {}), state.journal_gap
+    gap.machine_rebooted = bool(stored.get("fell"))
+    gap.records_missing = bool(stored.get("short"))
 
 
 def intent(state: MasterState) -> Intent:
@@ -61,7 +59,7 @@ def intent(state: MasterState) -> Intent:
 
 
 def review(state: MasterState, now: float) -> None:
-    """End the waits that are over, in the journal too."""
+    """End each wait whose condition no longer holds, in the journal too."""
     gap = state.journal_gap
     before = (gap.machine_rebooted, gap.records_missing)
     if not any(before):
@@ -86,17 +84,13 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     if left > 0 and not gap.records_missing:
         gap.records_missing = True
         state.emit(intent(state))
-    wait = (
-        f"; the master assigns no work for {left:.1f} s, until all hosts have reported"
-        if left > 0
-        else ""
-    )
+    wait = f"; the master assigns no work for {left:.1f} s, until all hosts have reported"
     records = counted(lost, "record is", "records are")
     state.record(
         now, EventKind.JOURNAL_BEHIND,
         f"the journal has lost its newest records: {host} has seen record {seen}, and the journal "
         f"ended at {gap.newest} when this master started: {records} missing. Repeat the "
-        f"requests in them; processes that these started are stopped{wait}",
+        f"requests in them; processes that these started are stopped{wait if left > 0 else ''}",
         host=host, facts={"seen": seen, "newest": gap.newest, "lost": lost},
     )  # fmt: skip
 

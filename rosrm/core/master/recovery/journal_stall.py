@@ -1,7 +1,7 @@
-"""Journal stall: intake of readings while no decision can be made durable.
+"""Journal stall: readings that arrive while no decision can be made durable.
 
 The core's own clock stops during a stall. So no deadline passes, and no host becomes lost because
-of a full disk; deadlines continue where they were when the stall ends.
+of a full disk. Deadlines continue where they were when the stall ends.
 """
 
 from __future__ import annotations

@@ -7,18 +7,12 @@ from typing import Any
 
 from rosrm.core.master.checkpoint import images
 from rosrm.core.master.lifecycle import adopt_to_stop, note_awaited_ends, note_phase
-from rosrm.core.master.master_state import (
-    DesiredState,
-    MasterState,
-    Migration,
-    Process,
-    ProcessPhase,
-)
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state import migration
 from rosrm.core.master.state import process as processes
-from rosrm.core.master.state.migration import end_from_dict, undo_steps
-from rosrm.core.master.state.process import Image, LeftBehind
+from rosrm.core.master.state.migration import Migration, end_from_dict, undo_steps
+from rosrm.core.master.state.process import DesiredState, Image, LeftBehind, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
 from rosrm.model.codec import fields_from_plain, from_plain
 from rosrm.model.event_kinds import EventKind
@@ -107,7 +101,7 @@ def _restore_instances(
             continue
         instance = InstanceId(process.name, int(number))
         if instance.number == item["owner"] or instance.number in moving:
-            held = state.add_instance(instance, process.spec, host, now)
+            held = state.add_instance(instance, host, now, state.estimate(process.spec))
             held.node_name = str(aliases.get(number, ""))
         else:
             adopt_to_stop(state, instance, host, now)
@@ -131,7 +125,7 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
 def _restore_standby(
     state: MasterState, process: Process, item: Mapping[str, Any], now: float
 ) -> None:
-    """Restore the standby of a process; it learns its primary again and reports its phase."""
+    """Restore the standby of a process; its node reports its phase again."""
     standby = item.get("standby")
     if standby is None or int(standby["destination"]) not in process.instances:
         return
@@ -169,14 +163,11 @@ def _restore_move(
     for number in process.instances.intersection(move["stopping"]):
         state.instances[number].stopping = True
     state.set_phase(process, ProcessPhase.MIGRATING, now, restored.progress_text)
-    goes_on = (
-        f"continues its move to {restored.destination_host.name}"
-        if restored.aim is Aim.MOVE
-        else f"continues: {restored.progress_text}"
-    )
+    host, is_move = restored.destination_host.name, restored.aim is Aim.MOVE
+    continues = f" its move to {host}" if is_move else f": {restored.progress_text}"
     state.record(
-        now, EventKind.MIGRATION_TAKEN_UP, f"{process.name} {goes_on}",
-        process=process.name, host=restored.destination_host.name,
+        now, EventKind.MIGRATION_TAKEN_UP, f"{process.name} continues{continues}",
+        process=process.name, host=host,
     )  # fmt: skip
     return True
 
@@ -215,9 +206,6 @@ def _discard_migration(
         source.recalled = True
     for instance in state.instances_of(process):
         instance.stopping = instance.id.number != process.owner
-    state.record(
-        now, EventKind.MIGRATION_FORGOTTEN,
-        f"the move of {process.name} cannot be continued: {fault}",
-        process=process.name,
-    )  # fmt: skip
+    message = f"the move of {process.name} cannot be continued: {fault}"
+    state.record(now, EventKind.MIGRATION_FORGOTTEN, message, process=process.name)
     state.emit(Intent("migration", process.name, None))

@@ -67,8 +67,8 @@ def candidates(
     if more is not None:
         busy, processes = busy + need * more, processes + more
     return Candidates(
-        table, demand, columns, table.resources, need, cells,
-        busy=busy, processes=processes, bound=table.bound[columns],
+        table=table, demand=demand, columns=columns, resources=table.resources, need=need,
+        cells=cells, busy=busy, processes=processes, bound=table.bound[columns],
     )  # fmt: skip
 
 

@@ -26,8 +26,6 @@ from rosrm.wording import one_line
 
 #: An explanation names every host up to this many, else the best of those that fit.
 _NAMED_HOSTS: Final = 16
-
-
 #: Kind of a decision; "": it has none yet.
 DecisionKind = Literal["", "assigned", "set_aside", "waits", "migrated"]
 
@@ -92,10 +90,8 @@ class Decision(Lazy):
     """The outcome for one process; as a mapping, it has the form of the event record.
 
     Attributes:
-        kind: "assigned", "waits", "migrated", "stayed" (its migration was undone), ...
         column: of the chosen host; -1: none fits now.
-        policy: name of the policy that decided, and which was left out.
-        needs: base units by resource.
+        policy: name of the policy that decided, and of those that were left out.
         omitted: verdict to the number of hosts with it, beside those that are named.
     """
 
@@ -112,11 +108,6 @@ class Decision(Lazy):
         self._moment = moment
 
     @property
-    def needs(self) -> Mapping[str, float]:
-        """Base units by resource."""
-        return self._moment.hosts.demand.amounts
-
-    @property
     def verdicts(self) -> tuple[Verdict, ...]:
         """Return the verdicts on up to 16 hosts; the chosen one first."""
         return _verdicts(self._moment, chosen=self.column >= 0)
@@ -128,7 +119,7 @@ class Decision(Lazy):
             "kind": self.kind,
             "policy": self.policy,
             "chosen": verdicts[0].host if self.column >= 0 else None,
-            "need": dict(self.needs),
+            "need": dict(self._moment.hosts.demand.amounts),
             "hosts": [verdict.to_json() for verdict in verdicts],
             "omitted": dict(self.omitted),
         }

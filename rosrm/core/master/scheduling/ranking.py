@@ -35,7 +35,7 @@ from rosrm.extensions.plugin_calls import PluginCalls
 #: Equal scores: the host with fewer processes goes first, then the one registered first.
 TIE: Final = 1e-9
 #: Number of runners-up that an explanation names beside the chosen host, of many hosts.
-RUNNERS_UP: Final = 3
+_RUNNERS_UP: Final = 3
 #: Number of equal processes on one host that are judged in one call.
 _AT_A_TIME: Final = 8
 
@@ -122,7 +122,7 @@ class Ranking:
     def _find_lowest(self) -> list[int]:
         value = self._preferred()
         found, were = [], []
-        for _ in range(1 + RUNNERS_UP):
+        for _ in range(1 + _RUNNERS_UP):
             column = int(value.argmin())
             was = value[column]
             if was == np.inf:
@@ -217,7 +217,7 @@ class Ranking:
 
 
 def _tiers(table: HostTable, demand: Demand) -> IntArray | None:
-    """Return the tier of each host, (H,), lower first; None: all are alike.
+    """Return the tier of each host, (H,), lower first; None: all are equal.
 
     Avoided labels count up, preferred labels and hosts count down.
     """

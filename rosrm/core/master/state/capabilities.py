@@ -1,9 +1,9 @@
-"""Capabilities: the answer of each host about each strategy that does not work on all hosts."""
+"""Capability of a host: its answer about a strategy that does not work on every host."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 
 from rosrm.core.master.commands import OrderId
@@ -26,10 +26,3 @@ class Answer:
     facts: Mapping[str, str] | None = None
     reason: str = ""
     ask_at: float = inf
-
-
-@dataclass(slots=True)
-class HostCapabilities:
-    """The answers by strategy and host, for all strategies that do not work on every host."""
-
-    answers: dict[tuple[str, str], Answer] = field(default_factory=dict)

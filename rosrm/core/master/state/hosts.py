@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -32,7 +32,7 @@ _MOST_GUESSED: Final = 0.5
 
 
 class HostCondition(IntEnum):
-    """Liveness of a host; from LOST on the host is gone until it registers or rejoins."""
+    """Liveness of a host; from LOST on, it is away until it registers or rejoins."""
 
     UP = 0
     SUSPECT = 1
@@ -63,8 +63,8 @@ class Host:
         column: of this host in the arrays of `HostTable`.
         instances: numbers of the instances that it holds or that are assigned to it.
         over_since: resource name to the time since when it is over its limit.
-        over_at: resource name to the time at which it was last seen over its limit; only resources
-            whose excess is on record without its end.
+        over_at: resource name to the time of its last reading over the limit; only resources whose
+            excess is on record without its end.
         drained: it is draining, and no process is left on it that can leave.
         pruned: it is in no listing, until it registers.
         recorded_at: kind of a record that is not repeated at once, to the time of the record.
@@ -103,10 +103,10 @@ class Host:
 
 
 class HostTable(HostColumns):
-    """Every known host.
+    """All known hosts.
 
     Attributes:
-        version: grows with every change that touches many hosts.
+        version: grows with every change that concerns many hosts.
         touched: columns that single assignments and ends have changed since `version` grew.
     """
 
@@ -175,11 +175,16 @@ class HostTable(HostColumns):
         self.set_condition(host, HostCondition.LEFT)
 
     def find(self, host_id: int, incarnation: int) -> Host | None:
-        """Return the host of this number; None if the incarnation differs."""
+        """Return the host of this number; None: there is none with this incarnation."""
         column = host_id - 1
         if not 0 <= column < len(self.hosts) or int(self.incarnation[column]) != incarnation:
             return None
         return self.hosts[column]
+
+    def up(self, name: str) -> Host | None:
+        """Return the host of a name if it is up."""
+        host = self.by_name.get(name)
+        return host if host and self.condition_of(host) is HostCondition.UP else None
 
     def listed(self) -> Sequence[Host]:
         """Return every host that was not pruned; cached, because each decision needs them."""
@@ -203,7 +208,7 @@ class HostTable(HostColumns):
         self.touched.clear()
 
     def ask(self, host: Host) -> None:
-        """Note a request for work. The readings show how much; before the first, none is given."""
+        """Note a request for work; the host gets none before its first reading."""
         if not self.asking[host.column]:
             self.asking[host.column] = True
             self.changed()
@@ -272,13 +277,11 @@ class HostTable(HostColumns):
             amount = amounts.get(name, 0.0)
             if amount <= 0.0:
                 continue
-            part = np.divide(amount, self.capacity[row, columns], out=need[row])
-            if name in estimated:
+            is_guess, capacity = name in estimated, self.capacity[row, columns]
+            part = np.divide(amount, capacity, out=need[row])
+            if is_guess:
                 np.fmin(part, _MOST_GUESSED * self.limit[row, columns], out=part)
-                absent = 0.0
-            else:
-                absent = np.inf
-            part[np.isnan(self.capacity[row, columns])] = absent
+            part[np.isnan(capacity)] = 0.0 if is_guess else np.inf
         return need
 
     def without_reading(self) -> BoolArray:
@@ -321,7 +324,7 @@ class HostTable(HostColumns):
         return np.flatnonzero(over & (self.condition == HostCondition.UP))
 
     def statuses_missing(self) -> IntArray:
-        """Return the columns of hosts with missing statuses, by their report or since a loss."""
+        """Return the columns of hosts with missing statuses, by their reading or after a loss."""
         behind = (self.reported > self.status_sequence) | self.report_due
         return np.flatnonzero(behind & (self.condition == HostCondition.UP))
 
@@ -331,18 +334,16 @@ class HostTable(HostColumns):
             self.report_due[host.column] = report_due
             self.changed()
 
-    def note_statuses(self, host: Host, sequence: int, now: float) -> bool | None:
-        """Note the sequence of a status batch.
-
-        Returns:
-            None: older than the newest; True: the next; False: one before it was missed.
-        """
+    def note_statuses(
+        self, host: Host, sequence: int, now: float
+    ) -> Literal["late", "next", "after a gap"]:
+        """Note the sequence of a status batch, and return its place in the order of batches."""
         newest = int(self.status_sequence[host.column])
         if sequence <= newest:
-            return None
+            return "late"
         self.status_sequence[host.column] = sequence
         self.last_contact[host.column] = now
-        return sequence == newest + 1
+        return "next" if sequence == newest + 1 else "after a gap"
 
     def is_accepting(self, host: Host) -> bool:
         """Return True if a host is under all its limits and has asked for work."""

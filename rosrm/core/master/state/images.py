@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 
 from rosrm.core.master.commands import OrderId
 
@@ -25,7 +26,7 @@ class UnwantedImage:
     drop: str
     numbers: tuple[int, ...]
     order: OrderId | None = None
-    ask_at: float = float("-inf")
+    ask_at: float = -inf
 
 
 @dataclass(slots=True)

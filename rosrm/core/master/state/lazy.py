@@ -1,9 +1,13 @@
-"""Mapping that is rendered when first read, because most facts are never read."""
+"""Mappings that are rendered when first read, because most facts are never read."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
+
+from rosrm.model.codec import to_plain
+from rosrm.model.plan import Plan
+from rosrm.model.values import ProcessSpec
 
 
 class Lazy(Mapping[str, Any]):
@@ -34,3 +38,18 @@ class Lazy(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return repr(self._made())
+
+
+class Plain(Lazy):
+    """A spec or a plan as JSON, rendered once for all the intents that contain it."""
+
+    __slots__ = ("_value",)
+
+    def __init__(self, value: ProcessSpec | Plan) -> None:
+        super().__init__()
+        self._value = value
+
+    def render(self) -> Mapping[str, Any]:
+        """Return all fields of the value."""
+        plain: Mapping[str, Any] = to_plain(self._value)
+        return plain

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from rosrm.model.values import ProcessSpec
+from rosrm.model.values import EMPTY, ProcessSpec
 
 #: Weight of the newest run: the mean follows a changed program within a few runs.
 _NEWEST: Final = 0.3
@@ -17,10 +17,13 @@ _NOTICEABLE: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Needs in base units, and which of them are mere estimates."""
+    """Needs in base units by resource, and the resources whose amount is not declared."""
 
     amounts: Mapping[str, float]
-    estimated: frozenset[str]
+    estimated: frozenset[str] = frozenset()
+
+
+NO_NEEDS: Final = Estimate(EMPTY)
 
 
 class LearnedNeeds:

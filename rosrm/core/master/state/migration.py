@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.core.master.commands import OrderId
+from rosrm.core.master.events import OrderAnswered
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.lazy import Lazy
-from rosrm.model.codec import fields_from_plain, fields_to_plain, to_plain
+from rosrm.core.master.state.lazy import Plain
+from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
 from rosrm.model.values import InstanceId, InstanceStatus
 from rosrm.wording import one_line
@@ -44,21 +45,6 @@ class HandoffReports:
     message: str = ""
 
 
-class PlainPlan(Lazy):
-    """A plan as JSON, rendered once for all the intents that contain it."""
-
-    __slots__ = ("_plan",)
-
-    def __init__(self, plan: Plan) -> None:
-        super().__init__()
-        self._plan = plan
-
-    def render(self) -> Mapping[str, Any]:
-        """Return all fields of the plan."""
-        plain: Mapping[str, Any] = to_plain(self._plan)
-        return plain
-
-
 @dataclass(slots=True)
 class Migration:
     """A migration: the execution of a plan.
@@ -76,8 +62,7 @@ class Migration:
         begun: the current step has been ordered.
         order: of the current step; None: it has none.
         stuck: a step that must be done failed; it is retried from `retry_at` on.
-        answer: of the slave to the order of the current step: accepted, message.
-        bad_result: the executor of the current step ran to its end, but returned no JSON object.
+        answer: of the slave to the order of the current step; None: it has not answered.
         launched: numbers of the instances that were ordered to start.
         suspended: numbers of the instances whose slave was ordered not to restart them. A later
             order may have allowed it again: its answer may arrive before the report of an end.
@@ -112,8 +97,7 @@ class Migration:
     failure: str = ""
     stuck: bool = False
     retry_at: float = 0.0
-    answer: tuple[bool, str] | None = None
-    bad_result: bool = False
+    answer: OrderAnswered | None = None
     launched: set[int] = field(default_factory=set)
     suspended: set[int] = field(default_factory=set)
     ended: dict[int, End] = field(default_factory=dict)
@@ -121,10 +105,10 @@ class Migration:
     taking_over: bool = False
     results: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     aim: Aim = Aim.MOVE
-    plain_plan: PlainPlan = field(init=False)
+    plain_plan: Plain = field(init=False)
 
     def __post_init__(self) -> None:
-        self.plain_plan = PlainPlan(self.plan)
+        self.plain_plan = Plain(self.plan)
 
     @property
     def current_step(self) -> Step | None:
@@ -163,25 +147,23 @@ class Migration:
         }[self.aim]
 
     @property
-    def commit_index(self) -> int:
-        """Return the index of the plan's commit."""
-        return next(at for at, step in enumerate(self.plan.steps) if isinstance(step, Commit))
+    def commit(self) -> Commit:
+        """Return the commit of the plan."""
+        return next(step for step in self.plan.steps if isinstance(step, Commit))
 
     def begin_undo(self) -> None:
-        """Undo from now on every step so far, the current one included, newest first."""
+        """Turn to the undo of every step so far, the current one included, newest first."""
         self.turned_at = self.index
         self.undo = undo_steps(self.plan, self.turned_at)
         self.index, self.begun = 0, False
 
     def how_ended(self, instance: InstanceId) -> str:
-        """Return a text on the end of one of its instances."""
+        """Return how one of its instances ended, in words."""
         end = self.ended.get(instance.number)
         if end is None:
             return "it was never started"
-        status = end.status
-        return (
-            one_line(status.message) or f"exit code {status.exit_code}, signal {status.exit_signal}"
-        )
+        codes = f"exit code {end.status.exit_code}, signal {end.status.exit_signal}"
+        return one_line(end.status.message) or codes
 
     def phases_of(self, instance: InstanceId) -> Mapping[ReportPhase, str]:
         """Return all phases that the source or the destination has reported."""
@@ -207,11 +189,8 @@ _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")
 def migration_to_dict(migration: Migration, stopping: Sequence[int]) -> dict[str, Any]:
     """Return all facts about a migration that a restarted master needs.
 
-    Reports of a handoff are left out, because the nodes send them again.
-
-    Args:
-        migration: the migration.
-        stopping: numbers of its instances that were ordered to stop.
+    Reports of a handoff are left out, because the nodes send them again. `stopping`: numbers of its
+    instances that were ordered to stop.
     """
     return {
         "plan": migration.plain_plan, "back": migration.undo is not None,

@@ -8,11 +8,11 @@ from enum import Enum
 from math import inf
 from typing import Any, Final
 
+from rosrm.core.master.graph_names import node_of
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.lazy import Lazy
-from rosrm.model.codec import to_plain
+from rosrm.core.master.state.lazy import Plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
 
@@ -42,6 +42,8 @@ class ProcessPhase(str, Enum):
 
 
 _TERMINAL: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
+#: Phases of processes that wait for a host.
+WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 
 
 class DesiredState(str, Enum):
@@ -54,18 +56,18 @@ class DesiredState(str, Enum):
 
 @dataclass(slots=True)
 class Instance:
-    """One run of a process on one host, as the master sees it.
+    """One start of a process on one host, as the master sees it.
 
     Attributes:
-        state: as last reported by the slave; None: assigned, nothing reported yet.
-        reserved: (R',) reservation on its host, fractions.
+        since: time of the assignment.
         demand: base units that the assignment reserved.
         estimated: resources whose amount is an estimate and stops counting after `settle`.
-        since: time of the assignment.
+        reserved: (R',) reservation on its host, fractions.
+        state: as last reported by the slave; None: assigned, nothing reported yet.
         seen: newest usage in base units.
         peak: highest usage seen.
-        settled: its estimates no longer count.
         restarting: it was ordered to restart, and no report shows the restart yet.
+        settled: its estimates no longer count.
         redelivered: the assignment was delivered again, because its slave did not accept it.
         recalled: a former run of the master ordered it to stop, so its end counts as ordered.
         at_once: it is to end without delay, because another instance owns the name.
@@ -112,13 +114,7 @@ _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 @dataclass(frozen=True, slots=True)
 class LeftBehind:
-    """The owning instance of a process on a host that was lost, as long as it has no successor.
-
-    Attributes:
-        number: of the instance.
-        host: name of the host.
-        node_name: name of its node, where that is not the process's name.
-    """
+    """The owning instance of a process on a host that was lost, as long as it has no successor."""
 
     number: int
     host: str
@@ -148,21 +144,6 @@ class Image:
     needs: Mapping[str, float] = field(default_factory=dict)
 
 
-class PlainSpec(Lazy):
-    """A spec as JSON, rendered once for all the intents that contain it."""
-
-    __slots__ = ("_spec",)
-
-    def __init__(self, spec: ProcessSpec) -> None:
-        super().__init__()
-        self._spec = spec
-
-    def render(self) -> Mapping[str, Any]:
-        """Return all fields of the spec."""
-        plain: Mapping[str, Any] = to_plain(self._spec)
-        return plain
-
-
 #: Fields of a process that the journal has unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
@@ -179,7 +160,8 @@ class Process:
             journal has it.
         wall: unix time at which its phase began.
         phase_before_loss: its phase when its host was lost, with the start of that phase (`since`
-            and `wall`); None: its host reports, or the process has another phase since.
+            and `wall`); None: its host reports, or the process has had another phase since.
+        wanted: its desired state.
         born: lowest number that an instance of it can have; snapshots of lower ones are void.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
@@ -194,6 +176,7 @@ class Process:
         standby_tries: standbys that were lost, one after the other.
         standby_reason: condition of its standby, for listings.
         demand: its demand, with the version of the learned needs in it.
+        node: the node that it adds to the ROS graph, as `node_of` returns it.
     """
 
     spec: ProcessSpec
@@ -207,7 +190,7 @@ class Process:
     excluded: dict[str, str] = field(default_factory=dict)
     born: int = 0
     migrations: int = 0
-    moved_at: float = float("-inf")
+    moved_at: float = -inf
     exit_code: int | None = None
     ended_on: str = ""
     wall: float = 0.0
@@ -222,10 +205,11 @@ class Process:
     standby_reason: str = ""
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     demand: tuple[int, Demand] | None = None
-    plain: PlainSpec = field(init=False)
+    plain: Plain = field(init=False)
+    node: str = field(init=False)
 
     def __post_init__(self) -> None:
-        self.plain = PlainSpec(self.spec)
+        self.plain, self.node = Plain(self.spec), node_of(self.spec)
 
     @property
     def name(self) -> str:

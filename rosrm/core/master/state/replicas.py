@@ -1,4 +1,4 @@
-"""Index of state replicas as reported by slaves. Not persisted.
+"""Index of snapshots and their replicas, as reported by slaves. Not persisted.
 
 Each report of a host is complete and replaces its former one.
 """
@@ -74,8 +74,8 @@ class ReplicaIndex:
         known = self._of.get(process)
         if known is None:
             return ()
-        found = [(one.age, name) for name, one in known.items() if one.number >= since]
-        return tuple(name for _, name in sorted(found, key=lambda one: one[0], reverse=True))
+        found = [name for name, one in known.items() if one.number >= since]
+        return tuple(sorted(found, key=lambda name: known[name].age, reverse=True))
 
     def processes(self) -> list[str]:
         """Return all processes with a snapshot anywhere."""
@@ -136,11 +136,11 @@ class ReplicationState:
         """
         known = self.replicas.hosts_of(process, since)
         last_order = self.last_orders.get(process)
-        asked = (
-            last_order.choice.hosts if last_order is not None and last_order.number >= since else ()
-        )
+        chosen: tuple[str, ...] = ()
+        if last_order is not None and last_order.number >= since:
+            chosen = last_order.choice.hosts
         return tuple(
             name
-            for name in (*(name for name in asked if name not in known), *known)
+            for name in (*(name for name in chosen if name not in known), *known)
             if name in hosts.by_name and hosts.condition_of(hosts.by_name[name]) in _IN_REACH
         )
