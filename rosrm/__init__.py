@@ -7,7 +7,7 @@ watches it, and moves it with its state. All that a Python program or a plugin n
     import rosrm
 
     with rosrm.Client() as client:                 # a running `rosrm master`
-        client.submit({"name": "talker", "command": ["ros2", "run", "demo_nodes_py", "talker"]})
+        client.submit({"name": "talker", "package": "demo_nodes_py", "executable": "talker"})
         client.wait("talker", timeout=30.0)
         for row in client.list_processes():
             print(row.name, row.state, row.host)

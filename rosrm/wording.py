@@ -130,6 +130,8 @@ def amount(value: float, unit: str) -> str:
         return "?"
     if unit in ("B", "B/s"):
         return size(value) + unit[1:]
+    if unit == "core" and 0.0 < value < 0.001:
+        return "under 0.001 cores"
     return f"{value:.3g}" + {"core": " cores", "1": "", "": ""}.get(unit, f" {unit}")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from typer import BadParameter, Typer
 from typer.core import TyperCommand, TyperGroup
@@ -38,6 +38,8 @@ DISTRIBUTIONS: Final = {"criu": "rosrm-criu", "lab": "rosrm-lab", "simulate": "r
 _UNCUT: Final = 1000
 #: Duplicate marks of repetition, as in "WORK......" and "[NAME...]...".
 _DOTS_TWICE: Final = re.compile(r"(\.\.\.\]?)\.\.\.")
+#: Base of all errors of a command line. typer exports no name for it.
+_UsageError: Final = cast(type[Any], BadParameter.__mro__[1])
 _BRACES: Final = str.maketrans("", "", "{}")
 
 
@@ -50,6 +52,10 @@ class PlainCommand(TyperCommand):
             return super().parse_args(ctx, args)
         except BadParameter as error:
             error.message = error.message.removeprefix("Value error, ")
+            raise
+        except _UsageError as error:
+            if "extra argument" in error.message and any(one.name == "to" for one in self.params):
+                error.message += ". The destination is an option: --to HOST"
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:

@@ -48,6 +48,29 @@ _WANTED: Final = {
 
 _UNKNOWN_KEY: Final = frozenset({"unexpected_keyword_argument", "extra_forbidden"})
 
+#: Keys of ROS 2 launch, Nomad, Kubernetes and Docker, and the equivalent keys of rosrm.
+_ELSEWHERE: Final = {
+    word: key
+    for key, words in (
+        ("labels", "host hosts machine machines node_selector nodeSelector affinity constraints"),
+        ("needs", "resources requests memory cpu gpu"),
+        ("command", "cmd entrypoint"),
+        ("executable", "exec"),
+        ("package", "pkg"),
+        ("arguments", "args"),
+        ("parameters", "params param"),
+        ("remappings", "remap"),
+        ("namespace", "ns"),
+        ("environment", "env"),
+        ("working_directory", "cwd workdir workingDir"),
+        ("restart", "respawn"),
+        ("kind", "type"),
+    )
+    for word in words.split()
+}
+#: Similarity from which a key counts as misspelt, not as a key of another tool.
+_MISSPELT: Final = 0.8
+
 #: Wording of each bound of annotated_types.
 _BOUNDS: Final = {
     "greater_than": "greater than",
@@ -84,7 +107,7 @@ def salvaged(wanted: type[T], node: Node, problems: Problems) -> tuple[T | None,
 
     Returns:
         The value, with the defaults of wrong members (None: a member without a default is wrong),
-        and the keys of the wrong members. An unknown key counts as the known one closest to it.
+        and the keys of the wrong members. An unknown key counts as the one that its message names.
     """
     faults = Problems()
     value = validated(wanted, node, faults)
@@ -97,7 +120,7 @@ def salvaged(wanted: type[T], node: Node, problems: Problems) -> tuple[T | None,
         if name in known and not any(_lies_in(item, place) for place, _ in faults.found)
     }  # fmt: skip
     wrong = set(node.items) - set(right)
-    meant = {close for name in wrong - set(known) for close in get_close_matches(name, known, 1)}
+    meant = {close for name in wrong - set(known) for close in _closest_key(name, known)}
     value = validated(wanted, Node(right, node.place, node.key_place), Problems())
     return value, frozenset(wrong & set(known) | meant)
 
@@ -122,7 +145,18 @@ def described(value: Any) -> str:
 
 def near(given: str, allowed: Mapping[str, Any] | list[str] | tuple[str, ...]) -> str:
     """Return '; did you mean X?' or '.', followed by the list of allowed names."""
-    close = get_close_matches(given, list(allowed), 1)
+    return _meant(get_close_matches(given, list(allowed), 1), allowed)
+
+
+def _closest_key(given: str, allowed: list[str]) -> list[str]:
+    """Return the key that an unknown one stands for, as a list of one; [] if there is none."""
+    misspelt = get_close_matches(given, allowed, 1, _MISSPELT)
+    equivalent = [key for key in allowed if key == _ELSEWHERE.get(given)]
+    return misspelt or equivalent or get_close_matches(given, allowed, 1)
+
+
+def _meant(close: list[str], allowed: Iterable[str]) -> str:
+    """Return the text after an unknown name: the name that is meant, and the allowed ones."""
     meant = f"; did you mean {close[0]!r}?" if close else "."
     return f"{meant} Allowed: {', '.join(allowed) or 'none'}"
 
@@ -141,9 +175,9 @@ def _note(
     if error["type"] in _UNKNOWN_KEY:
         inside = _named(path[:-1], where)
         note = f"unknown key {path[-1]!r}" + (f" in {inside}" if inside else "")
-        problems.add(
-            target.key_place or target.place, note + near(str(path[-1]), _keys(wanted, path[:-1]))
-        )
+        allowed = _keys(wanted, path[:-1])
+        note += _meant(_closest_key(str(path[-1]), allowed), allowed)
+        problems.add(target.key_place or target.place, note)
         return
     prefix = _named(path, where)
     problems.add(target.place, (f"{prefix}: " if prefix else "") + _said(error))

@@ -50,7 +50,7 @@ def test_spans_have_at_most_two_units(value, text):
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [(0.5, "core", "0.5 cores"), (5e6, "B/s", "5.0 MB/s"), (3, "", "3"), (2, "lux", "2 lux"),
-     (float("nan"), "B", "?")],
+     (float("nan"), "B", "?"), (8.31e-05, "core", "under 0.001 cores"), (0.0, "core", "0 cores")],
 )  # fmt: skip
 def test_amounts_carry_the_unit_of_their_resource(value, unit, text):
     assert amount(value, unit) == text

@@ -20,6 +20,8 @@ _DECIDED: Final = {
     "set_aside": "No host may take {process}",
 }
 _STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "full": "yellow"}
+#: Decimals of a score: more are the rounding errors of a sum, such as 1.4e-17.
+_DECIMALS: Final = 9
 _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 
 
@@ -94,7 +96,7 @@ def _sentence(name: str, decision: Mapping[str, Any]) -> Text:
 
 def _needs(need: Mapping[str, float]) -> Text:
     amounts = [f"{name} {amount(value, _UNITS.get(name, ''))}" for name, value in need.items()]
-    return Text(f"Needs that were counted: {', '.join(amounts) or 'none'}.")
+    return Text(f"Needs, declared or estimated: {', '.join(amounts) or 'none'}.")
 
 
 def _hosts(hosts: list[Mapping[str, Any]]) -> RenderableType:
@@ -105,7 +107,7 @@ def _hosts(hosts: list[Mapping[str, Any]]) -> RenderableType:
         made.add_row(
             Text(host["name"]),
             Text(verdict, _STYLES.get(verdict, "")),
-            "" if score is None else f"{score:.4g}",
+            "" if score is None else f"{round(score, _DECIMALS) + 0.0:.4g}",
             Text(host.get("reason") or ""),
         )
     return made

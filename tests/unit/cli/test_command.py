@@ -47,6 +47,14 @@ def test_a_verb_of_another_tool_names_the_command_that_does_as_much(rosrm, verb,
     assert result.err.splitlines()[-1] == f"Error: No such command '{verb}'. {hint}"
 
 
+def test_a_destination_without_its_option_names_the_option(rosrm):
+    result = rosrm("migrate", "talker", "beta")
+    assert result.code == 2
+    said = result.err.splitlines()[-1]
+    assert "(beta)" in said
+    assert said.endswith("The destination is an option: --to HOST")
+
+
 def commands():
     """Yield every command, with the arguments that select it."""
     group = typer.main.get_command(app)

@@ -207,12 +207,19 @@ def test_explain_shows_every_host_with_its_score_or_veto(rosrm, client):
     assert lines[2].startswith(
         "The master assigned talker to alpha 61 s ago. Scoring policy: weighted;"
     )
-    assert "Needs that were counted: memory 64.0 MB, cpu 0.5 cores." in out
+    assert "Needs, declared or estimated: memory 64.0 MB, cpu 0.5 cores." in out
     for expected in ("0.4123", "memory 0.79 of 0.8", "too near its limit", "vetoed"):
         assert expected in out
     assert "and 5 more hosts cannot take it now" in out
     assert "at a higher score" not in out
     assert "62 s ago  submitted          talker was submitted" in out
+
+
+def test_explain_prints_the_rounding_error_of_a_score_as_zero():
+    host = {"name": "alpha", "verdict": "chosen", "score": 1.3877787807814457e-17}
+    made = explain.render({**STORY, "decision": {**STORY["decision"], "hosts": [host]}})
+    (line,) = [line for line in drawn(made) if line.startswith("alpha")]
+    assert line.split() == ["alpha", "chosen", "0"]
 
 
 def drawn(made, width=60):

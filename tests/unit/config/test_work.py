@@ -219,6 +219,9 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ("name: a, command: x, needs: {memory: lots}", "needs.memory: 'lots' is not a number"),
         ('name: a, command: "echo \'x"', "cannot be split into words: No closing quotation"),
         ("name: a, comand: x", "unknown key 'comand'; did you mean 'command'?"),
+        ("name: a, command: x, hosts: [b]", "unknown key 'hosts'; did you mean 'labels'?"),
+        ("name: a, command: x, cwd: /b", "unknown key 'cwd'; did you mean 'working_directory'?"),
+        ("name: a, command: x, memory: 1GB", "unknown key 'memory'; did you mean 'needs'?"),
         ("name: a, command: x, labels: {need: {}}", "unknown key 'need' in labels"),
         ("name: a, module: x, ros: true, remappings: [[a]]", "remappings: a mapping is required"),
     ],
@@ -246,8 +249,12 @@ def test_a_conflict_of_keys_is_reported_along_with_a_wrong_key(refusal, entry, s
 
 
 @pytest.mark.parametrize(
-    "entry", ["comand: x", "package: [p], executable: e, parameters: {b: 1}", "module: 5, ros: 3"]
-)
+    "entry",
+    [
+        "comand: x", "pkg: p, exec: e", "package: [p], executable: e, parameters: {b: 1}",
+        "module: 5, ros: 3",
+    ],
+)  # fmt: skip
 def test_an_unreadable_key_is_not_reported_as_missing(refusal, entry):
     """Errors that only follow from the first one are left out."""
     said = refusal(load_work, f"processes: [{{name: a, {entry}}}]")
