@@ -61,7 +61,7 @@ def test_a_checkpoint_ends_the_process_and_leaves_its_image() -> None:
     assert not cluster.submit(process("p")).accepted
     told = row(cluster)
     assert (told["host"], told["reason"]) == ("a", "its image is on a")
-    assert cluster.told("checkpointed") == ["p is checkpointed: its image is on a"]
+    assert cluster.recorded("checkpointed") == ["p is checkpointed: its image is on a"]
     assert not cluster.intents["migration"]
     cluster.wait(60.0)
     assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("checkpointed", [], {1})
@@ -79,7 +79,7 @@ def test_a_restore_goes_on_from_the_image() -> None:
     assert shelf.machine.programs[instance].restart == policy
     assert cluster["p"].image is None
     assert cluster["p"].migrations == 0
-    assert cluster.told("restored") == ["p was restored from its image on a"]
+    assert cluster.recorded("restored") == ["p was restored from its image on a"]
     assert cluster.checkpoint("p").accepted
     assert shelf.images == {instance.number}
 
@@ -108,7 +108,7 @@ def test_a_restored_process_that_ends_before_its_plan_does_follows_its_policy() 
     shelf.machine.executors["await"] = end_after
     cluster.restore("p")
     cluster.wait(1.0)
-    assert "p was restored from its image" in cluster.told("restored")[0]
+    assert "p was restored from its image" in cluster.recorded("restored")[0]
     assert (cluster.where("p"), cluster["p"].image, shelf.images) == ([], None, set())
     assert cluster.phase("p") == "failed"
 
@@ -124,7 +124,7 @@ def test_what_cannot_be_dumped_runs_on_and_the_reason_is_said() -> None:
     cluster.checkpoint("p")
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert shelf.machine.programs[shelf.machine.find("p")].restart == policy
-    (said,) = cluster.told("checkpoint_failed")
+    (said,) = cluster.recorded("checkpoint_failed")
     assert said == (
         "p was not checkpointed and still runs on a: freeze failed on a: file descriptor 7 is a "
         "pipe"
@@ -143,7 +143,7 @@ def test_a_restore_that_fails_leaves_the_image_where_it_was(step: str) -> None:
     assert "its pid 7 is in use here" in row(cluster)["reason"]
     assert "its image is on a; it was not restored" in row(cluster)["reason"]
     assert cluster.state.hosts.processes.tolist() == [0]
-    assert "p stays checkpointed on a" in cluster.told("restore_failed")[0]
+    assert "p stays checkpointed on a" in cluster.recorded("restore_failed")[0]
     cluster.restart_master()
     assert "its pid 7 is in use here" in row(cluster)["reason"]
     shelf.trouble.clear()
@@ -172,7 +172,7 @@ def test_a_process_that_was_restored_is_not_put_back() -> None:
     cluster.restore("p")
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("running", ["a"], set())
-    assert cluster.told("migration_redone") == [
+    assert cluster.recorded("migration_redone") == [
         f"the restore of p is finished after all: p#{cluster['p'].owner} is active"
     ]
 
@@ -339,7 +339,7 @@ def test_a_drained_host_says_that_images_stay() -> None:
     _, cluster = checkpointed()
     cluster.set_host("a", "drain")
     cluster.wait(0.5)
-    (message,) = cluster.told("host_drained")
+    (message,) = cluster.recorded("host_drained")
     assert "p is checkpointed: its image stays on a" in message
 
 
@@ -347,7 +347,7 @@ def test_the_record_of_a_checkpoint_names_its_requester() -> None:
     """The record names the requester as the cause of the plan."""
     _, cluster = playing()
     cluster.ask(happened.CheckpointRequested, "p", "anna@desk:42")
-    (message,) = cluster.told("checkpoint_begun")
+    (message,) = cluster.recorded("checkpoint_begun")
     assert message.endswith("; asked for by anna@desk:42")
 
 
@@ -374,7 +374,7 @@ def test_an_image_that_nobody_wants_is_removed(end: str) -> None:
     cluster.wait(1.0)
     assert shelf.images == set()
     assert cluster["p"].image is None
-    assert cluster.told("image_removed") == ["the image of p was removed from a"]
+    assert cluster.recorded("image_removed") == ["the image of p was removed from a"]
     assert not cluster.intents["cluster"].get("unwanted_images")
     phase, alive = (cluster.phase("p"), cluster.where("p"))
     assert (phase, alive) == (("cancelled", []) if end == "cancel" else ("running", ["a"]))
@@ -401,7 +401,7 @@ def test_a_removal_that_fails_is_tried_again() -> None:
     shelf.trouble["drop"] = "read-only file system"
     cluster.cancel("p")
     cluster.wait(1.0)
-    assert "was not removed from a: read-only file system" in cluster.told("image_left")[0]
+    assert "was not removed from a: read-only file system" in cluster.recorded("image_left")[0]
     shelf.trouble.clear()
     cluster.wait(61.0)
     assert shelf.images == set()

@@ -125,7 +125,7 @@ def test_a_source_that_is_lost_goes_elsewhere(executor: str, how: str) -> None:
     move_and_lose(cluster, executor, of="b", lost="a", how=how)
     wait(cluster, LEASE + 3.0)
     runs_alone(cluster, "b", "c")
-    assert cluster.told("given_up") == ["p#1 is given up: a is lost"]
+    assert cluster.recorded("given_up") == ["p#1 is given up: a is lost"]
     back(cluster, "a", how)
     runs_alone(cluster, "b", "c")
     nothing_else(cluster)
@@ -181,7 +181,7 @@ def test_a_source_that_is_given_up_is_followed_by_its_image(then: str) -> None:
     machine.slow.add(AWAIT_RESTORED)
     cluster.migrate("p", "b")
     wait(cluster, LEASE + 2.0)
-    assert cluster.told("given_up") == ["p#1 is given up: a is lost"]
+    assert cluster.recorded("given_up") == ["p#1 is given up: a is lost"]
     assert not heard(cluster)
     cluster.tell(machine.answers.pop())
     wait(cluster, 3.0)
@@ -215,7 +215,7 @@ def test_a_source_s_host_that_is_silent_for_a_while_is_waited_for() -> None:
     move_and_lose(cluster, FETCH, of="b", lost="a", heard=True)
     wait(cluster, LEASE - 3.0)
     back(cluster, "a")
-    assert not cluster.told("given_up")
+    assert not cluster.recorded("given_up")
     runs_alone(cluster, "a")
     assert cluster["p"].owner == first
 
@@ -227,7 +227,7 @@ def test_the_end_of_a_source_whose_host_is_silent_for_a_while_is_waited_for() ->
     wait(cluster, LEASE - 3.0)
     assert ("p" in cluster.state.migrations, heard(cluster)) == (True, ["b"])
     back(cluster, "a")
-    assert not cluster.told("given_up")
+    assert not cluster.recorded("given_up")
     runs_alone(cluster, "b")
     nothing_else(cluster)
 
@@ -287,7 +287,7 @@ def test_a_source_s_slave_that_stops_leaves_nobody_waiting(then: str) -> None:
     host(cluster, "b").mute.add(FETCH)
     cluster.migrate("p", "b")
     host(cluster, "a").mute.add(GO_ON)
-    cluster.leave(host(cluster, "a"))
+    cluster.leave("a")
     host(cluster, "a").connected = False
     wait(cluster, 3.0)
     runs_alone(cluster, "b", "c")
@@ -300,7 +300,7 @@ def test_a_destination_s_slave_that_stops_in_the_fetch_lets_the_source_go_on(the
     first = cluster["p"].owner
     host(cluster, "b").mute.add(FETCH)
     cluster.migrate("p", "b")
-    cluster.leave(host(cluster, "b"))
+    cluster.leave("b")
     host(cluster, "b").connected = False
     wait(cluster, 1.0)
     runs_alone(cluster, "a")
@@ -318,7 +318,7 @@ def test_a_source_that_is_lost_after_the_commit_has_no_say(then: str, how: str) 
     move_and_lose(cluster, JOIN, of="b", lost="a", how=how, heard=True)
     wait(cluster, LEASE + 3.0)
     runs_alone(cluster, "b")
-    assert cluster.told("migrated") == ["p moved from a to b"]
+    assert cluster.recorded("migrated") == ["p moved from a to b"]
     back(cluster, "a", how)
     runs_alone(cluster, "b")
     nothing_else(cluster)
@@ -330,7 +330,7 @@ def test_a_source_s_slave_that_stops_after_the_commit_has_no_say(then: str) -> N
     cluster = story(then)
     host(cluster, "a").mute.add(END)
     cluster.migrate("p", "b")
-    cluster.leave(host(cluster, "a"))
+    cluster.leave("a")
     host(cluster, "a").connected = False
     wait(cluster, 3.0)
     runs_alone(cluster, "b")
@@ -408,7 +408,7 @@ def test_a_destination_s_slave_that_stops_before_it_joins_leaves_nobody_waiting(
     cluster = story(then)
     host(cluster, "b").mute.add(JOIN)
     cluster.migrate("p", "b")
-    cluster.leave(host(cluster, "b"))
+    cluster.leave("b")
     host(cluster, "b").connected = False
     wait(cluster, 3.0)
     runs_alone(cluster, "a", "c")

@@ -74,7 +74,7 @@ def has_stayed(cluster: Cluster) -> None:
     """Check that p stayed: one active instance at the source, restarted as its spec says."""
     assert (cluster.phase("p"), cluster.where("p"), cluster.active()) == ("running", ["a"], ["a"])
     assert restart_of(cluster, "a") == ON_FAILURE
-    assert len(cluster.told("stayed")) == 1
+    assert len(cluster.recorded("stayed")) == 1
     settled(cluster)
 
 
@@ -82,7 +82,7 @@ def has_moved(cluster: Cluster) -> None:
     """Check that p moved: one active instance at the destination, restarted as its spec says."""
     assert (cluster.phase("p"), cluster.where("p"), cluster.active()) == ("running", ["b"], ["b"])
     assert restart_of(cluster, "b") == ON_FAILURE
-    assert len(cluster.told("migrated")) == 1
+    assert len(cluster.recorded("migrated")) == 1
     settled(cluster)
 
 
@@ -111,7 +111,7 @@ def test_what_a_destination_waited_for_is_no_part_of_its_report() -> None:
     cluster = two_hosts()
     assert cluster.migrate("p").accepted
     cluster.wait(3.0)
-    assert "p#2 receives the state of the source" in cluster.told("handoff_reported")
+    assert "p#2 receives the state of the source" in cluster.recorded("handoff_reported")
 
 
 def test_names_on_the_wire_are_fully_qualified() -> None:
@@ -189,7 +189,7 @@ def test_a_destination_that_is_never_ready_is_stopped_and_said_what_it_waits_for
     cluster.migrate("p", "b")
     cluster.wait(11.0)
     has_stayed(cluster)
-    (told,) = cluster.told("stayed")
+    (told,) = cluster.recorded("stayed")
     assert told == (
         "p stayed on a: copying the state to the destination took longer than 10 s: p#2 receives "
         "the state of the source: waits for input /scan; p#1 takes part in the handoff"
@@ -204,7 +204,7 @@ def test_a_node_that_follows_no_protocol_stays_and_it_is_said_what_to_check() ->
     cluster.migrate("p", "b")
     cluster.wait(10.3)
     has_stayed(cluster)
-    (told,) = cluster.told("stayed")
+    (told,) = cluster.recorded("stayed")
     assert "neither node has reported. Do they use rosrm.node?" in told
     assert "`protocol: paper`" in told
 
@@ -222,7 +222,7 @@ def test_a_report_of_failure_ends_the_handoff(host: str, told: str) -> None:
     quirk(cluster, host, "unfit")
     cluster.migrate("p", "b")
     has_stayed(cluster)
-    assert cluster.told("stayed") == [f"p stayed on a: {told}"]
+    assert cluster.recorded("stayed") == [f"p stayed on a: {told}"]
 
 
 def test_a_source_that_does_not_fall_silent_goes_on() -> None:
@@ -240,8 +240,7 @@ def test_a_destination_that_ends_leaves_the_source_as_it_was(phase: HandoffPhase
     """The end of the destination is enough; the plan sends no ABORT to a dead node."""
     cluster = two_hosts()
     begin(cluster, phase)
-    cluster.machines["b"].finish("p", cluster.now, code=3)
-    cluster.settle()
+    cluster.finish("p", "b", code=3)
     has_stayed(cluster)
 
 
@@ -295,10 +294,9 @@ def test_a_destination_that_answers_abort_with_active_has_moved() -> None:
     cluster.wait(10.5)
     assert said(cluster)[-1] == "ABORT"
     assert cluster.active() == ["b"]
-    cluster.machines["b"].connected = True
-    cluster.wait(1.0)
+    cluster.reconnect("b", seconds=1.0)
     has_moved(cluster)
-    assert len(cluster.told("migration_redone")) == 1
+    assert len(cluster.recorded("migration_redone")) == 1
 
 
 def test_a_destination_that_does_not_answer_to_abort_is_stopped_before_the_source_goes_on() -> None:
@@ -311,9 +309,8 @@ def test_a_destination_that_does_not_answer_to_abort_is_stopped_before_the_sourc
     cluster.wait(25.0)
     assert "RESUME" not in said(cluster)
     assert len(cluster.orders(StopInstance)) > 1
-    assert len(cluster.told("destination_unheard")) == 1
-    cluster.machines["b"].let_go("p", cluster.now)
-    cluster.settle()
+    assert len(cluster.recorded("destination_unheard")) == 1
+    cluster.let_go("p", "b")
     has_stayed(cluster)
 
 
@@ -329,8 +326,7 @@ def test_active_of_a_destination_that_was_ordered_to_stop_decides_nothing() -> N
     cluster.wait(1.0)
     assert "RESUME" not in said(cluster)
     assert cluster["p"].migrations == 0
-    cluster.machines["b"].let_go("p", cluster.now)
-    cluster.settle()
+    cluster.let_go("p", "b")
     has_stayed(cluster)
 
 
@@ -344,7 +340,7 @@ def test_a_silent_source_that_does_not_say_that_it_goes_on_is_stuck() -> None:
     assert cluster.phase("p") == "stuck"
     assert (
         "letting the source publish again took longer than 10 s"
-        in cluster.told("migration_stuck")[0]
+        in cluster.recorded("migration_stuck")[0]
     )
     cluster.machines["a"].quirks["p"].clear()
     cluster.wait(3.0)
@@ -359,11 +355,10 @@ def test_a_source_that_ends_before_the_switch_is_queued_again_by_its_policy() ->
     cluster = two_hosts()
     quirk(cluster, "b", "never ready")
     cluster.migrate("p", "b")
-    cluster.machines["a"].finish("p", cluster.now, code=3)
-    cluster.settle()
+    cluster.finish("p", code=3)
     assert cluster.phase("p") == "running"
     assert len(cluster.active()) == 1
-    (told,) = cluster.told("queued")
+    (told,) = cluster.recorded("queued")
     assert told == "p returns to the queue: restart by policy 'on-failure': exit code 3"
 
 
@@ -379,8 +374,7 @@ def test_a_source_that_is_never_restarted_and_ends_before_the_switch_has_failed(
     cluster = two_hosts(spec=stateful(restart=RestartPolicy("never")))
     quirk(cluster, "b", "never ready")
     cluster.migrate("p", "b")
-    cluster.machines["a"].finish("p", cluster.now, code=3)
-    cluster.settle()
+    cluster.finish("p", code=3)
     assert (cluster.phase("p"), cluster.where("p")) == ("failed", [])
 
 
@@ -389,8 +383,7 @@ def test_a_source_that_ends_during_the_switch_is_taken_over() -> None:
     cluster = two_hosts()
     quirk(cluster, "a", "never silent")
     cluster.migrate("p", "b")
-    cluster.machines["a"].finish("p", cluster.now, code=3)
-    cluster.settle()
+    cluster.finish("p", code=3)
     has_moved(cluster)
     assert said(cluster) == ["SHADOW", "SWITCH", "TAKE_OVER", "DONE"]
 
@@ -401,14 +394,13 @@ def test_take_over_is_said_again_until_it_is_answered() -> None:
     quirk(cluster, "a", "never silent")
     cluster.migrate("p", "b")
     quirk(cluster, "b", "deaf")
-    cluster.machines["a"].finish("p", cluster.now, code=3)
-    cluster.settle()
+    cluster.finish("p", code=3)
     cluster.wait(5.0)
     assert said(cluster).count("TAKE_OVER") == 3
     cluster.wait(25.0)
     assert cluster.phase("p") == "running"
     assert len(cluster.active()) == 1
-    assert len(cluster.told("queued")) == 1
+    assert len(cluster.recorded("queued")) == 1
 
 
 def test_a_phase_is_said_again_until_it_is_answered() -> None:
@@ -430,8 +422,7 @@ def test_a_destination_that_ends_after_the_commit_is_queued_by_its_policy() -> N
     begin(cluster, HandoffPhase.SWITCH)
     while not cluster["p"].migrations:
         cluster.nodes_talk()
-    cluster.machines["b"].finish("p", cluster.now, code=3)
-    cluster.settle()
+    cluster.finish("p", "b", code=3)
     assert cluster.phase("p") == "running"
     assert len(cluster.active()) == 1
 
@@ -512,7 +503,7 @@ def test_a_master_may_be_killed_at_any_event_of_a_move(strategy: str, overlap: b
         assert cluster.active() == [host]
         assert restart_of(cluster, host) == ON_FAILURE
         assert not cluster.intents["migration"]
-        assert len(cluster.told("migrated") + cluster.told("stayed")) == 1, stop_at
+        assert len(cluster.recorded("migrated") + cluster.recorded("stayed")) == 1, stop_at
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -576,8 +567,7 @@ def test_a_destination_that_was_ordered_to_stop_is_known_to_a_new_master() -> No
     cluster.tell(happened.HandoffReported("p", 2, 2, ReportPhase.ACTIVE))
     cluster.wait(1.0)
     assert cluster["p"].migrations == 0
-    cluster.machines["b"].let_go("p", cluster.now)
-    cluster.settle()
+    cluster.let_go("p", "b")
     has_stayed(cluster)
 
 
@@ -592,7 +582,7 @@ def test_a_move_in_the_journal_that_nobody_understands_is_over() -> None:
     assert not cluster.intents["migration"]
     assert (
         "cannot be continued: steps[0].kind 'teleport'; allowed: start, "
-        in cluster.told("migration_forgotten")[0]
+        in cluster.recorded("migration_forgotten")[0]
     )
 
 

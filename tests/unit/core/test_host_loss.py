@@ -71,7 +71,7 @@ def test_elsewhere_starts_it_on_another_host_as_soon_as_its_host_is_lost() -> No
     cluster.wait(1.0)
     assert cluster.where("p") == ["a", "b"]
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
-    assert cluster.told("given_up") == ["p#1 is given up: a is lost"]
+    assert cluster.recorded("given_up") == ["p#1 is given up: a is lost"]
 
 
 def test_elsewhere_waits_for_its_delay() -> None:
@@ -105,7 +105,7 @@ def test_the_old_instance_is_fenced_when_its_host_is_heard() -> None:
     back(cluster, "a", seconds=0.2)
     assert cluster.where("p") == ["b"]
     assert [order.instance.number for order in cluster.orders(FenceInstance)] == [1]
-    assert cluster.told("fenced")[0].startswith(
+    assert cluster.recorded("fenced")[0].startswith(
         "p#1 is not assigned to a: the master has it killed"
     )
 
@@ -116,9 +116,7 @@ def test_the_old_instance_is_fenced_by_a_master_that_was_restarted() -> None:
     lose(cluster, "a")
     cluster.restart_master()
     assert cluster.phase("p") == "running"
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
-    cluster.wait(1.0)
+    cluster.rejoin("a")
     assert cluster.where("p") == ["b"]
 
 
@@ -169,9 +167,7 @@ def test_what_is_not_there_any_more_goes_elsewhere() -> None:
     lose(cluster, "a")
     cluster.machines["a"].programs.clear()
     cluster.machines["a"].restart_slave(cluster.now)
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
-    cluster.wait(1.0)
+    cluster.rejoin("a")
     assert (cluster.phase("p"), cluster["p"].owner, cluster.where("p")) == ("running", 2, ["a"])
 
 
@@ -182,11 +178,11 @@ def test_a_master_that_hears_nobody_gives_nothing_up() -> None:
     """A host that rejoins within a lease of the first host keeps its processes."""
     cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
     lose(cluster, "a", "b", seconds=60.0)
-    assert (cluster.phase("p"), cluster.told("given_up")) == ("unreachable", [])
+    assert (cluster.phase("p"), cluster.recorded("given_up")) == ("unreachable", [])
     back(cluster, "b", seconds=8.0)
     back(cluster, "a")
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
-    assert not cluster.told("given_up")
+    assert not cluster.recorded("given_up")
 
 
 def test_a_host_that_stays_away_when_the_others_are_back_is_given_up() -> None:
@@ -240,9 +236,7 @@ def test_a_process_that_is_being_cancelled_when_its_host_is_lost_says_so() -> No
     assert cluster.phase("p") == "stopping"
     assert "a, which has not come back since the master started" in cluster["p"].reason
     cluster.machines["a"].let_go("p", cluster.now)
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
-    cluster.wait(1.0)
+    cluster.rejoin("a")
     assert cluster.phase("p") == "cancelled"
 
 
@@ -412,9 +406,7 @@ def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
     cluster.ask(happened.PruneRequested, (), ("a",))
     cluster.set_host("b", "cordon")
     assert cluster.submit(process("p")).accepted
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
-    cluster.wait(1.0)
+    cluster.rejoin("a")
     assert (cluster.phase("p"), cluster.queue()) == ("stopping", [])
     assert cluster["p"].reason == "waits until p#1 on a has ended"
     cluster.machines["a"].let_go("p", cluster.now)

@@ -114,7 +114,7 @@ def test_who_does_not_ask_has_none(spec):
     cluster = running(Pacing(), host, spec=spec)
     cluster.wait(60.0)
     assert host.dumps == []
-    assert cluster.told("periodic_failed") == []
+    assert cluster.recorded("periodic_failed") == []
 
 
 def test_the_first_one_is_told_and_explained():
@@ -122,7 +122,7 @@ def test_the_first_one_is_told_and_explained():
     host = Host()
     cluster = running(Pacing(), host)
     cluster.wait(60.0)
-    (said,) = cluster.told("periodic_checkpoint")
+    (said,) = cluster.recorded("periodic_checkpoint")
     assert "5.0 kB, paused for 0.60 s" in said
     told = cluster.explain("p")["checkpoint"]
     assert (told["size"], told["trouble"]) == (5000, "")
@@ -136,11 +136,11 @@ def test_what_fails_is_said_once_and_tried_again():
     cluster = running(Pacing(), host)
     cluster.wait(45.0)
     assert len(host.dumps) >= 3
-    assert cluster.told("periodic_failed") == ["no periodic checkpoint of p was made: no room"]
+    assert cluster.recorded("periodic_failed") == ["no periodic checkpoint of p was made: no room"]
     assert cluster.explain("p")["checkpoint"]["trouble"] == "no room"
     host.answer = {"size": 1, "seconds": {}}
     cluster.wait(12.0)
-    assert len(cluster.told("periodic_checkpoint")) == 1
+    assert len(cluster.recorded("periodic_checkpoint")) == 1
     assert cluster.explain("p")["checkpoint"]["trouble"] == ""
 
 
@@ -157,7 +157,7 @@ def test_a_policy_without_a_pace_makes_none(policy, reason):
     cluster = running(policy, host)
     cluster.wait(30.0)
     assert host.dumps == []
-    (said,) = cluster.told("periodic_failed")
+    (said,) = cluster.recorded("periodic_failed")
     assert reason in said
 
 
@@ -169,7 +169,7 @@ def test_a_policy_that_makes_no_sense_harms_nobody(answer):
     cluster = running(policy, host)
     cluster.wait(30.0)
     assert host.dumps == []
-    (said,) = cluster.told("periodic_failed")
+    (said,) = cluster.recorded("periodic_failed")
     assert "'pacing'" in said
     assert cluster.phase("p") == "running"
 
@@ -181,7 +181,7 @@ def test_where_criu_does_not_work_there_are_none():
     cluster.state.replication.policy = Pacing()
     cluster.submit(portable())
     cluster.wait(30.0)
-    (said,) = cluster.told("periodic_failed")
+    (said,) = cluster.recorded("periodic_failed")
     assert "criu does not work on a" in said
 
 
@@ -231,7 +231,7 @@ def test_a_step_with_a_field_of_a_wrong_type_is_not_ordered(fields, reason):
     cluster.submit(portable())
     cluster.wait(15.0)
     assert host.dumps == []
-    (said,) = cluster.told("periodic_failed")
+    (said,) = cluster.recorded("periodic_failed")
     assert reason in said
 
 

@@ -46,7 +46,7 @@ def test_a_host_that_has_just_registered_takes_its_part_of_the_work(monkeypatch)
     assert cluster["p"].reason == ("waits for the first request for work of b, registered just now")
     cluster.wait(0.1)
     assert cluster.counts() == {"a": 1, "b": 1}
-    assert cluster.told("waits") == []
+    assert cluster.recorded("waits") == []
 
 
 def test_hosts_that_register_and_never_ask_hold_up_no_work(monkeypatch) -> None:
@@ -69,8 +69,7 @@ def test_sixty_equal_processes_on_three_equal_hosts_end_20_20_20(needs: str) -> 
     if needs == "learned":
         cluster.machines["a"].shown["first"] = {"memory": 90 * MIB}
         cluster.submit(job("first"))
-        cluster.machines["a"].finish("first", cluster.now)
-        cluster.settle()
+        cluster.finish("first")
         assert cluster["first"].phase.value == "finished"
     memory = 80.0 if needs == "declared" else 0.0
     cluster.submit(*[process(f"p{i}", memory=memory) for i in range(60)])
@@ -82,8 +81,7 @@ def test_learned_needs_stand_in_for_those_that_were_not_declared() -> None:
     cluster = Cluster("a")
     cluster.machines["a"].shown["first"] = {"memory": 160 * MIB, "cpu": 0.5}
     cluster.submit(job("first"))
-    cluster.machines["a"].finish("first", cluster.now)
-    cluster.settle()
+    cluster.finish("first")
     cluster.submit(process("second"))
     need = cluster.explain("second")["decision"]["need"]
     assert need == {"memory": 160 * MIB, "cpu": 0.5}
@@ -97,8 +95,7 @@ def test_cpu_is_not_learned_from_a_run_too_short_to_tell() -> None:
     cluster = Cluster("a")
     cluster.submit(job("first"))
     cluster.machines["a"].shown["first"] = {"cpu": 1.0, "memory": 2 * MIB}
-    cluster.machines["a"].finish("first", cluster.now, run_time=0.01)
-    cluster.settle()
+    cluster.finish("first", run_time=0.01)
     cluster.submit(process("second"))
     assert cluster.explain("second")["decision"]["need"] == {"memory": 2 * MIB, "cpu": 0.1}
 
@@ -177,8 +174,7 @@ def test_max_processes_is_the_most_that_a_host_holds() -> None:
     cluster = Cluster(Machine("a", max_processes=2), Machine("b", max_processes=1))
     cluster.submit(*[job(f"p{i}") for i in range(5)])
     assert cluster.counts() == {"a": 2, "b": 1}
-    cluster.machines["b"].finish("p1", cluster.now)
-    cluster.settle()
+    cluster.finish("p1", "b")
     assert cluster.where("p3") == ["b"]
     assert cluster.queue() == ["p4"]
 
@@ -208,8 +204,7 @@ def test_a_charge_ends_with_its_instance() -> None:
     """The reservation is released completely."""
     cluster = Cluster("a")
     cluster.submit(job("p", memory=100))
-    cluster.machines["a"].finish("p", cluster.now)
-    cluster.settle()
+    cluster.finish("p")
     assert load(cluster, "a") == 0.0
 
 

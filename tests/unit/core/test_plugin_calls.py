@@ -41,14 +41,14 @@ def test_a_failing_plugin_is_recorded_once_and_again_when_it_works() -> None:
     policy.fails = True
     for number in range(1, 4):
         submitted(cluster, number)
-    (failed,) = cluster.told("plugin_failed")
+    (failed,) = cluster.recorded("plugin_failed")
     assert failed.startswith("the scoring policy 'eq1' fails: score: KeyError: 'prefix' (")
     policy.fails = False
     submitted(cluster, 4)
     assert ("scoring", "eq1") in cluster.state.plugins.failing
     cluster.wait(WORKS_AFTER + 1.0)
     submitted(cluster, 5)
-    assert cluster.told("plugin_works") == ["the scoring policy 'eq1' works again"]
+    assert cluster.recorded("plugin_works") == ["the scoring policy 'eq1' works again"]
     assert cluster.state.plugins.failing == {}
 
 
@@ -115,8 +115,8 @@ def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
     cluster = Cluster("a")
     for failing in ({"lidar": "no such sensor"}, {"lidar": "no such sensor"}, {}):
         fails_there(cluster, failing)
-    assert cluster.told("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
-    assert cluster.told("plugin_works") == ["the probe of lidar on a works again"]
+    assert cluster.recorded("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
+    assert cluster.recorded("plugin_works") == ["the probe of lidar on a works again"]
 
 
 def test_a_strategy_whose_executors_fail_is_recorded_with_its_host() -> None:
@@ -125,8 +125,10 @@ def test_a_strategy_whose_executors_fail_is_recorded_with_its_host() -> None:
     for failing in ({"acme": "executor rest raised OSError: no arm"}, {}):
         fails_there(cluster, {}, failing)
     said = "the migration strategy 'acme' on a"
-    assert cluster.told("plugin_failed") == [f"{said} fails: executor rest raised OSError: no arm"]
-    assert cluster.told("plugin_works") == [f"{said} works again"]
+    assert cluster.recorded("plugin_failed") == [
+        f"{said} fails: executor rest raised OSError: no arm"
+    ]
+    assert cluster.recorded("plugin_works") == [f"{said} works again"]
 
 
 def fails_there(cluster: Cluster, *failing: dict[str, str]) -> None:
@@ -149,7 +151,7 @@ def test_another_error_of_a_failing_plugin_is_recorded_once_a_minute() -> None:
     cluster.wait(RECORD_PERIOD + 1.0)
     fails_there(cluster, {"lidar": "too cold"})
     said = "the probe of lidar on a fails: "
-    assert cluster.told("plugin_failed") == [f"{said}unplugged", f"{said}too cold"]
+    assert cluster.recorded("plugin_failed") == [f"{said}unplugged", f"{said}too cold"]
 
 
 #: Capability of a strategy whose processes ask for periodic checkpoints.
@@ -179,4 +181,4 @@ def test_a_property_of_a_plugin_that_raises_costs_one_decision(members: str) -> 
     if "p" in cluster.state.processes:
         cluster.checkpoint("p")
         cluster.migrate("p")
-    assert "SystemExit: no driver" in cluster.told("plugin_failed")[0]
+    assert "SystemExit: no driver" in cluster.recorded("plugin_failed")[0]

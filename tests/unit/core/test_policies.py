@@ -117,7 +117,7 @@ def test_a_broken_policy_is_left_out_and_named(make: Any, said: str) -> None:
     policy = cluster.explain("p")["decision"]["policy"]
     assert policy.startswith("left out: 'eq1', ")
     assert said in policy
-    (told,) = cluster.told("plugin_failed")
+    (told,) = cluster.recorded("plugin_failed")
     assert told.startswith("the scoring policy 'eq1' fails: score: ")
     assert said in told
 
@@ -186,7 +186,7 @@ def test_a_process_that_is_vetoed_everywhere_does_not_wait_for_room() -> None:
 
     cluster = three(policy=Policy(nowhere))
     cluster.submit(process("p"))
-    assert cluster.told("waits") == ["p waits: no host can take it now"]
+    assert cluster.recorded("waits") == ["p waits: no host can take it now"]
 
 
 def test_a_score_of_a_host_that_does_not_fit_may_be_anything() -> None:

@@ -43,7 +43,7 @@ def test_the_head_blocks_those_behind_it() -> None:
     cluster.submit(process("filler", memory=400))
     cluster.submit(process("large", memory=600), process("small", memory=10))
     assert cluster.queue() == ["large", "small"]
-    assert cluster.told("waits") == ["large waits: no host can take it now"]
+    assert cluster.recorded("waits") == ["large waits: no host can take it now"]
 
 
 def test_with_backfill_those_behind_may_pass() -> None:
@@ -63,7 +63,7 @@ def test_that_somebody_waits_is_said_once() -> None:
     cluster = Cluster(full(), backfill=True)
     cluster.submit(process("p", memory=100), process("q", memory=50))
     cluster.wait(3.0)
-    assert len(cluster.told("waits")) == 2
+    assert len(cluster.recorded("waits")) == 2
 
 
 def test_who_may_never_run_is_set_aside_and_lets_the_others_pass() -> None:
@@ -121,12 +121,11 @@ def test_restart_of_a_process_that_waits_for_room_is_refused() -> None:
 def test_a_queue_without_hosts_that_are_there_says_that_they_are_away() -> None:
     """The reason names absent hosts, not full ones."""
     cluster = Cluster("a", "b")
-    cluster.leave(cluster.machines["a"])
-    cluster.machines["b"].connected = False
-    cluster.wait(11.0)
+    cluster.leave("a")
+    cluster.cut("b", seconds=11.0)
     cluster.submit(process("p"))
     assert cluster["p"].reason == "every host is away: a: it has left; b: it is lost"
-    assert cluster.told("waits") == [f"p waits: {cluster['p'].reason}"]
+    assert cluster.recorded("waits") == [f"p waits: {cluster['p'].reason}"]
 
 
 def test_who_was_set_aside_returns_to_its_place_when_a_fitting_host_comes() -> None:
@@ -150,7 +149,7 @@ def test_with_no_host_at_all_everybody_waits() -> None:
     cluster = Cluster()
     cluster.submit(process("p", memory=1e6), process("q"))
     assert cluster.queue() == ["p", "q"]
-    assert cluster.told("waits") == ["p waits: no host has registered yet"]
+    assert cluster.recorded("waits") == ["p waits: no host has registered yet"]
     cluster.add("a")
     assert cluster.phase("p") == "set_aside"
     assert cluster.where("q") == ["a"]
@@ -171,15 +170,13 @@ def test_who_waits_for_a_host_that_is_away_does_not_block_the_others() -> None:
 def test_who_waits_for_a_lost_host_is_placed_when_it_is_back() -> None:
     """The lease decides when the process is set aside, the host's next message when it returns."""
     cluster = Cluster("a", Machine("b", labels={"gpu": "yes"}))
-    cluster.machines["b"].connected = False
-    cluster.wait(2.0)
+    cluster.cut("b", seconds=2.0)
     cluster.submit(process("special", required_labels={"gpu": "yes"}), process("plain"))
     assert cluster.queue() == ["special", "plain"]
     cluster.wait(10.0)
     assert cluster.phase("special") == "set_aside"
     assert cluster.where("plain") == ["a"]
-    cluster.machines["b"].connected = True
-    cluster.wait(1.0)
+    cluster.reconnect("b", seconds=1.0)
     assert cluster.where("special") == ["b"]
 
 

@@ -55,7 +55,7 @@ def test_every_name_that_is_in_use_is_named() -> None:
     """The refusal lists live processes and those being cancelled, with the reason."""
     cluster = Cluster("a")
     cluster.submit(*(process(name) for name in "pqrs"))
-    cluster.detach(cluster.machines["a"])
+    cluster.detach("a")
     cluster.cancel("p", "q")
     assert cluster.submit(*(process(name) for name in "pqrst")).message == (
         "the names p and q are still in use: being cancelled: waits for a, whose slave was "
@@ -68,8 +68,7 @@ def test_the_name_of_a_process_that_is_over_can_be_used_again() -> None:
     """The new process is the last in the listing."""
     cluster = Cluster("a")
     cluster.submit(job("p"), job("q"))
-    cluster.machines["a"].finish("p", cluster.now)
-    cluster.settle()
+    cluster.finish("p")
     assert cluster.submit(job("p")).accepted
     assert list(cluster.state.processes) == ["q", "p"]
     assert cluster.phase("p") == "running"
@@ -177,8 +176,7 @@ def test_cancel_of_one_that_does_not_end_is_asked_again() -> None:
     cluster.wait(5.0)
     assert cluster.phase("p") == "stopping"
     assert len(cluster.orders(StopInstance)) == 3
-    cluster.machines["a"].let_go("p", cluster.now)
-    cluster.settle()
+    cluster.let_go("p")
     assert cluster.phase("p") == "cancelled"
 
 
@@ -186,12 +184,10 @@ def test_cancel_of_one_whose_host_is_lost_ends_when_the_host_is_back() -> None:
     """The process shows as being stopped until its host rejoins."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
-    cluster.machines["a"].connected = False
-    cluster.wait(11.0)
+    cluster.cut("a", seconds=11.0)
     cluster.cancel("p")
     assert cluster.phase("p") == "stopping"
-    cluster.machines["a"].connected = True
-    cluster.wait(3.0)
+    cluster.reconnect("a", seconds=3.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
 
 
@@ -199,8 +195,7 @@ def test_cancel_of_one_that_is_over_says_so() -> None:
     """The other processes are cancelled."""
     cluster = Cluster("a")
     cluster.submit(job("p"), process("q"))
-    cluster.machines["a"].finish("p", cluster.now)
-    cluster.settle()
+    cluster.finish("p")
     assert cluster.cancel("p", "q").message == "1 process being cancelled; ended before: p"
     assert (cluster.phase("p"), cluster.phase("q")) == ("finished", "cancelled")
 
@@ -224,8 +219,7 @@ def test_cancel_of_one_that_moves_ends_both_instances(overlap: bool) -> None:
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     spec = movable("p", overlap=overlap, ros=True)
     cluster.submit(spec)
-    cluster.machines["a"].seen_in_graph("p", cluster.now)
-    cluster.settle()
+    cluster.discover("p")
     cluster.migrate("p")
     assert cluster.phase("p") == "migrating"
     assert cluster.where("p") == (["a", "b"] if overlap else ["b"])
@@ -254,8 +248,7 @@ def test_restart_of_one_that_is_over_queues_it_anew() -> None:
     """The process goes to the end of the queue, and may go to any host."""
     cluster = Cluster("a")
     cluster.submit(job("p"))
-    cluster.machines["a"].finish("p", cluster.now, code=3)
-    cluster.settle()
+    cluster.finish("p", code=3)
     assert (cluster.phase("p"), cluster["p"].exit_code) == ("failed", 3)
     cluster.restart("p", "p")
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
@@ -277,7 +270,9 @@ def test_restart_of_one_whose_end_is_on_its_way_is_not_lost(code: int) -> None:
     cluster.machines["a"].finish("p", cluster.now, code=code)
     assert cluster.restart("p").accepted
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
-    assert cluster.told("queued") == ["p returns to the queue: it ended before it was restarted"]
+    assert cluster.recorded("queued") == [
+        "p returns to the queue: it ended before it was restarted"
+    ]
 
 
 def test_an_end_after_a_restart_is_an_end() -> None:
@@ -285,8 +280,7 @@ def test_an_end_after_a_restart_is_an_end() -> None:
     cluster = Cluster("a")
     cluster.submit(job("p"))
     cluster.restart("p")
-    cluster.machines["a"].finish("p", cluster.now)
-    cluster.settle()
+    cluster.finish("p")
     assert (cluster.phase("p"), len(cluster.assigned())) == ("finished", 1)
 
 
@@ -328,8 +322,7 @@ def test_one_that_runs_again_is_not_among_those_that_are_over() -> None:
     """A process that was restarted or submitted again counts as newest at its next end."""
     cluster = Cluster("a", keep_ended=1)
     cluster.submit(job("p"))
-    cluster.machines["a"].finish("p", cluster.now)
-    cluster.settle()
+    cluster.finish("p")
     cluster.restart("p")
     cluster.submit(job("q"))
     cluster.machines["a"].finish("q", cluster.now)
@@ -345,8 +338,7 @@ def test_restart_is_refused_where_it_makes_no_sense() -> None:
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.machines["a"].stubborn.add("stops")
     cluster.submit(process("stops"), movable("moves", ros=True), process("huge", memory=1e6))
-    cluster.machines["a"].seen_in_graph("moves", cluster.now)
-    cluster.settle()
+    cluster.discover("moves")
     cluster.migrate("moves")
     cluster.cancel("stops")
     for name, said in (("huge", "huge is set aside: no host may take it"),
@@ -360,8 +352,7 @@ def test_restart_of_one_out_of_reach_is_refused() -> None:
     """Its host would not receive the order."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
-    cluster.machines["a"].connected = False
-    cluster.wait(11.0)
+    cluster.cut("a", seconds=11.0)
     assert cluster.restart("p").message == "p is out of reach: a is lost. Nothing was restarted"
 
 
@@ -373,8 +364,7 @@ def test_a_job_that_exits_with_0_has_finished_one_that_does_not_has_failed() -> 
     cluster = Cluster("a")
     cluster.submit(job("good"), job("bad"))
     cluster.machines["a"].finish("good", cluster.now)
-    cluster.machines["a"].finish("bad", cluster.now, code=7)
-    cluster.settle()
+    cluster.finish("bad", code=7)
     assert (cluster.phase("good"), cluster.phase("bad")) == ("finished", "failed")
     assert (cluster["bad"].exit_code, cluster["bad"].reason) == (7, "exit code 7")
 
@@ -384,8 +374,7 @@ def test_a_node_runs_once_it_is_seen_in_the_graph() -> None:
     cluster = Cluster("a")
     cluster.submit(node("p"))
     assert cluster.phase("p") == "starting"
-    cluster.machines["a"].seen_in_graph("p", cluster.now)
-    cluster.settle()
+    cluster.discover("p")
     assert cluster.phase("p") == "running"
 
 
@@ -404,7 +393,7 @@ def test_a_host_that_cannot_start_it_is_left_out_and_another_tried() -> None:
     cluster.machines["a"].refuses["p"] = "no such executable"
     cluster.submit(process("p"))
     assert cluster.where("p") == ["b"]
-    (said,) = cluster.told("queued")
+    (said,) = cluster.recorded("queued")
     assert said == "p returns to the queue: a cannot run it: no such executable"
 
 
@@ -432,7 +421,7 @@ def test_equal_refusals_are_said_once_and_their_details_only_where_asked_for() -
         "no host can start it: a, b and 2 more: program 'p' is not on the PATH"
     )
     said = "program 'p' is not on the PATH; the PATH is /bin"
-    assert cluster.told("queued")[0] == f"p returns to the queue: a cannot run it: {said}"
+    assert cluster.recorded("queued")[0] == f"p returns to the queue: a cannot run it: {said}"
     assert said in cluster.explain("p")["history"][-2]["message"]
 
 
@@ -464,7 +453,7 @@ def test_an_assignment_that_is_not_taken_up_is_withdrawn() -> None:
             cluster.set_host("a", "cordon")
     cluster.settle()
     assert cluster.where("p") == ["b"]
-    assert "a did not accept the assignment in time" in cluster.told("queued")[0]
+    assert "a did not accept the assignment in time" in cluster.recorded("queued")[0]
 
 
 def test_one_that_was_fetched_and_never_heard_of_is_stopped_before_it_goes_elsewhere() -> None:
@@ -524,7 +513,7 @@ def test_the_record_of_a_request_names_its_requester() -> None:
         record = next(record for record in cluster.records if record.kind == kind)
         assert record.message.endswith(f" (by {by})"), kind
         assert record.facts["by"] == by
-    assert cluster.told("migration_begun")[0].endswith(f"asked for by {by}")
+    assert cluster.recorded("migration_begun")[0].endswith(f"asked for by {by}")
 
 
 def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ended() -> None:
@@ -550,8 +539,8 @@ def test_a_job_that_has_begun_runs() -> None:
     """Only a service becomes ready for others."""
     cluster = Cluster("a")
     cluster.submit(process("p"), job("q"))
-    assert cluster.told("ready") == ["p is ready on a"]
-    assert cluster.told("running") == ["q is running on a"]
+    assert cluster.recorded("ready") == ["p is ready on a"]
+    assert cluster.recorded("running") == ["q is running on a"]
 
 
 def test_a_process_that_is_not_in_the_graph_yet_says_what_it_waits_for() -> None:
@@ -561,8 +550,7 @@ def test_a_process_that_is_not_in_the_graph_yet_says_what_it_waits_for() -> None
     waits = "waits for its node /robot/p in the ROS graph, for at most 20 s"
     row = listing.process_row(cluster.state, cluster["p"], cluster.now)
     assert (row.state, row.reason, cluster.explain("p")["reason"]) == ("starting", waits, waits)
-    cluster.machines["a"].seen_in_graph("p", cluster.now)
-    cluster.settle()
+    cluster.discover("p")
     row = listing.process_row(cluster.state, cluster["p"], cluster.now)
     assert (row.state, row.reason) == ("running", "")
 
@@ -574,10 +562,9 @@ def test_an_explanation_says_what_to_do_next() -> None:
     """
     cluster = Cluster("a")
     cluster.submit(process("p", restart=RestartPolicy("never")), process("q"))
-    cluster.machines["a"].finish("p", cluster.now, code=2)
-    cluster.settle()
+    cluster.finish("p", code=2)
     assert cluster.explain("p")["reason"] == (
         "exit code 2; `rosrm logs p` shows its output, `rosrm restart p` starts it again"
     )
-    cluster.detach(cluster.machines["a"])
+    cluster.detach("a")
     assert cluster.explain("q")["reason"].endswith("; start the slave of a again")

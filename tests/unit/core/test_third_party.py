@@ -19,8 +19,8 @@ from rosrm.model.values import (
 )
 from tests.unit.core.cluster import Cluster, HandOver, process
 from tests.unit.core.machine import Machine
-from tests.unit.core.test_keeping import Asked, assigned, keep, others, where
 from tests.unit.core.test_periodic import Pacing
+from tests.unit.core.test_replication import Asked, assigned, keep, others, where
 
 TELEPORT = MigrationPolicy("teleport")
 

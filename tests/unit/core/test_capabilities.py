@@ -126,7 +126,7 @@ def test_where_it_does_not_work_nothing_goes():
     assert anywhere.message == (
         "no host has room for p; freezing does not work on b: CRIU 3.17 is too old"
     )
-    assert "freezing does not work on b" in " ".join(cluster.told("strategy_absent"))
+    assert "freezing does not work on b" in " ".join(cluster.recorded("strategy_absent"))
 
 
 def test_hosts_that_do_not_match_are_no_destination():

@@ -10,8 +10,7 @@ def cluster_of_one_slot(run_time: float) -> Cluster:
     """Return a cluster of one host with one slot, on which a job has run once."""
     cluster = Cluster(Machine("a", max_processes=1))
     cluster.submit(job("first"))
-    cluster.machines["a"].finish("first", cluster.now, run_time=run_time)
-    cluster.settle()
+    cluster.finish("first", run_time=run_time)
     return cluster
 
 

@@ -129,7 +129,7 @@ class Life(RuleBasedStateMachine):
         """Stop a slave: it ends its processes, and another slave starts later."""
         machine = host(self.cluster, name)
         if machine.connected:
-            self.cluster.leave(machine)
+            self.cluster.leave(name)
             self.lose(machine, power=True)
             wait(self.cluster, 1.0)
 

@@ -36,7 +36,7 @@ def test_what_is_set_aside_stays_so_while_the_hosts_come_back() -> None:
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster["p"].reason) == ("set_aside", reason)
     assert cluster["p"].since == pytest.approx(since, abs=0.01)
-    assert len(cluster.told("set_aside")) == 1
+    assert len(cluster.recorded("set_aside")) == 1
 
 
 def test_the_reason_of_what_is_set_aside_follows_the_hosts() -> None:
@@ -86,7 +86,7 @@ def test_what_a_slave_ended_while_the_master_was_away_is_queued_again(spec) -> N
     cluster.register(machine)
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
-    assert cluster.told("queued") == ["p returns to the queue: its instance on a was stopped"]
+    assert cluster.recorded("queued") == ["p returns to the queue: its instance on a was stopped"]
 
 
 def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled() -> None:
@@ -173,8 +173,7 @@ def test_what_was_learned_is_known() -> None:
     cluster = Cluster("a")
     cluster.machines["a"].shown["first"] = {"memory": 160 * MIB}
     cluster.submit(job("first"))
-    cluster.machines["a"].finish("first", cluster.now)
-    cluster.settle()
+    cluster.finish("first")
     cluster.restart_master()
     cluster.submit(process("second"))
     assert cluster.explain("second")["decision"]["need"]["memory"] == 160 * MIB
@@ -201,7 +200,7 @@ def test_a_host_that_never_comes_back_is_lost_after_its_lease() -> None:
     cluster.submit(process("special", required_labels={"x": "y"}), process("plain"))
     assert cluster.queue() == ["special", "plain"]
     cluster.wait(11.0)
-    assert len(cluster.told("host_lost")) == 1
+    assert len(cluster.recorded("host_lost")) == 1
     assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "b is lost")
     assert (cluster.phase("special"), cluster.where("plain")) == ("set_aside", ["a"])
 
@@ -213,16 +212,13 @@ def test_a_move_that_was_under_way_goes_on(overlap: bool, first: str, ready: boo
     """Whichever slave registers first, before or after the commit, one owner runs in the end."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", overlap=overlap, ros=True))
-    cluster.machines["a"].seen_in_graph("p", cluster.now)
-    cluster.settle()
+    cluster.discover("p")
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
     if not overlap:
-        cluster.machines["a"].let_go("p", cluster.now)
-        cluster.settle()
+        cluster.let_go("p")
     if ready:
-        cluster.machines["b"].seen_in_graph("p", cluster.now)
-        cluster.settle()
+        cluster.discover("p", "b")
     cluster.machines["a"].stubborn.clear()
     cluster.kill_master()
     second = "b" if first == "a" else "a"
@@ -244,8 +240,7 @@ def test_how_long_a_move_took_counts_from_its_beginning() -> None:
     """The duration includes the time in which the master was away."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", ros=True))
-    cluster.machines["a"].seen_in_graph("p", cluster.now)
-    cluster.settle()
+    cluster.discover("p")
     cluster.migrate("p")
     cluster.wait(2.0)
     cluster.now += 3.0

@@ -41,8 +41,8 @@ def test_the_largest_relief_leaves_a_host_that_is_over_its_limit() -> None:
     cluster.wait(3.0)
     assert cluster.where("large") == ["b"]
     assert cluster.counts() == {"a": 2, "b": 1}
-    assert cluster.told("over_limit") == ["a reached its limit of memory"]
-    (said,) = cluster.told("migration_begun")
+    assert cluster.recorded("over_limit") == ["a reached its limit of memory"]
+    (said,) = cluster.recorded("migration_begun")
     assert said == "large moves from a to b by relaunch: a is over its limit of memory"
     assert cluster.explain("large")["decision"]["kind"] == "migrated"
 
@@ -58,14 +58,14 @@ def test_a_stale_reading_says_nothing_of_a_limit() -> None:
     cluster.machines["a"].stale.add("memory")
     cluster.machines["a"].busy["memory"] = 0.5
     cluster.wait(5.0)
-    assert cluster.told("over_limit") == []
+    assert cluster.recorded("over_limit") == []
     assert cluster.counts() == {"a": 2, "b": 0}
     cluster.machines["a"].stale.clear()
     cluster.wait(0.5)
     cluster.machines["a"].stale.add("memory")
     cluster.wait(5.0)
-    assert cluster.told("over_limit") == ["a reached its limit of memory"]
-    assert cluster.told("under_limit") == []
+    assert cluster.recorded("over_limit") == ["a reached its limit of memory"]
+    assert cluster.recorded("under_limit") == []
     assert cluster.counts() == {"a": 2, "b": 0}
 
 
@@ -76,10 +76,10 @@ def test_a_reading_that_crosses_the_limit_each_second_is_recorded_once() -> None
         for memory in (0.9, 0.3):
             cluster.machines["a"].busy["memory"] = memory
             cluster.wait(1.0)
-    assert cluster.told("over_limit") == ["a reached its limit of memory"]
-    assert cluster.told("under_limit") == []
+    assert cluster.recorded("over_limit") == ["a reached its limit of memory"]
+    assert cluster.recorded("under_limit") == []
     cluster.wait(1.5)
-    assert cluster.told("under_limit") == ["a is under its limits"]
+    assert cluster.recorded("under_limit") == ["a is under its limits"]
 
 
 def test_it_must_relieve_the_resource_that_is_over() -> None:
@@ -113,7 +113,7 @@ def test_nothing_moves_when_every_host_is_at_its_limits() -> None:
     cluster.wait(5.0)
     cluster.submit(movable("q"))
     assert (cluster.where("p"), cluster.queue()) == (["a"], ["q"])
-    assert cluster.told("nothing_moves")[0] == "nothing can leave a: no host has room for p"
+    assert cluster.recorded("nothing_moves")[0] == "nothing can leave a: no host has room for p"
 
 
 def test_a_full_resource_without_a_limit_is_no_reason_to_move() -> None:
@@ -126,7 +126,7 @@ def test_a_full_resource_without_a_limit_is_no_reason_to_move() -> None:
     cluster.machines["a"].busy["cpu"] = 0.9
     assert cluster.machines["a"].usage(cluster.now)["cpu"] == 1.0
     cluster.wait(5.0)
-    assert cluster.told("over_limit") == []
+    assert cluster.recorded("over_limit") == []
     assert cluster.where("p") == ["a"]
 
 
@@ -142,7 +142,7 @@ def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
         cluster.wait(0.5)
     assert cluster.where("p") == ["a"]
     cluster.wait(2.0)
-    assert cluster.told("under_limit")
+    assert cluster.recorded("under_limit")
 
 
 def test_a_process_that_moved_is_left_alone_for_its_cool_down() -> None:
@@ -158,7 +158,7 @@ def test_a_process_that_moved_is_left_alone_for_its_cool_down() -> None:
     cluster.machines["b"].shown["p"] = {"memory": 300 * MIB}
     cluster.wait(20.0)
     assert cluster.where("p") == ["b"]
-    assert "p is in its cool-down of 30 s after a move" in cluster.told("nothing_moves")[-1]
+    assert "p is in its cool-down of 30 s after a move" in cluster.recorded("nothing_moves")[-1]
     cluster.wait(12.0)
     assert cluster.where("p") == ["a"]
 
@@ -210,7 +210,7 @@ def test_a_drained_host_is_emptied_of_what_can_move() -> None:
     assert said == f"a is draining: 2 processes leave (p and q); cannot {stays}"
     cluster.wait(3.0)
     assert cluster.counts() == {"a": 2, "b": 2}
-    assert cluster.told("host_drained") == [f"a is drained: nothing can {stays}"]
+    assert cluster.recorded("host_drained") == [f"a is drained: nothing can {stays}"]
     assert listing.host_rows(cluster.state, cluster.now)[0].drained
     cluster.submit(process("new"))
     assert cluster.where("new") == ["b"]
@@ -224,14 +224,13 @@ def test_a_draining_host_is_drained_only_when_what_can_leave_has_left() -> None:
     cluster.set_host("b", "cordon")
     cluster.set_host("a", "drain")
     cluster.wait(3.0)
-    assert "no host has room for p" in cluster.told("nothing_moves")[0]
+    assert "no host has room for p" in cluster.recorded("nothing_moves")[0]
     cluster.machines["a"].connected = False
     cluster.set_host("b", "uncordon")
     cluster.wait(12.0)
-    assert cluster.told("host_drained") == []
-    cluster.machines["a"].connected = True
-    cluster.wait(5.0)
-    assert (cluster.where("p"), len(cluster.told("host_drained"))) == (["b"], 1)
+    assert cluster.recorded("host_drained") == []
+    cluster.reconnect("a", seconds=5.0)
+    assert (cluster.where("p"), len(cluster.recorded("host_drained"))) == (["b"], 1)
     cluster.set_host("a", "uncordon")
     assert not listing.host_rows(cluster.state, cluster.now)[0].drained
 
@@ -245,7 +244,7 @@ def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> Non
         "nothing can leave: p may run on no other host (`rosrm explain NAME` shows the reason)"
     )
     cluster.wait(3.0)
-    assert len(cluster.told("host_drained")) == 1
+    assert len(cluster.recorded("host_drained")) == 1
     cluster.add(Machine("c", labels={"camera": "front"}))
     cluster.wait(3.0)
     assert cluster.where("p") == ["c"]
@@ -258,7 +257,7 @@ def test_a_process_too_large_for_every_other_host_stays_on_a_draining_host() -> 
     assert cluster.where("p") == ["a"]
     assert "nothing can leave: p may run on no other" in cluster.set_host("a", "drain").message
     cluster.wait(3.0)
-    assert len(cluster.told("host_drained")) == 1
+    assert len(cluster.recorded("host_drained")) == 1
 
 
 def test_that_there_is_no_other_host_is_said_once() -> None:
@@ -288,12 +287,12 @@ def test_that_nothing_can_move_is_said_once_for_each_reason() -> None:
     on_a(cluster, p=300)
     cluster.machines["a"].busy["memory"] = 0.6
     cluster.wait(60.0)
-    assert len(cluster.told("nothing_moves")) == 1
+    assert len(cluster.recorded("nothing_moves")) == 1
     cluster.machines["a"].busy["memory"] = 0.1
     cluster.wait(20.0)
     cluster.machines["a"].busy["memory"] = 0.6
     cluster.wait(20.0)
-    assert len(cluster.told("nothing_moves")) == 2
+    assert len(cluster.recorded("nothing_moves")) == 2
 
 
 def test_a_move_goes_to_the_largest_margin() -> None:

@@ -101,10 +101,10 @@ def test_the_order_of_the_hosts_that_are_chosen_makes_no_difference():
     one, two = others(cluster)
     policy.answer = CheckpointChoice((one, two))
     cluster.wait(3.0)
-    told, recorded = len(cluster.orders(ReplicateSnapshot)), cluster.told("kept_on")
+    told, recorded = len(cluster.orders(ReplicateSnapshot)), cluster.recorded("kept_on")
     policy.answer = CheckpointChoice((two, one))
     cluster.wait(10.0)
-    assert (len(cluster.orders(ReplicateSnapshot)), cluster.told("kept_on")) == (told, recorded)
+    assert (len(cluster.orders(ReplicateSnapshot)), cluster.recorded("kept_on")) == (told, recorded)
 
 
 def test_what_the_policy_sees():
@@ -162,9 +162,9 @@ def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
         keep(cluster, where(cluster), ("p", cluster["p"].owner, 5))
     told = len(cluster.orders(ReplicateSnapshot))
     cluster.wait(25.0)
-    (first, *_) = cluster.told("plugin_failed")
+    (first, *_) = cluster.recorded("plugin_failed")
     assert first.startswith("the checkpoint policy 'asked' fails: choose: ")
-    assert len(cluster.told("plugin_failed")) == 1
+    assert len(cluster.recorded("plugin_failed")) == 1
     assert all(order.hosts == () for order in cluster.orders(ReplicateSnapshot)[told:])
 
 
@@ -196,7 +196,7 @@ def test_a_choice_of_the_processs_own_host_is_refused():
     cluster = running(policy, "a", "b")
     policy.answer = CheckpointChoice((where(cluster),))
     cluster.wait(2.0)
-    assert cluster.told("plugin_failed")
+    assert cluster.recorded("plugin_failed")
 
 
 def test_a_slave_that_was_started_anew_is_told_again():
