@@ -48,7 +48,7 @@ def test_a_host_is_detached_however_long() -> None:
     assert cluster.recorded("host_suspect") == cluster.recorded("host_lost") == []
 
 
-def test_the_next_slave_takes_the_processes_over() -> None:
+def test_the_next_slave_readopts_the_processes() -> None:
     """The next slave adopts the same instance, even after the lease."""
     cluster = detached(process("p"))
     number = cluster["p"].owner
@@ -58,7 +58,7 @@ def test_the_next_slave_takes_the_processes_over() -> None:
     assert state_of(cluster, "a") == "up"
 
 
-def test_a_process_goes_elsewhere_no_sooner_than_after_a_loss() -> None:
+def test_a_process_starts_elsewhere_as_late_as_after_a_loss() -> None:
     """The instance has a fence, which counts from the last beat: it needs the whole lease."""
     cluster = detached(process("p", host_loss=HostLossPolicy("elsewhere", 5.0)))
     lease = cluster.settings.lease
@@ -77,7 +77,7 @@ def test_beats_name_a_detached_host() -> None:
     assert cluster.state.hosts.silent_hosts() == [cluster.machines["a"].host_id]
 
 
-def test_what_ended_before_the_slave_stopped_is_known_with_its_end() -> None:
+def test_an_end_before_the_stop_of_the_slave_is_known() -> None:
     """The slave's last message has all its instances, including ends not reported before."""
     cluster = Cluster("a")
     cluster.submit(process("p"), job("q"))
@@ -88,7 +88,7 @@ def test_what_ended_before_the_slave_stopped_is_known_with_its_end() -> None:
     assert cluster.phase("q") == "finished"
 
 
-def test_what_has_not_begun_there_is_queued_again() -> None:
+def test_an_assignment_that_has_not_started_is_queued_again() -> None:
     """The slave starts no more processes, so the master queues the assignment again."""
     cluster = detached(process("p"))
     cluster.restart_slave("a")
@@ -104,14 +104,9 @@ def test_a_late_report_changes_nothing() -> None:
     """A late report is older than the slave's last message."""
     cluster = Cluster("a")
     cluster.submit(process("p"))
-    machine = cluster.machines["a"]
-    kept = machine.begun()
-    machine.said.clear()
-    late = happened.StatusesReceived(
-        machine.host_id, machine.incarnation, machine.batches + 1, False, kept
-    )
+    kept = cluster.machines["a"].begun()
     cluster.detach("a")
-    cluster.tell(late)
+    cluster.report("a", *kept)
     assert cluster.phase("p") == "unreachable"
 
 
@@ -146,12 +141,11 @@ def test_a_cancelled_process_on_a_silent_host_names_the_host() -> None:
     cluster.submit(process("p"))
     cluster.cut("a", seconds=4.0)
     cluster.cancel("p")
-    assert row_of(cluster, "p").reason == (
-        "being cancelled: waits for a, which has been silent for 4 s"
-    )
+    reason = "being cancelled: waits for a, which has been silent for 4 s"
+    assert row_of(cluster, "p").reason == reason
 
 
-def test_a_slave_that_ends_its_processes_after_all_leaves() -> None:
+def test_the_end_of_a_cancelled_process_is_known_when_its_slave_leaves() -> None:
     """As with `rosrm slave --stop-all`, the master learns the end of a cancelled process."""
     cluster = detached(process("p"))
     cluster.cancel("p")
@@ -174,8 +168,7 @@ def test_a_registration_counts_the_processes_that_have_not_ended() -> None:
     """A restarted slave also reports the processes that ended while no slave ran."""
     cluster = Cluster("a")
     cluster.submit(process("p"), job("q"))
-    machine = cluster.machines["a"]
     cluster.detach("a")
-    machine.finish("q", cluster.now)
+    cluster.machines["a"].finish("q", cluster.now)
     cluster.restart_slave("a")
     assert cluster.recorded("host_registered")[-1] == "a registered with 1 process"
