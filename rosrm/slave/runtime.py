@@ -135,7 +135,7 @@ class SlaveRuntime:
             self._limit = self._limits()
             self._endpoint = SlaveEndpoint(
                 self._participant, self._description(probes.absent), self._state, take=self._take,
-                kept_states=lambda: self._replication.states(),  # noqa: PLW0108 - made later
+                snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
                 seen=JournalWatermark(config.state / "journal_seen"),
             )  # fmt: skip
             self._note_probes(first)
@@ -148,10 +148,10 @@ class SlaveRuntime:
             self._replication = ReplicationService(
                 kept, config.host, config.keep,
                 ReplicationEndpoint(self._participant, config.host),
-                post=self._post, publish=self._endpoint.publish_kept,
+                post=self._post, publish=self._endpoint.publish_snapshots,
             )  # fmt: skip
             duties = Duties(
-                self._take, self._set_restart, self._replication.keep, self._drop_kept,
+                self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
                 self._execute, self._read_log,
             )  # fmt: skip
             SlaveServices(
@@ -393,7 +393,7 @@ class SlaveRuntime:
         self._unsettled.setdefault((order.instance, order.restart), []).append(settled)
         self._take(event_of(order))
 
-    def _drop_kept(self, instance: InstanceId) -> None:
+    def _drop_snapshots(self, instance: InstanceId) -> None:
         """Delete the snapshots of a process, of instances up to this one."""
         lives = any(
             one.process == instance.process and one.number <= instance.number

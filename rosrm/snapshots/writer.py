@@ -153,17 +153,6 @@ class CopyWriter:
             self._file = -1
 
 
-def write_copy(directory: Path, data: bytes) -> None:
-    """Store a replica from another host; raises the errors of `CopyWriter`."""
-    copy = CopyWriter(directory)
-    try:
-        copy.append(data)
-    except OSError:
-        copy.abandon()
-        raise
-    copy.finish()
-
-
 def drop_snapshots(directory: Path, up_to: int) -> bool:
     """Delete the snapshots of instances up to a number; return True if none is left."""
     left = False

@@ -168,7 +168,7 @@ class _Writer:
             self._waiting = sequence, blocks
             self._changed.notify()
         if self._thread is None:  # not sooner, because it would delay a successor's announcement
-            self._thread = threading.Thread(target=self._work, name="rosrm keeper", daemon=True)
+            self._thread = threading.Thread(target=self._work, name="rosrm snapshots", daemon=True)
             self._thread.start()
 
     def close(self) -> None:

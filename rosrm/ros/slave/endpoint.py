@@ -68,7 +68,7 @@ class SlaveEndpoint:
     Args:
         state: instances of the slave; read-only here.
         take: takes events for the core.
-        kept_states: returns all snapshots on this host.
+        snapshots: returns all snapshots on this host.
         seen: newest journal records of the masters that this host knows.
 
     Attributes:
@@ -84,11 +84,11 @@ class SlaveEndpoint:
     def __init__(
         self, participant: Participant, description: HostDescription, state: SlaveState, *,
         take: Callable[[events.Event], None],
-        kept_states: Callable[[], Sequence[SnapshotReport]] = tuple,
+        snapshots: Callable[[], Sequence[SnapshotReport]] = tuple,
         seen: JournalWatermark | None = None,
     ) -> None:  # fmt: skip
         self._participant = participant
-        self._state, self._take, self._kept_states = state, take, kept_states
+        self._state, self._take, self._snapshots = state, take, snapshots
         self._description = description
         self._seen = seen or JournalWatermark()
         self.link = MasterLink.SEARCHING
@@ -141,7 +141,9 @@ class SlaveEndpoint:
         self._usages = node.create_publisher(
             msg.ProcessUsage, path(names.PROCESS_USAGE), qos.STATUSES
         )
-        self._kept = node.create_publisher(msg.KeptStates, path(names.KEPT_STATES), qos.STATUSES)
+        self._snapshot_reports = node.create_publisher(
+            msg.KeptStates, path(names.KEPT_STATES), qos.STATUSES
+        )
         node.create_subscription(
             msg.MasterBeat, path(names.MASTER_BEAT),
             self._participant.counted(self._take_beat), qos.BEAT_IN,
@@ -197,7 +199,7 @@ class SlaveEndpoint:
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._state.statuses()],
-            kept=[convert.snapshot_to_msg(one) for one in self._kept_states()],
+            kept=[convert.snapshot_to_msg(one) for one in self._snapshots()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
         self._incarnation = beat.incarnation
@@ -394,11 +396,11 @@ class SlaveEndpoint:
                 )
             )  # fmt: skip
 
-    def publish_kept(self, states: Sequence[SnapshotReport]) -> bool:
+    def publish_snapshots(self, states: Sequence[SnapshotReport]) -> bool:
         """Publish all snapshots that this host holds; False: it is not registered."""
         if self.link is not MasterLink.REGISTERED:
             return False
-        self._kept.publish(
+        self._snapshot_reports.publish(
             msg.KeptStates(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                 incarnation=self._description.incarnation,

@@ -100,7 +100,7 @@ class ReplicationEndpoint:
 
     # --- requests to other slaves --------------------------------------------------------
 
-    def finds_keeper(self, host: str, now: float) -> bool:
+    def finds_receiver(self, host: str, now: float) -> bool:
         """Return True if a host's slave is discovered and can receive a replica."""
         return bool(self._peer(srv.KeepState, names.KEEP_STATE, host, now).service_is_ready())
 

@@ -58,7 +58,7 @@ class Duties:
             when the policy is durable, whichever process is killed, else with the reason why there
             is no such instance.
         keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
-        drop_kept: deletes the snapshots of a process, of instances up to this one.
+        drop_snapshots: deletes the snapshots of a process, of instances up to this one.
         execute: runs an executor, and calls its last argument with the outcome. If that takes
             longer than the order allows, the executor's strategy counts as failing.
         read_log: returns a part of a log; raises `Refused`.
@@ -67,7 +67,7 @@ class Duties:
     take: Callable[[Event], None]
     set_restart: Callable[[SetRestartPolicy, Callable[[str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
-    drop_kept: Callable[[InstanceId], None]
+    drop_snapshots: Callable[[InstanceId], None]
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
     read_log: Callable[[LogQuery], LogPart]
 
@@ -104,7 +104,7 @@ class SlaveServices:
                 case ReplicateSnapshot(instance, hosts, every):
                     self._duties.keep(instance, hosts, every)
                 case DropReplica(instance):
-                    self._duties.drop_kept(instance)
+                    self._duties.drop_snapshots(instance)
                 case _:
                     self._duties.take(event_of(order, request.envelope.receiver_beat / 1e9))
         except Refused as refusal:

@@ -110,7 +110,7 @@ class ReplicationService:
         self._next_scan = 0.0
         self._budget = float(settings.max_rate)
         self._budget_at = time.monotonic()
-        threading.Thread(target=self._work, name="kept states", daemon=True).start()
+        threading.Thread(target=self._work, name="snapshots", daemon=True).start()
         endpoint.serve(self)
 
     # --- the thread ----------------------------------------------------------------------
@@ -212,7 +212,7 @@ class ReplicationService:
             return
         # The host that waits longest comes first, so a host without an answer delays no other.
         for host in sorted(shipment.hosts, key=lambda name: shipment.due.get(name, 0.0)):
-            if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_keeper(host, now):
+            if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_receiver(host, now):
                 shipment.due[host] = now + shipment.every
                 transfer = self._transfers[process] = _Transfer(shipment, host)
                 sent = shipment.sent.get(host, (0, 0))

@@ -37,10 +37,10 @@ class Wire:
     def serve(self, host) -> None:
         self.host = host
 
-    def finds_keeper(self, host: str, now: float) -> bool:
+    def finds_receiver(self, host: str, now: float) -> bool:
         return host not in self.net.hidden
 
-    finds_source = finds_keeper
+    finds_source = finds_receiver
 
     def give(self, host, part, now, timeout, done) -> None:
         self.given.append(part)

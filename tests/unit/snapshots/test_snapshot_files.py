@@ -15,11 +15,17 @@ from hypothesis import strategies as st
 
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, Damaged, decoded, encoded_head
-from rosrm.snapshots.writer import SlotWriter, drop_snapshots, write_copy
+from rosrm.snapshots.writer import CopyWriter, SlotWriter, drop_snapshots
 
 
 def blocks(*contents: bytes) -> list[Block]:
     return [Block(data, zlib.crc32(data)) for data in contents]
+
+
+def write_copy(directory: Path, data: bytes) -> None:
+    copy = CopyWriter(directory)
+    copy.append(data)
+    copy.finish()
 
 
 def write(directory: Path, sequence: int, *contents: bytes, instance: int = 7) -> bool:
