@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -57,6 +57,9 @@ from rosrm.model.values import (
 from rosrm_simulate.world import World
 from tests.unit.core.machine import GIB, MIB, Machine
 from tests.unit.core.nodes import Air, Node
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = [
     "GIB",
@@ -203,11 +206,7 @@ class Cluster(World[Machine]):
         self.settings = CoreSettings(**{"settle": 1e9, **settings})
         self.policy = policy or Eq1()
         self.fallback = fallback
-        self.strategies = {
-            "relaunch": StartFirstOrStopFirst(),
-            "handoff": HandOver(),
-            **strategies,
-        }
+        self.strategies = {"relaunch": StartFirstOrStopFirst(), "handoff": HandOver(), **strategies}
         self.declared = declared or declared_by(self.strategies)
         super().__init__(self._new_state(epoch=1))
         self.air = Air(self.machines.values)
@@ -315,6 +314,11 @@ class Cluster(World[Machine]):
     def submit(self, *specs: ProcessSpec) -> Reply:
         return self.ask(happened.SubmissionReceived, specs)
 
+    def with_processes(self, *specs: ProcessSpec) -> Self:
+        """Submit processes, and return the cluster."""
+        assert self.submit(*specs).accepted
+        return self
+
     def cancel(self, *names: str) -> Reply:
         return self.ask(happened.CancelRequested, names)
 
@@ -377,7 +381,7 @@ class Cluster(World[Machine]):
         machine.restart_slave(self.now)
         return self.register(machine)
 
-    def report(self, host: str, *statuses: InstanceStatus, **failing: dict[str, str]) -> None:
+    def report(self, host: str, *statuses: InstanceStatus, **failing: Mapping[str, str]) -> None:
         """Send a batch of statuses, and the failing probes and strategies of a slave."""
         machine = self.machines[host]
         machine.batches += 1

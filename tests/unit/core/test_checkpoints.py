@@ -9,12 +9,7 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Command, SendOrder
-from rosrm.model.orders import (
-    FenceInstance,
-    SetRestartPolicy,
-    StartInstance,
-    StopInstance,
-)
+from rosrm.model.orders import FenceInstance, SetRestartPolicy, StartInstance, StopInstance
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, Stop, plan_fault
 from rosrm.model.values import (
     HostLossPolicy,
@@ -244,8 +239,7 @@ def test_a_plan_in_progress_refuses_another_request() -> None:
 
 def test_without_a_strategy_that_takes_images_there_is_no_checkpoint() -> None:
     """The refusal names the strategy to use."""
-    cluster = Cluster("a")
-    cluster.submit(movable("p"))
+    cluster = Cluster("a").with_processes(movable("p"))
     said = cluster.checkpoint("p").message
     assert "nothing that is selected here can checkpoint p: name `criu`" in said
 

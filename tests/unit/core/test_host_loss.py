@@ -35,8 +35,7 @@ def lose(cluster: Cluster, *names: str, seconds: float = 12.0) -> None:
 
 def on_a(spec: ProcessSpec, *others: str, full: bool = False, **settings: Any) -> Cluster:
     """Return a cluster in which a process runs on a; the others are cordoned if they are full."""
-    cluster = Cluster("a", **settings)
-    cluster.submit(spec)
+    cluster = Cluster("a", **settings).with_processes(spec)
     for name in others:
         cluster.add(name)
         if full:
@@ -325,14 +324,18 @@ def test_the_time_of_an_isolation_policy_applies() -> None:
 
 
 def test_beats_name_the_hosts_without_contact() -> None:
-    """Beats name suspect and lost hosts, not expected ones or those that have left."""
-    cluster = Cluster("a", "b", "c")
+    """Beats name suspect, lost and detached hosts, not expected ones or those that have left.
+
+    A slave that is still stopping must not take a beat as contact with the master.
+    """
+    cluster = Cluster(*"abcd").with_processes(*(process(name) for name in "pqrs"))
     assert cluster.state.hosts.silent_hosts() == []
     lose(cluster, "b", seconds=2.0)
     lose(cluster, "c", seconds=10.0)
-    assert cluster.state.hosts.silent_hosts() == [2, 3]
+    cluster.detach("d")
+    assert cluster.state.hosts.silent_hosts() == [2, 3, 4]
     cluster.reconnect("b", seconds=1.0)
-    assert cluster.state.hosts.silent_hosts() == [3]
+    assert cluster.state.hosts.silent_hosts() == [3, 4]
 
 
 @pytest.mark.parametrize(("then", "phase"), [("wait", "running"), ("stop", "failed")])

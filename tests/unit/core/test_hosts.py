@@ -126,8 +126,7 @@ def test_the_registration_of_a_host_defines_the_meaning_of_its_slots() -> None:
 
 def test_an_invalid_usage_is_refused() -> None:
     """An invalid usage of an instance is recorded, and its last valid usage stays."""
-    cluster = Cluster("a")
-    cluster.submit(process("p", memory=100))
+    cluster = Cluster("a").with_processes(process("p", memory=100))
     for wrong in (float("nan"), -1.0, float("inf")):
         cluster.machines["a"].shown["p"] = {"memory": wrong}
         cluster.tell(cluster.machines["a"].usages(cluster.now))
@@ -154,8 +153,7 @@ def test_a_second_live_slave_of_a_name_is_refused() -> None:
 @pytest.mark.parametrize("seconds", [1.5, 11.0], ids=["silent", "lost"])
 def test_the_next_run_of_a_slave_registers_when_the_former_is_silent(seconds: float) -> None:
     """The instances of the old slave keep running; after a loss they are re-adopted."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
+    cluster = Cluster("a").with_processes(process("p"))
     cluster.cut("a", seconds=seconds)
     cluster.restart_slave("a")
     assert cluster.phase("p") == "running"
@@ -229,8 +227,7 @@ def test_the_arrays_grow_without_loss() -> None:
 
 def test_a_silent_host_is_suspect_and_gets_no_work() -> None:
     """The processes of a suspect host keep running."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
+    cluster = Cluster("a").with_processes(process("p"))
     cluster.cut("a", seconds=1.2)
     assert len(cluster.recorded("host_suspect")) == 1
     cluster.submit(process("q"))
@@ -260,8 +257,7 @@ def test_a_host_with_a_long_period_is_not_silent() -> None:
 
 def test_the_processes_of_a_lost_host_are_readopted() -> None:
     """The processes return to their former phases, and the master requests a full report."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"), job("q"))
+    cluster = Cluster("a").with_processes(process("p"), job("q"))
     cluster.cut("a", seconds=11.0)
     cluster.machines["a"].finish("q", cluster.now)
     cluster.reconnect("a", seconds=0.5)
@@ -272,8 +268,7 @@ def test_the_processes_of_a_lost_host_are_readopted() -> None:
 @pytest.mark.parametrize("last", [False, True])
 def test_after_a_lost_status_batch_the_master_requests_a_full_report(last: bool) -> None:
     """A gap in the batch numbers shows the loss, and of the last batch the next reading does."""
-    cluster = Cluster("a")
-    cluster.submit(job("p"), process("q"))
+    cluster = Cluster("a").with_processes(job("p"), process("q"))
     machine = cluster.machines["a"]
     machine.finish("p", cluster.now)
     machine.said.clear()
@@ -290,8 +285,7 @@ def test_after_a_lost_status_batch_the_master_requests_a_full_report(last: bool)
 
 def test_a_status_batch_that_comes_late_or_twice_changes_nothing() -> None:
     """The master already knows a newer status."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
+    cluster = Cluster("a").with_processes(process("p"))
     machine = cluster.machines["a"]
     old = happened.StatusesReceived(machine.host_id, machine.incarnation, 1, True, ())
     before = len(cluster.carried)
@@ -306,8 +300,7 @@ def test_a_status_batch_that_comes_late_or_twice_changes_nothing() -> None:
 
 def test_a_cordoned_host_gets_no_work_and_keeps_what_it_has() -> None:
     """The host takes work again once it is uncordoned."""
-    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
-    cluster.submit(process("p"))
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5})).with_processes(process("p"))
     assert cluster.set_host("a", "cordon").message == "a is cordoned"
     cluster.submit(process("q"))
     assert (cluster.where("p"), cluster.where("q")) == (["a"], ["b"])
@@ -336,8 +329,7 @@ def test_the_processes_that_a_leaving_host_ends_are_queued_again() -> None:
 
 def test_a_job_that_completes_as_its_host_leaves_has_finished() -> None:
     """The job completed by its own exit and does not run again."""
-    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
-    cluster.submit(job("p"))
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5})).with_processes(job("p"))
     machine = cluster.machines["a"]
     cluster.ask(happened.HostLeft, machine.host_id, machine.incarnation)
     machine.finish("p", cluster.now)
@@ -347,8 +339,7 @@ def test_a_job_that_completes_as_its_host_leaves_has_finished() -> None:
 
 def test_a_process_that_a_stopped_slave_ends_has_the_reason_and_the_time() -> None:
     """A bare "SIGINT" would not tell the user the cause, nor whether the process ever ends."""
-    cluster = Cluster("a")
-    cluster.submit(process("deaf", stop=StopPolicy(2.0, 3.0)))
+    cluster = Cluster("a").with_processes(process("deaf", stop=StopPolicy(2.0, 3.0)))
     machine = cluster.machines["a"]
     cluster.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
     (instance,) = machine.programs
@@ -361,8 +352,7 @@ def test_a_process_that_a_stopped_slave_ends_has_the_reason_and_the_time() -> No
 
 def test_a_host_that_left_and_became_silent_is_lost() -> None:
     """Its processes stay in memory and show as unreachable."""
-    cluster = Cluster("a", "b")
-    cluster.submit(process("p"))
+    cluster = Cluster("a", "b").with_processes(process("p"))
     machine = cluster.machines["a"]
     cluster.ask(happened.HostLeft, machine.host_id, machine.incarnation)
     machine.connected = False

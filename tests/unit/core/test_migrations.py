@@ -22,14 +22,7 @@ from rosrm.model.values import (
     ProcessSpec,
     RestartPolicy,
 )
-from tests.unit.core.cluster import (
-    Cluster,
-    Machine,
-    StartFirstOrStopFirst,
-    job,
-    movable,
-    process,
-)
+from tests.unit.core.cluster import Cluster, Machine, StartFirstOrStopFirst, job, movable, process
 from tests.unit.core.machine import GIB
 
 

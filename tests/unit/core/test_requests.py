@@ -57,8 +57,7 @@ def test_a_name_in_use_refuses_the_submission() -> None:
 
     The refusal lists live processes and those being cancelled, with the reason.
     """
-    cluster = Cluster("a")
-    cluster.submit(*(process(name) for name in "pqrs"))
+    cluster = Cluster("a").with_processes(*(process(name) for name in "pqrs"))
     reply = cluster.submit(process("t"), process("p"))
     assert (reply.accepted, reply.code) == (False, "name_taken")
     assert reply.message == (
@@ -77,8 +76,7 @@ def test_a_name_in_use_refuses_the_submission() -> None:
 
 def test_the_name_of_a_terminal_process_can_be_used_again() -> None:
     """The new process is the last in the listing."""
-    cluster = Cluster("a")
-    cluster.submit(job("p"), job("q"))
+    cluster = Cluster("a").with_processes(job("p"), job("q"))
     cluster.finish("p")
     assert cluster.submit(job("p")).accepted
     assert list(cluster.state.processes) == ["q", "p"]
@@ -133,16 +131,14 @@ def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
 
 def test_cancel_removes_a_waiting_process_from_the_queue() -> None:
     """The processes behind it move up."""
-    cluster = Cluster()
-    cluster.submit(process("p"), process("q"))
+    cluster = Cluster().with_processes(process("p"), process("q"))
     assert cluster.cancel("p").message == "1 process cancelled"
     assert (cluster.phase("p"), cluster.queue()) == ("cancelled", ["q"])
 
 
 def test_cancel_ends_a_process_that_was_set_aside() -> None:
     """A host that would fit does not bring it back."""
-    cluster = Cluster("a")
-    cluster.submit(process("p", required_labels={"x": "y"}))
+    cluster = Cluster("a").with_processes(process("p", required_labels={"x": "y"}))
     cluster.cancel("p")
     cluster.add(Machine("b", labels={"x": "y"}))
     cluster.wait(1.0)
@@ -176,8 +172,7 @@ def test_a_stop_order_repeats_until_the_process_has_ended() -> None:
 
 def test_cancel_names_processes_that_ended_before() -> None:
     """The other processes are cancelled."""
-    cluster = Cluster("a")
-    cluster.submit(job("p"), process("q"))
+    cluster = Cluster("a").with_processes(job("p"), process("q"))
     cluster.finish("p")
     assert cluster.cancel("p", "q").message == "1 process being cancelled; ended before: p"
     assert (cluster.phase("p"), cluster.phase("q")) == ("finished", "cancelled")
@@ -185,8 +180,7 @@ def test_cancel_names_processes_that_ended_before() -> None:
 
 def test_an_unknown_name_refuses_the_whole_request() -> None:
     """No process is cancelled or restarted."""
-    cluster = Cluster("a")
-    cluster.submit(process("talker"))
+    cluster = Cluster("a").with_processes(process("talker"))
     for ask in (cluster.cancel, cluster.restart):
         reply = ask("talker", "talkre")
         assert (reply.code, reply.message) == (
@@ -218,8 +212,7 @@ def test_cancel_during_a_move_ends_both_instances(overlap: bool) -> None:
 
 def test_restart_of_a_running_process_happens_on_its_host() -> None:
     """The instance and the host stay the same, and the process becomes ready again."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
+    cluster = Cluster("a").with_processes(process("p"))
     before = cluster.machines["a"].programs[cluster.machines["a"].find("p")].pid
     assert cluster.restart("p").message == "1 process restarted"
     after = cluster.machines["a"].programs[cluster.machines["a"].find("p")].pid
@@ -229,8 +222,7 @@ def test_restart_of_a_running_process_happens_on_its_host() -> None:
 
 def test_restart_of_a_terminal_process_queues_it_again() -> None:
     """The process goes to the end of the queue, and may go to any host."""
-    cluster = Cluster("a")
-    cluster.submit(job("p"))
+    cluster = Cluster("a").with_processes(job("p"))
     cluster.finish("p", code=3)
     assert (cluster.phase("p"), cluster["p"].exit_code) == ("failed", 3)
     cluster.restart("p", "p")
@@ -248,8 +240,7 @@ def test_restart_does_not_prevent_the_start_of_an_assigned_process() -> None:
 @pytest.mark.parametrize("code", [0, 3])
 def test_a_restart_is_not_lost_if_the_process_has_just_ended(code: int) -> None:
     """The end was reported before the restart order arrived: the process is queued again."""
-    cluster = Cluster("a")
-    cluster.submit(job("p"))
+    cluster = Cluster("a").with_processes(job("p"))
     cluster.machines["a"].finish("p", cluster.now, code=code)
     assert cluster.restart("p").accepted
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
@@ -260,8 +251,7 @@ def test_a_restart_is_not_lost_if_the_process_has_just_ended(code: int) -> None:
 
 def test_an_end_after_a_restart_is_final() -> None:
     """The restart was carried out, so a later end counts."""
-    cluster = Cluster("a")
-    cluster.submit(job("p"))
+    cluster = Cluster("a").with_processes(job("p"))
     cluster.restart("p")
     cluster.finish("p")
     assert (cluster.phase("p"), len(cluster.assigned())) == ("finished", 1)
@@ -285,8 +275,7 @@ def test_the_oldest_terminal_processes_are_garbage_collected() -> None:
 
 def test_a_terminal_process_is_kept_while_an_instance_is_being_stopped() -> None:
     """Its name must not be given to another process until then."""
-    cluster = Cluster("a", keep_ended=1)
-    cluster.submit(process("p"), job("q"))
+    cluster = Cluster("a", keep_ended=1).with_processes(process("p"), job("q"))
     cluster.cancel("p")
     assert cluster.phase("p") == "cancelled"
     # A late status shows that an instance of p still runs.
@@ -303,8 +292,7 @@ def test_a_terminal_process_is_kept_while_an_instance_is_being_stopped() -> None
 
 def test_a_process_that_runs_again_is_not_terminal() -> None:
     """A process that was restarted or submitted again counts as newest at its next end."""
-    cluster = Cluster("a", keep_ended=1)
-    cluster.submit(job("p"))
+    cluster = Cluster("a", keep_ended=1).with_processes(job("p"))
     cluster.finish("p")
     cluster.restart("p")
     cluster.submit(job("q"))
@@ -343,8 +331,7 @@ def test_restart_is_refused_where_it_makes_no_sense() -> None:
 
 def test_a_job_that_exits_with_0_has_finished_one_that_does_not_has_failed() -> None:
     """The listing shows the exit code."""
-    cluster = Cluster("a")
-    cluster.submit(job("good"), job("bad"))
+    cluster = Cluster("a").with_processes(job("good"), job("bad"))
     cluster.machines["a"].finish("good", cluster.now)
     cluster.finish("bad", code=7)
     assert (cluster.phase("good"), cluster.phase("bad")) == ("finished", "failed")
@@ -353,8 +340,7 @@ def test_a_job_that_exits_with_0_has_finished_one_that_does_not_has_failed() -> 
 
 def test_a_node_that_never_appears_in_the_graph_fails() -> None:
     """Its slave reports the failure after the readiness time-out."""
-    cluster = Cluster("a")
-    cluster.submit(node("p"))
+    cluster = Cluster("a").with_processes(node("p"))
     cluster.wait(21.0)
     assert cluster.phase("p") == "failed"
     assert "not ready within 20 s" in cluster["p"].reason
@@ -504,16 +490,14 @@ def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ende
 
 def test_a_started_job_is_running_and_not_ready() -> None:
     """Only a service becomes ready for others."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"), job("q"))
+    cluster = Cluster("a").with_processes(process("p"), job("q"))
     assert cluster.recorded("ready") == ["p is ready on a"]
     assert cluster.recorded("running") == ["q is running on a"]
 
 
 def test_a_node_is_starting_until_the_ros_graph_shows_it() -> None:
     """The reason has the node's full name and the time-out; once the node appears, it is empty."""
-    cluster = Cluster("a")
-    cluster.submit(node("p", namespace="/robot"))
+    cluster = Cluster("a").with_processes(node("p", namespace="/robot"))
     waits = "waits for its node /robot/p in the ROS graph, for at most 20 s"
     row = listing.process_row(cluster.state, cluster["p"], cluster.now)
     assert (row.state, row.reason, cluster.explain("p")["reason"]) == ("starting", waits, waits)
