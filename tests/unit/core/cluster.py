@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,7 @@ from rosrm.model.plan import (
 )
 from rosrm.model.values import (
     EMPTY,
+    InstanceStatus,
     Kind,
     MigrationPolicy,
     ProcessSpec,
@@ -57,6 +58,9 @@ from rosrm.model.values import (
 from rosrm_simulate.world import World
 from tests.unit.core.machine import GIB, MIB, Machine
 from tests.unit.core.nodes import Air, Node
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = [
     "GIB",
@@ -203,11 +207,7 @@ class Cluster(World[Machine]):
         self.settings = CoreSettings(**{"settle": 1e9, **settings})
         self.policy = policy or Eq1()
         self.fallback = fallback
-        self.strategies = {
-            "relaunch": StartFirstOrStopFirst(),
-            "handoff": HandOver(),
-            **strategies,
-        }
+        self.strategies = {"relaunch": StartFirstOrStopFirst(), "handoff": HandOver(), **strategies}
         self.declared = declared or declared_by(self.strategies)
         super().__init__(self._new_state(epoch=1))
         self.air = Air(self.machines.values)
@@ -315,6 +315,11 @@ class Cluster(World[Machine]):
     def submit(self, *specs: ProcessSpec) -> Reply:
         return self.ask(happened.SubmissionReceived, specs)
 
+    def with_processes(self, *specs: ProcessSpec) -> Self:
+        """Submit processes, and return the cluster."""
+        assert self.submit(*specs).accepted
+        return self
+
     def cancel(self, *names: str) -> Reply:
         return self.ask(happened.CancelRequested, names)
 
@@ -333,27 +338,74 @@ class Cluster(World[Machine]):
     def set_host(self, host: str, action: str) -> Reply:
         return self.ask(happened.HostStateRequested, host, action)
 
-    def leave(self, machine: Machine) -> Reply:
+    def leave(self, host: str) -> Reply:
         """Stop a slave: it announces its departure and ends all its processes."""
+        machine = self.machines[host]
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
         machine.shut_down(self.now)
         self.settle()
         return reply
 
-    def detach(self, machine: Machine) -> Reply:
+    def detach(self, host: str) -> Reply:
         """Stop a slave that leaves its processes running; the host then has no slave."""
+        machine = self.machines[host]
         kept = machine.begun()
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, kept)
         machine.connected = False
         return reply
 
-    def attach(self, machine: Machine) -> Reply:
-        """Start the slave of a host again."""
+    # --- hosts and processes -------------------------------------------------------------
+
+    def cut(self, *hosts: str, seconds: float = 0.0) -> None:
+        """Cut hosts off, and let time pass."""
+        for host in hosts:
+            self.machines[host].connected = False
+        self.wait(seconds)
+
+    def reconnect(self, *hosts: str, seconds: float = 0.0) -> None:
+        """Repair the wires of hosts, and let time pass."""
+        for host in hosts:
+            self.machines[host].connected = True
+        self.wait(seconds)
+
+    def rejoin(self, host: str, seconds: float = 1.0) -> None:
+        """Repair the wires of a host, register its slave again, and let time pass."""
+        machine = self.machines[host]
+        machine.connected = True
+        assert self.register(machine).accepted
+        self.wait(seconds)
+
+    def restart_slave(self, host: str) -> Reply:
+        """Start another run of a host's slave, which registers; the processes keep running."""
+        machine = self.machines[host]
         machine.connected = True
         machine.restart_slave(self.now)
-        reply = self.register(machine)
+        return self.register(machine)
+
+    def report(self, host: str, *statuses: InstanceStatus, **failing: Mapping[str, str]) -> None:
+        """Send a batch of statuses, and the failing probes and strategies of a slave."""
+        machine = self.machines[host]
+        machine.batches += 1
+        self.tell(
+            happened.StatusesReceived(
+                machine.host_id, machine.incarnation, machine.batches, False, statuses, **failing
+            )
+        )
+
+    def finish(self, name: str, on: str = "a", *, code: int = 0, run_time: float = 10.0) -> None:
+        """End a process with an exit code, and deliver all messages."""
+        self.machines[on].finish(name, self.now, code=code, run_time=run_time)
         self.settle()
-        return reply
+
+    def let_go(self, name: str, on: str = "a") -> None:
+        """End a stubborn process, and deliver all messages."""
+        self.machines[on].let_go(name, self.now)
+        self.settle()
+
+    def discover(self, name: str, on: str = "a") -> None:
+        """Show the node of the newest instance in the ROS graph, and deliver all messages."""
+        self.machines[on].seen_in_graph(name, self.now)
+        self.settle()
 
     # --- time and wires ------------------------------------------------------------------
 
@@ -452,7 +504,7 @@ class Cluster(World[Machine]):
     def queue(self) -> list[str]:
         return list(self.state.queue)
 
-    def told(self, kind: str) -> list[str]:
+    def recorded(self, kind: str) -> list[str]:
         """Return the messages of the records of a kind."""
         return [record.message for record in self.records if record.kind == kind]
 

@@ -106,7 +106,7 @@ def test_a_host_fits_exactly_if_no_filter_has_a_reason_against_it(
 
 
 @given(tables(), demands(), st.booleans())
-def test_every_filter_that_says_no_says_why(
+def test_every_filter_that_excludes_a_host_has_a_reason(
     table: HostTable, demand: Demand, as_empty: bool
 ) -> None:
     """Reason and mask agree for all hosts, for some hosts, and for hosts taken as empty."""
@@ -127,7 +127,7 @@ def test_every_filter_that_says_no_says_why(
 
 
 @given(tables(most=3), demands(), st.lists(st.integers(0, 19), min_size=1, max_size=6))
-def test_a_ranking_that_was_refreshed_equals_a_new_one(
+def test_a_refreshed_ranking_equals_a_new_one(
     table: HostTable, demand: Demand, chosen: list[int]
 ) -> None:
     """The ranking stays correct after assignments of the same demand and of other demands."""
@@ -145,7 +145,7 @@ def test_a_ranking_that_was_refreshed_equals_a_new_one(
 
 
 @given(tables(most=3), demands())
-def test_no_process_is_set_aside_that_a_host_takes_now(table: HostTable, demand: Demand) -> None:
+def test_no_process_is_set_aside_if_a_host_takes_it_now(table: HostTable, demand: Demand) -> None:
     """The reason of a process that is set aside names each host."""
     never = why_never(table, demand)
     if (ranked(table, demand).value < np.inf).any():

@@ -15,13 +15,14 @@ from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
     IsolationPolicy,
+    Kind,
     MigrationPolicy,
     ProcessSpec,
     RestartPolicy,
     StandbyPolicy,
     StopPolicy,
 )
-from tests.unit.core.cluster import Cluster, job, movable, process
+from tests.unit.core.cluster import Cluster, movable, process
 from tests.unit.core.machine import Machine
 
 ELSEWHERE = HostLossPolicy("elsewhere")
@@ -29,26 +30,25 @@ ELSEWHERE = HostLossPolicy("elsewhere")
 
 def lose(cluster: Cluster, *names: str, seconds: float = 12.0) -> None:
     """Cut hosts off for longer than their lease."""
-    for name in names:
-        cluster.machines[name].connected = False
-    cluster.wait(seconds)
+    cluster.cut(*names, seconds=seconds)
 
 
-def back(cluster: Cluster, *names: str, seconds: float = 1.0) -> None:
-    for name in names:
-        cluster.machines[name].connected = True
-    cluster.wait(seconds)
-
-
-def on_a(spec: ProcessSpec, *others: str, **settings: Any) -> Cluster:
-    """Return a cluster in which a process runs on host a."""
-    cluster = Cluster("a", **settings)
-    cluster.submit(spec)
+def on_a(spec: ProcessSpec, *others: str, full: bool = False, **settings: Any) -> Cluster:
+    """Return a cluster in which a process runs on a; the others are cordoned if they are full."""
+    cluster = Cluster("a", **settings).with_processes(spec)
     for name in others:
         cluster.add(name)
+        if full:
+            cluster.set_host(name, "cordon")
     cluster.wait(11.0)  # the master has had contact with some host for a whole lease
     assert cluster.where(spec.name) == ["a"]
     return cluster
+
+
+def followed(*, full: bool = False, **fields: Any) -> Cluster:
+    """Return a cluster in which p runs on a, and starts on b when a is lost."""
+    fields.setdefault("host_loss", ELSEWHERE)
+    return on_a(process("p", **fields), "b", full=full)
 
 
 # --- host-loss policies -----------------------------------------------------------------------
@@ -59,24 +59,24 @@ def test_by_default_a_process_waits_for_its_host() -> None:
     cluster = on_a(process("p"), "b")
     lose(cluster, "a", seconds=100.0)
     assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "a is lost")
-    back(cluster, "a")
+    cluster.reconnect("a", seconds=1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
 
 
-def test_elsewhere_starts_it_on_another_host_as_soon_as_its_host_is_lost() -> None:
+def test_elsewhere_starts_a_process_on_another_host_after_the_lease() -> None:
     """The successor starts as soon as the lease has expired, not before."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster = followed()
     lose(cluster, "a", seconds=9.5)
     assert cluster.where("p") == ["a"]
     cluster.wait(1.0)
     assert cluster.where("p") == ["a", "b"]
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
-    assert cluster.told("given_up") == ["p#1 is given up: a is lost"]
+    assert cluster.recorded("given_up") == ["p#1 is given up: a is lost"]
 
 
 def test_elsewhere_waits_for_its_delay() -> None:
     """The reason names the delay."""
-    cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
+    cluster = followed(host_loss=HostLossPolicy("elsewhere", 20.0))
     lose(cluster, "a", seconds=25.0)
     assert cluster["p"].reason == "a is lost; the process is started on another host in 20 s"
     assert cluster.where("p") == ["a"]
@@ -84,56 +84,49 @@ def test_elsewhere_waits_for_its_delay() -> None:
     assert cluster.where("p") == ["a", "b"]
 
 
-def test_stop_lets_it_fail() -> None:
+def test_stop_makes_a_process_fail() -> None:
     """The process has no successor, and is stopped when its host rejoins."""
-    cluster = on_a(process("p", host_loss=HostLossPolicy("stop")), "b")
+    cluster = followed(host_loss=HostLossPolicy("stop"))
     lose(cluster, "a")
     assert (cluster.phase("p"), cluster["p"].reason) == ("failed", "a is lost")
     assert cluster.where("p") == ["a"]
-    back(cluster, "a")
+    cluster.reconnect("a", seconds=1.0)
     assert cluster.where("p") == []
 
 
 # --- rejoin -----------------------------------------------------------------------------------
 
 
-def test_the_old_instance_is_fenced_when_its_host_is_heard() -> None:
-    """The new instance owns the name, so the old one ends at once, without its stop time."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+@pytest.mark.parametrize("restarted", [False, True], ids=["same master", "restarted master"])
+def test_the_old_instance_is_fenced_when_its_host_rejoins(restarted: bool) -> None:
+    """The new instance owns the name, so the old one ends at once, without its stop time.
+
+    A restarted master fences an instance that its journal does not contain.
+    """
+    cluster = followed()
     cluster.machines["a"].stubborn.add("p")
     lose(cluster, "a")
-    back(cluster, "a", seconds=0.2)
+    if restarted:
+        cluster.restart_master()
+        assert cluster.phase("p") == "running"
+        cluster.rejoin("a", 0.2)
+    cluster.reconnect("a", seconds=0.2)
     assert cluster.where("p") == ["b"]
     assert [order.instance.number for order in cluster.orders(FenceInstance)] == [1]
-    assert cluster.told("fenced")[0].startswith(
-        "p#1 is not assigned to a: the master has it killed"
-    )
-
-
-def test_the_old_instance_is_fenced_by_a_master_that_was_restarted() -> None:
-    """The new master fences an instance that its journal does not contain."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
-    lose(cluster, "a")
-    cluster.restart_master()
-    assert cluster.phase("p") == "running"
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
-    cluster.wait(1.0)
-    assert cluster.where("p") == ["b"]
+    (message, *_) = cluster.recorded("fenced")
+    assert message.startswith("p#1 is not assigned to a: the master has it killed")
 
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["same master", "restarted master"])
-def test_what_nothing_has_followed_goes_on(restarted: bool) -> None:
+def test_a_process_without_a_successor_is_readopted(restarted: bool) -> None:
     """With no room elsewhere, the process leaves the queue and keeps running untouched."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE, required_labels={}), "b")
-    cluster.set_host("b", "cordon")
+    cluster = followed(full=True)
     lose(cluster, "a")
     assert (cluster.phase("p"), cluster.queue()) == ("queued", ["p"])
     if restarted:
         cluster.restart_master()
-        cluster.machines["a"].connected = True
-        cluster.register(cluster.machines["a"])
-    back(cluster, "a")
+        cluster.rejoin("a", 0.0)
+    cluster.reconnect("a", seconds=1.0)
     assert (cluster.phase("p"), cluster["p"].owner, cluster.queue()) == ("running", 1, [])
     assert cluster.where("p") == ["a"]
     assert not cluster.orders(FenceInstance)
@@ -142,35 +135,22 @@ def test_what_nothing_has_followed_goes_on(restarted: bool) -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
 
 
-def test_a_job_that_completed_out_of_sight_is_not_done_again() -> None:
-    """The job had no successor yet."""
-    cluster = on_a(job("p", host_loss=ELSEWHERE), "b")
-    cluster.set_host("b", "cordon")
+@pytest.mark.parametrize(("code", "phase"), [(0, "finished"), (3, "failed")])
+def test_an_end_on_a_lost_host_is_final(code: int, phase: str) -> None:
+    """A job without a successor is not run again; the host has applied its restart policy."""
+    cluster = followed(kind=Kind.JOB, full=True)
     lose(cluster, "a")
-    cluster.machines["a"].finish("p", cluster.now)
-    back(cluster, "a")
-    assert (cluster.phase("p"), cluster.queue()) == ("finished", [])
+    cluster.machines["a"].finish("p", cluster.now, code=code)
+    cluster.reconnect("a", seconds=1.0)
+    assert (cluster.phase("p"), cluster["p"].exit_code, cluster.queue()) == (phase, code, [])
 
 
-def test_what_failed_out_of_sight_has_failed() -> None:
-    """The host has applied the process's restart policy, so the failure is final."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
-    cluster.set_host("b", "cordon")
-    lose(cluster, "a")
-    cluster.machines["a"].finish("p", cluster.now, code=3)
-    back(cluster, "a")
-    assert (cluster.phase("p"), cluster["p"].exit_code) == ("failed", 3)
-
-
-def test_what_is_not_there_any_more_goes_elsewhere() -> None:
+def test_a_process_that_is_missing_on_a_returned_host_starts_again() -> None:
     """A host that lost its power rejoins without the process."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
-    cluster.set_host("b", "cordon")
+    cluster = followed(full=True)
     lose(cluster, "a")
     cluster.machines["a"].programs.clear()
-    cluster.machines["a"].restart_slave(cluster.now)
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
+    cluster.restart_slave("a")
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster["p"].owner, cluster.where("p")) == ("running", 2, ["a"])
 
@@ -178,28 +158,28 @@ def test_what_is_not_there_any_more_goes_elsewhere() -> None:
 # --- lost host or isolated master -------------------------------------------------------------
 
 
-def test_a_master_that_hears_nobody_gives_nothing_up() -> None:
+def test_a_master_without_contact_to_any_host_gives_nothing_up() -> None:
     """A host that rejoins within a lease of the first host keeps its processes."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster = followed()
     lose(cluster, "a", "b", seconds=60.0)
-    assert (cluster.phase("p"), cluster.told("given_up")) == ("unreachable", [])
-    back(cluster, "b", seconds=8.0)
-    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.recorded("given_up")) == ("unreachable", [])
+    cluster.reconnect("b", seconds=8.0)
+    cluster.reconnect("a", seconds=1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
-    assert not cluster.told("given_up")
+    assert not cluster.recorded("given_up")
 
 
-def test_a_host_that_stays_away_when_the_others_are_back_is_given_up() -> None:
+def test_a_host_that_stays_away_after_the_rejoin_of_others_is_given_up() -> None:
     """The host is given up one lease after the first host rejoined."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster = followed()
     lose(cluster, "a", "b", seconds=60.0)
-    back(cluster, "b", seconds=12.0)
+    cluster.reconnect("b", seconds=12.0)
     assert cluster.where("p") == ["a", "b"]
 
 
 def test_a_restarted_master_gives_the_hosts_their_lease_first() -> None:
     """A new master has had no contact yet, so silence counts from its start."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster = followed()
     cluster.machines["a"].connected = False
     cluster.restart_master()
     cluster.wait(9.0)
@@ -214,22 +194,29 @@ def test_a_restarted_master_gives_the_hosts_their_lease_first() -> None:
 BEING_CANCELLED = "being cancelled; it may still run on a, which is lost, and ends when a returns"
 
 
-@pytest.mark.parametrize("then", ["wait", "stop"])
+@pytest.mark.parametrize(
+    "policy",
+    [HostLossPolicy(), HostLossPolicy("stop", 50.0), HostLossPolicy("elsewhere", 20.0)],
+    ids=lambda one: one.then,
+)
 def test_a_process_on_a_lost_host_is_being_cancelled_until_the_host_reports_its_end(
-    then: Any,
+    policy: HostLossPolicy,
 ) -> None:
-    """The process may still run there, so its name stays taken until then."""
-    cluster = on_a(process("p", host_loss=HostLossPolicy(then, 50.0)), "b")
+    """The process may still run there, so its name stays taken until then.
+
+    A fence of `isolation: keep` ends nothing while the slave runs.
+    """
+    cluster = followed(host_loss=policy)
     lose(cluster, "a")
     assert cluster.cancel("p").message == f"1 process being cancelled; p is {BEING_CANCELLED}"
     cluster.wait(100.0)
     assert (cluster.phase("p"), cluster["p"].reason) == ("stopping", BEING_CANCELLED)
     assert BEING_CANCELLED in cluster.submit(process("p")).message
-    back(cluster, "a")
+    cluster.reconnect("a", seconds=1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
 
 
-def test_a_process_that_is_being_cancelled_when_its_host_is_lost_says_so() -> None:
+def test_a_process_that_is_being_cancelled_when_its_host_is_lost_has_the_reason() -> None:
     """The reason is kept over a restart of the master."""
     cluster = on_a(process("p"), "b")
     cluster.machines["a"].stubborn.add("p")
@@ -240,51 +227,32 @@ def test_a_process_that_is_being_cancelled_when_its_host_is_lost_says_so() -> No
     assert cluster.phase("p") == "stopping"
     assert "a, which has not come back since the master started" in cluster["p"].reason
     cluster.machines["a"].let_go("p", cluster.now)
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
-    cluster.wait(1.0)
+    cluster.rejoin("a")
     assert cluster.phase("p") == "cancelled"
 
 
-def test_a_fenced_process_is_cancelled_when_its_fence_has_ended_it() -> None:
-    """With `elsewhere` the process ended before a successor could have started."""
-    spec = process(
-        "p", host_loss=HostLossPolicy("elsewhere", 20.0), isolation=IsolationPolicy("stop")
-    )
-    cluster = on_a(spec, "b")
+@pytest.mark.parametrize(
+    ("isolation", "before", "after"),
+    [(IsolationPolicy("stop"), 0.0, 20.0), (IsolationPolicy("stop", 60.0), 48.0, 6.0)],
+    ids=["delay", "later fence"],
+)
+def test_a_process_is_cancelled_when_its_fence_has_ended_it(
+    isolation: IsolationPolicy, before: float, after: float
+) -> None:
+    """With `elsewhere` the process ended before a successor could have started.
+
+    Its own `isolation.after` counts from the last contact that its host knows of.
+    """
+    cluster = followed(host_loss=HostLossPolicy("elsewhere", 20.0), isolation=isolation)
     lose(cluster, "a")
     cluster.cancel("p")
+    cluster.wait(before)  # the lease of 10 s expired 2 s before that
     assert cluster.phase("p") == "stopping"
-    cluster.wait(20.0)
+    cluster.wait(after)
     assert cluster.phase("p") == "cancelled"
 
 
-def test_a_cancelled_process_that_its_host_keeps_is_not_said_to_have_ended() -> None:
-    """A fence of `isolation: keep` ends nothing while the slave runs."""
-    cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
-    lose(cluster, "a")
-    cluster.cancel("p")
-    cluster.wait(100.0)
-    assert (cluster.phase("p"), cluster["p"].reason) == ("stopping", BEING_CANCELLED)
-    back(cluster, "a")
-    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
-
-
-def test_a_cancelled_process_waits_for_a_fence_that_is_later_than_its_delay() -> None:
-    """Its own `isolation.after` counts from the last contact that its host knows of."""
-    spec = process(
-        "p", host_loss=HostLossPolicy("elsewhere", 20.0), isolation=IsolationPolicy("stop", 60.0)
-    )
-    cluster = on_a(spec, "b")
-    lose(cluster, "a")
-    cluster.cancel("p")
-    cluster.wait(48.0)  # the lease of 10 s expired 2 s ago
-    assert cluster.phase("p") == "stopping"
-    cluster.wait(6.0)
-    assert cluster.phase("p") == "cancelled"
-
-
-def test_the_former_host_of_a_move_that_is_lost_does_not_hold_it_up() -> None:
+def test_the_loss_of_the_source_after_the_commit_does_not_block_a_move() -> None:
     """The destination owns the name; the source is fenced when its host rejoins."""
     cluster = on_a(movable("p"), "b")
     cluster.machines["a"].stubborn.add("p")
@@ -293,7 +261,7 @@ def test_the_former_host_of_a_move_that_is_lost_does_not_hold_it_up() -> None:
     assert cluster.phase("p") == "migrating"
     lose(cluster, "a", seconds=15.0)
     assert cluster.phase("p") == "running"
-    back(cluster, "a", seconds=0.5)
+    cluster.reconnect("a", seconds=0.5)
     assert cluster.where("p") == ["b"]
 
 
@@ -315,7 +283,7 @@ def test_by_default_nothing_is_fenced() -> None:
     assert fence(HostLossPolicy(), IsolationPolicy()) is None
 
 
-def test_what_may_have_a_successor_is_fenced_where_its_slave_is_not_at_work() -> None:
+def test_a_process_that_may_have_a_successor_is_fenced_without_its_slave() -> None:
     """A host that is only cut off keeps the process, as long as its slave runs."""
     cluster = Cluster("a")
     followed = process(
@@ -348,35 +316,39 @@ def test_a_fence_of_a_short_lease_leaves_time_for_beats() -> None:
     assert grace == pytest.approx(0.1)
 
 
-def test_a_time_of_ones_own_is_kept() -> None:
+def test_the_time_of_an_isolation_policy_applies() -> None:
     """A process without a successor gets its whole grace, too."""
     assert fence(HostLossPolicy(), IsolationPolicy("stop", 7.0)) == (7.0, 3.0)
     assert fence(HostLossPolicy(), IsolationPolicy("stop")) == (CoreSettings().lease, 3.0)
     assert fence(ELSEWHERE, IsolationPolicy("stop", 100.0)) == (100.0, 0.0)
 
 
-def test_beats_name_the_hosts_that_are_not_heard() -> None:
-    """Beats name suspect and lost hosts, not expected ones or those that have left."""
-    cluster = Cluster("a", "b", "c")
+def test_beats_name_the_hosts_without_contact() -> None:
+    """Beats name suspect, lost and detached hosts, not expected ones or those that have left.
+
+    A slave that is still stopping must not take a beat as contact with the master.
+    """
+    cluster = Cluster(*"abcd").with_processes(*(process(name) for name in "pqrs"))
     assert cluster.state.hosts.silent_hosts() == []
     lose(cluster, "b", seconds=2.0)
     lose(cluster, "c", seconds=10.0)
-    assert cluster.state.hosts.silent_hosts() == [2, 3]
-    back(cluster, "b")
-    assert cluster.state.hosts.silent_hosts() == [3]
+    cluster.detach("d")
+    assert cluster.state.hosts.silent_hosts() == [2, 3, 4]
+    cluster.reconnect("b", seconds=1.0)
+    assert cluster.state.hosts.silent_hosts() == [3, 4]
 
 
 @pytest.mark.parametrize(("then", "phase"), [("wait", "running"), ("stop", "failed")])
-def test_what_its_host_has_fenced_starts_again(then: str, phase: str) -> None:
+def test_a_process_that_its_host_fenced_follows_its_policy(then: str, phase: str) -> None:
     """The host was cut off only briefly and never lost, so the process has no successor."""
-    cluster = on_a(process("p", host_loss=HostLossPolicy(then)), "b")
+    cluster = followed(host_loss=HostLossPolicy(then))
     machine = cluster.machines["a"]
     machine._end(machine.find("p"), InstanceState.FENCED, cluster.now, signal=9)
     cluster.settle()
     assert cluster.phase("p") == phase
 
 
-def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
+def test_a_readopted_process_has_its_restart_policy_again() -> None:
     """A move in progress at the loss had ordered the slave not to restart the process."""
     cluster = on_a(process("p", restart=RestartPolicy("on-failure"), host_loss=ELSEWHERE))
     cluster.add(Machine("b", busy={"memory": 0.9}))  # a host in contact, without room
@@ -385,21 +357,20 @@ def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
     a.tell(events.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
     lose(cluster, "a")
     assert cluster.phase("p") == "queued"
-    back(cluster, "a")
+    cluster.reconnect("a", seconds=1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert [one.restart for one in cluster.orders(SetRestartPolicy)] == [
         RestartPolicy("on-failure")
     ]
 
 
-def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:
+def test_a_process_that_was_cancelled_while_its_host_was_lost_is_not_readopted() -> None:
     """The process is queued again; the old instance is ordered to end."""
-    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
-    cluster.set_host("b", "cordon")
+    cluster = followed(full=True)
     lose(cluster, "a")
     cluster.cancel("p")
     cluster.restart("p")
-    back(cluster, "a")
+    cluster.reconnect("a", seconds=1.0)
     assert (cluster.phase("p"), cluster["p"].owner, cluster.where("p")) == ("running", 2, ["a"])
 
 
@@ -412,9 +383,7 @@ def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
     cluster.ask(happened.PruneRequested, (), ("a",))
     cluster.set_host("b", "cordon")
     assert cluster.submit(process("p")).accepted
-    cluster.machines["a"].connected = True
-    cluster.register(cluster.machines["a"])
-    cluster.wait(1.0)
+    cluster.rejoin("a")
     assert (cluster.phase("p"), cluster.queue()) == ("stopping", [])
     assert cluster["p"].reason == "waits until p#1 on a has ended"
     cluster.machines["a"].let_go("p", cluster.now)
@@ -425,27 +394,23 @@ def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
 # --- what is shown ----------------------------------------------------------------------------
 
 
-def test_of_a_silent_host_nothing_is_said_to_run_and_readings_are_old() -> None:
+def test_rows_of_a_silent_host_are_stale() -> None:
     """From the first silence on every row shows old readings; after the rejoin all is current."""
     cluster = on_a(process("p"), "b")
 
     def rows() -> Any:
         (process,) = listing.process_rows(cluster.state, cluster.now)
         host = listing.host_rows(cluster.state, cluster.now)[0]
-        return process, host, {resource.stale for resource in host.resources}
+        return process.state, process.stale, host.state, {one.stale for one in host.resources}
 
-    process_row, host_row, stale = rows()
-    assert (process_row.state, process_row.stale, stale) == ("running", False, {False})
-    assert host_row.accepting
+    assert rows() == ("running", False, "up", {False})
+    assert listing.host_rows(cluster.state, cluster.now)[0].accepting
     lose(cluster, "a", seconds=4.0)
-    process_row, host_row, stale = rows()
-    assert (host_row.state, stale, host_row.accepting) == ("suspect", {True}, False)
-    assert (process_row.state, process_row.stale) == ("unknown", True)
-    assert process_row.reason == "a has been silent for 4 s; last known: running"
+    assert rows() == ("unknown", True, "suspect", {True})
+    assert not listing.host_rows(cluster.state, cluster.now)[0].accepting
+    (row,) = listing.process_rows(cluster.state, cluster.now)
+    assert row.reason == "a has been silent for 4 s; last known: running"
     cluster.wait(10.0)
-    process_row, host_row, stale = rows()
-    assert (host_row.state, stale) == ("lost", {True})
-    assert (process_row.state, process_row.stale) == ("unreachable", True)
-    back(cluster, "a")
-    process_row, host_row, stale = rows()
-    assert (process_row.state, process_row.stale, stale) == ("running", False, {False})
+    assert rows() == ("unreachable", True, "lost", {True})
+    cluster.reconnect("a", seconds=1.0)
+    assert rows() == ("running", False, "up", {False})

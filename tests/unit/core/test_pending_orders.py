@@ -25,7 +25,7 @@ def test_optional_plugins_do_not_shift_the_numbers_of_other_orders():
     assert fewer.add(CapabilityQuery("criu", "a")) == ("capability", 1)
 
 
-def test_an_answered_order_is_pending_no_more():
+def test_an_answered_order_is_removed():
     orders = PendingOrders()
     order = orders.add(MigrationStep("p"))
     assert orders.pop(order) == MigrationStep("p")
@@ -34,7 +34,6 @@ def test_an_answered_order_is_pending_no_more():
 
 def test_an_answer_to_an_order_of_a_former_master_is_ignored():
     """The orders of a former run have no purpose here, whatever their numbers."""
-    cluster = Cluster(Machine("a"))
-    cluster.submit(job("p"))
+    cluster = Cluster(Machine("a")).with_processes(job("p"))
     for order in (1000, ("capability", 1000)):
         assert cluster.decide(happened.OrderAnswered(order, accepted=False, code="failed")) == []

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.master import events as happened
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.plugin_calls import RECORD_PERIOD, WORKS_AFTER, PluginCalls, required
-from rosrm.model.values import MigrationPolicy, Readiness
+from rosrm.model.values import EMPTY, MigrationPolicy, Readiness
 from tests.unit.core.cluster import Cluster, Eq1, StartFirstOrStopFirst, process
 
 
@@ -35,33 +34,24 @@ def submitted(cluster: Cluster, number: int) -> None:
 
 
 def test_a_failing_plugin_is_recorded_once_and_again_when_it_works() -> None:
-    """Further failures are not recorded; the plugin works again after a while without failures."""
+    """Further failures are counted; the plugin works again after a while without failures."""
     policy = Moody()
     cluster = Cluster("a", policy=policy)
     policy.fails = True
     for number in range(1, 4):
         submitted(cluster, number)
-    (failed,) = cluster.told("plugin_failed")
-    assert failed.startswith("the scoring policy 'eq1' fails: score: KeyError: 'prefix' (")
+    (message,) = cluster.recorded("plugin_failed")
+    assert message.startswith("the scoring policy 'eq1' fails: score: KeyError: 'prefix' (")
+    reason = cluster.state.plugins.failing["scoring", "eq1"].reason
+    assert reason.startswith("score: KeyError: 'prefix' (")
+    assert reason.endswith("; 3 failures so far")
     policy.fails = False
     submitted(cluster, 4)
     assert ("scoring", "eq1") in cluster.state.plugins.failing
     cluster.wait(WORKS_AFTER + 1.0)
     submitted(cluster, 5)
-    assert cluster.told("plugin_works") == ["the scoring policy 'eq1' works again"]
+    assert cluster.recorded("plugin_works") == ["the scoring policy 'eq1' works again"]
     assert cluster.state.plugins.failing == {}
-
-
-def test_a_failing_plugin_is_listed_with_its_last_error_and_how_often() -> None:
-    """The reason of its row has both."""
-    policy = Moody()
-    cluster = Cluster("a", policy=policy)
-    policy.fails = True
-    submitted(cluster, 1)
-    submitted(cluster, 2)
-    reason = cluster.state.plugins.failing["scoring", "eq1"].reason
-    assert reason.startswith("score: KeyError: 'prefix' (")
-    assert reason.endswith("; 2 failures so far")
 
 
 def test_the_place_is_the_plugin_s_own_innermost_frame() -> None:
@@ -115,8 +105,8 @@ def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
     cluster = Cluster("a")
     for failing in ({"lidar": "no such sensor"}, {"lidar": "no such sensor"}, {}):
         fails_there(cluster, failing)
-    assert cluster.told("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
-    assert cluster.told("plugin_works") == ["the probe of lidar on a works again"]
+    assert cluster.recorded("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
+    assert cluster.recorded("plugin_works") == ["the probe of lidar on a works again"]
 
 
 def test_a_strategy_whose_executors_fail_is_recorded_with_its_host() -> None:
@@ -125,19 +115,15 @@ def test_a_strategy_whose_executors_fail_is_recorded_with_its_host() -> None:
     for failing in ({"acme": "executor rest raised OSError: no arm"}, {}):
         fails_there(cluster, {}, failing)
     said = "the migration strategy 'acme' on a"
-    assert cluster.told("plugin_failed") == [f"{said} fails: executor rest raised OSError: no arm"]
-    assert cluster.told("plugin_works") == [f"{said} works again"]
+    assert cluster.recorded("plugin_failed") == [
+        f"{said} fails: executor rest raised OSError: no arm"
+    ]
+    assert cluster.recorded("plugin_works") == [f"{said} works again"]
 
 
-def fails_there(cluster: Cluster, *failing: dict[str, str]) -> None:
+def fails_there(cluster: Cluster, probes: dict[str, str], strategies: Any = EMPTY) -> None:
     """Let the slave of `a` report its failing probes and strategies."""
-    machine = cluster.machines["a"]
-    machine.batches += 1
-    cluster.tell(
-        happened.StatusesReceived(
-            machine.host_id, machine.incarnation, machine.batches, False, (), *failing
-        )
-    )
+    cluster.report("a", failing=probes, failing_strategies=strategies)
 
 
 def test_another_error_of_a_failing_plugin_is_recorded_once_a_minute() -> None:
@@ -149,7 +135,7 @@ def test_another_error_of_a_failing_plugin_is_recorded_once_a_minute() -> None:
     cluster.wait(RECORD_PERIOD + 1.0)
     fails_there(cluster, {"lidar": "too cold"})
     said = "the probe of lidar on a fails: "
-    assert cluster.told("plugin_failed") == [f"{said}unplugged", f"{said}too cold"]
+    assert cluster.recorded("plugin_failed") == [f"{said}unplugged", f"{said}too cold"]
 
 
 #: Capability of a strategy whose processes ask for periodic checkpoints.
@@ -179,4 +165,4 @@ def test_a_property_of_a_plugin_that_raises_costs_one_decision(members: str) -> 
     if "p" in cluster.state.processes:
         cluster.checkpoint("p")
         cluster.migrate("p")
-    assert "SystemExit: no driver" in cluster.told("plugin_failed")[0]
+    assert "SystemExit: no driver" in cluster.recorded("plugin_failed")[0]

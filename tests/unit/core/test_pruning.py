@@ -21,19 +21,17 @@ def seen(cluster: Cluster) -> tuple[list[str], list[str]]:
 
 def of_two_hosts() -> Cluster:
     """Return a cluster: host b has left; one process finished, one was cancelled, one runs."""
-    cluster = Cluster("a")
-    cluster.submit(job("done"), process("gone"), process("live"))
+    cluster = Cluster("a").with_processes(job("done"), process("gone"), process("live"))
     cluster.machines["a"].finish("done", cluster.now)
     cluster.add("b")
     cluster.cancel("gone")
-    cluster.leave(cluster.machines["b"])
-    cluster.machines["b"].connected = False
-    cluster.wait(1.0)
+    cluster.leave("b")
+    cluster.cut("b", seconds=1.0)
     assert seen(cluster) == (["done", "gone", "live"], ["a", "b"])
     return cluster
 
 
-def test_without_names_all_that_ended_and_all_hosts_that_left_are_removed() -> None:
+def test_without_names_all_ended_processes_and_departed_hosts_are_removed() -> None:
     """They are removed from the journal, too."""
     cluster = of_two_hosts()
     assert prune(cluster).message == "2 processes and 1 host removed"
@@ -78,12 +76,12 @@ def test_a_pruned_host_registers_as_a_new_host() -> None:
     cluster.set_host("b", "cordon")
     cluster.set_host("b", "drain")
     cluster.wait(1.0)
-    drained = cluster.told("host_drained")
+    drained = cluster.recorded("host_drained")
     host = cluster.state.hosts.by_name["b"]
     host.over_at["memory"] = host.over_since["memory"] = cluster.now
     prune(cluster, hosts=("b",))
     cluster.wait(20.0)
-    assert (cluster.told("host_drained"), cluster.told("under_limit")) == (drained, [])
+    assert (cluster.recorded("host_drained"), cluster.recorded("under_limit")) == (drained, [])
     machine = cluster.machines["b"]
     machine.connected = True
     cluster.register(machine)
@@ -102,22 +100,21 @@ def test_no_reason_names_a_pruned_host() -> None:
     cluster.submit(process("p"))
     assert cluster["p"].reason == "every host is away: a: it is cordoned"
     cluster.cancel("p", "live")
-    cluster.leave(cluster.machines["a"])
-    cluster.machines["a"].connected = False
-    cluster.wait(1.0)
+    cluster.leave("a")
+    cluster.cut("a", seconds=1.0)
     prune(cluster)
     cluster.submit(process("q"))
     cluster.wait(1.0)
     assert cluster["q"].reason == "no host has registered yet"
 
 
-def test_a_pruned_host_is_not_among_the_hosts_of_a_decision_about_many() -> None:
+def test_an_explanation_does_not_count_a_pruned_host() -> None:
     """The host is neither named nor counted among the hosts left out."""
     cluster = Cluster(*(f"h{number}" for number in range(20)))
     for number in range(18):
         cluster.set_host(f"h{number}", "cordon")
     for name in ("h0", "h18", "h19"):
-        cluster.leave(cluster.machines[name])
+        cluster.leave(name)
         cluster.machines[name].connected = False
     prune(cluster)
     cluster.submit(process("p"))
@@ -126,7 +123,7 @@ def test_a_pruned_host_is_not_among_the_hosts_of_a_decision_about_many() -> None
     assert sum(decision["omitted"].values()) + len(decision["hosts"]) == 17
 
 
-def test_what_has_not_ended_or_left_is_refused_and_nothing_is_removed() -> None:
+def test_a_running_process_or_host_refuses_the_prune() -> None:
     """The refusal names such processes and hosts."""
     cluster = of_two_hosts()
     refused = prune(cluster, "done", "live")
@@ -140,8 +137,7 @@ def test_what_has_not_ended_or_left_is_refused_and_nothing_is_removed() -> None:
 def test_a_suspect_host_is_refused_as_suspect() -> None:
     """The refusal names its silence and the time of its loss; after the loss it is pruned."""
     cluster = Cluster("a")
-    cluster.machines["a"].connected = False
-    cluster.wait(3.0)
+    cluster.cut("a", seconds=3.0)
     assert prune(cluster, hosts=("a",)).message == (
         "a is suspect: it has not reported for 3.0 s and may report again. Stop its slave if it "
         "runs; a host can be pruned once it has left or is lost, which is after 10 s of silence. "
@@ -151,10 +147,9 @@ def test_a_suspect_host_is_refused_as_suspect() -> None:
     assert prune(cluster, hosts=("a",)).accepted
 
 
-def test_a_host_that_leaves_is_pruned_once_its_processes_have_ended() -> None:
+def test_a_leaving_host_is_not_pruned_before_its_processes_have_ended() -> None:
     """Its slave still stops the processes; the user has to wait, and need not cancel."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
+    cluster = Cluster("a").with_processes(process("p"))
     machine = cluster.machines["a"]
     cluster.tell(happened.HostLeft(99, machine.host_id, machine.incarnation))
     assert prune(cluster, hosts=("a",)).message == (
@@ -162,12 +157,10 @@ def test_a_host_that_leaves_is_pruned_once_its_processes_have_ended() -> None:
     )
 
 
-def test_a_lost_host_is_pruned_once_all_that_it_may_run_was_cancelled() -> None:
+def test_a_lost_host_is_pruned_once_its_processes_are_cancelled() -> None:
     """The processes are then cancelled; if the host returns, they are stopped there."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
-    cluster.machines["a"].connected = False
-    cluster.wait(12.0)
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.cut("a", seconds=12.0)
     refused = prune(cluster, hosts=("a",))
     assert refused.message == "a may still run p; cancel it first. Nothing was removed"
     cluster.cancel("p")
@@ -176,20 +169,18 @@ def test_a_lost_host_is_pruned_once_all_that_it_may_run_was_cancelled() -> None:
     )
     assert (cluster.phase("p"), seen(cluster)[1]) == ("cancelled", [])
     assert cluster["p"].reason == "it may still run on a, which was removed"
-    assert cluster.told("host_pruned") == ["a was removed (by anna@desk)"]
-    cluster.machines["a"].connected = True
-    cluster.wait(1.0)
+    assert cluster.recorded("host_pruned") == ["a was removed (by anna@desk)"]
+    cluster.reconnect("a", seconds=1.0)
     assert seen(cluster)[1] == []
     cluster.register(cluster.machines["a"])
     cluster.wait(1.0)
     assert (cluster.where("p"), seen(cluster)[1], cluster["p"].reason) == ([], ["a"], "")
 
 
-def test_every_process_that_a_host_may_still_run_is_named() -> None:
+def test_the_prune_names_each_process_that_the_host_may_still_run() -> None:
     """Refusal and reply name each process, because a detached host keeps running cancelled ones."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"), process("q"))
-    cluster.detach(cluster.machines["a"])
+    cluster = Cluster("a").with_processes(process("p"), process("q"))
+    cluster.detach("a")
     refused = prune(cluster, hosts=("a",))
     assert refused.message == "a may still run p and q; cancel them first. Nothing was removed"
     cluster.cancel("p", "q")

@@ -50,6 +50,10 @@ ways = st.sampled_from(
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
+HOST_CHANGES = [
+    "cut", "mended", "killed", "killed", "leaves", "leaves unheard", "is detached", "loses power",
+    "loses a poll", "full", "over", "empty", "another supervisor",
+]  # fmt: skip
 #: Index of one of the present things; `Play.pick` takes it modulo their number.
 which_one = st.integers(0, 11)
 #: Seconds of contact with a host after which no fenced instance runs there any more.
@@ -512,26 +516,7 @@ class Play(RuleBasedStateMachine):
             if stopping and instance.process in names:
                 machine._stop(instance, self.cluster.now)
 
-    @rule(
-        host=hosts,
-        what=st.sampled_from(
-            [
-                "cut",
-                "mended",
-                "killed",
-                "killed",
-                "leaves",
-                "leaves unheard",
-                "is detached",
-                "loses power",
-                "loses a poll",
-                "full",
-                "over",
-                "empty",
-                "another supervisor",
-            ]
-        ),
-    )
+    @rule(host=hosts, what=st.sampled_from(HOST_CHANGES))
     def host_changes(self, host: str, what: str) -> None:
         """Change a host: its wire, its slave, or its load by others."""
         machine = self.machine(host)
@@ -702,8 +687,6 @@ class Play(RuleBasedStateMachine):
     @invariant()
     def no_process_is_lost(self) -> None:
         """Check that each process is in exactly one place that matches its phase."""
-        if not hasattr(self, "cluster"):
-            return
         state = self.cluster.state
         queued = set(state.queue)
         for process in state.processes.values():
@@ -724,8 +707,6 @@ class Play(RuleBasedStateMachine):
     @invariant()
     def the_books_balance(self) -> None:
         """Check that the load of each host is the sum over its instances and not negative."""
-        if not hasattr(self, "cluster"):
-            return
         state = self.cluster.state
         of_process = defaultdict(set)
         for number, instance in state.instances.items():
@@ -779,8 +760,6 @@ class Play(RuleBasedStateMachine):
     @invariant()
     def never_two_active(self) -> None:
         """Check that one instance of a process really runs; two only with a declared overlap."""
-        if not hasattr(self, "cluster"):
-            return
         left = self.given_up()
         for name in (*NAMES, *TWINS):
             running = [
@@ -808,8 +787,6 @@ class Play(RuleBasedStateMachine):
     @invariant()
     def what_was_cancelled_runs_nowhere(self) -> None:
         """Check that a `cancelled` process has really ended, or that a fence will end it."""
-        if not hasattr(self, "cluster"):
-            return
         left = self.given_up()
         for process in self.cluster.state.processes.values():
             if process.phase is not ProcessPhase.CANCELLED or process.spec.host_loss.then != "wait":
@@ -825,8 +802,6 @@ class Play(RuleBasedStateMachine):
     @invariant()
     def the_newest_state_of_a_life_is_not_dropped(self) -> None:
         """Check that the newest snapshot of a process exists until it finished or was cancelled."""
-        if not hasattr(self, "cluster"):
-            return
         for process in self.cluster.state.processes.values():
             name, born = process.name, process.born
             before = self.newest.pop(name, (born, (0, 0)))
@@ -845,8 +820,6 @@ class Play(RuleBasedStateMachine):
     @invariant()
     def an_end_is_told_as_it_was(self) -> None:
         """Check that each finished or failed process really ended so."""
-        if not hasattr(self, "cluster"):
-            return
         for process in self.cluster.state.processes.values():
             if process.phase is ProcessPhase.FINISHED:
                 assert process.name in self.completed

@@ -19,8 +19,8 @@ from rosrm.model.values import (
 )
 from tests.unit.core.cluster import Cluster, HandOver, process
 from tests.unit.core.machine import Machine
-from tests.unit.core.test_keeping import Asked, assigned, keep, others, where
 from tests.unit.core.test_periodic import Pacing
+from tests.unit.core.test_replication import Asked, assigned, keep, others, where
 
 TELEPORT = MigrationPolicy("teleport")
 
@@ -50,7 +50,7 @@ def cluster_with(capabilities: Capabilities, *machines: str | Machine) -> Cluste
     return Cluster(*machines, strategies={"teleport": Teleport()}, declared=declared)
 
 
-def test_snapshots_are_kept_of_a_state_on_topics():
+def test_a_state_on_topics_has_snapshots():
     """The slave keeps them, the master orders replicas, and the next start gets the newest."""
     policy = Asked()
     cluster = cluster_with(Capabilities(state="topics"), "a", "b", "c")
@@ -69,7 +69,7 @@ def test_snapshots_are_kept_of_a_state_on_topics():
     assert assigned(cluster).kept_on == (other,)
 
 
-def test_a_standby_is_kept_where_it_can_shadow():
+def test_a_strategy_that_can_shadow_has_standbys():
     """As of any strategy that declares it; otherwise the submission is refused."""
     spec = teleported(standby=StandbyPolicy(wanted=True))
     cluster = cluster_with(Capabilities(state="topics", shadow=True), "a", "b")
@@ -81,7 +81,7 @@ def test_a_standby_is_kept_where_it_can_shadow():
     assert "teleport cannot do that: install a strategy that can" in refusal.message
 
 
-def test_a_process_is_dumped_that_its_launcher_can_restart_from_the_image():
+def test_a_strategy_that_restarts_from_images_has_periodic_checkpoints():
     """At the pace that the strategy names; without the capability it is not asked for one."""
     for able in (True, False):
         dumps = []
@@ -95,7 +95,7 @@ def test_a_process_is_dumped_that_its_launcher_can_restart_from_the_image():
         assert len(dumps) == 2 * able
 
 
-def test_a_strategy_that_makes_images_is_named_where_none_is_selected():
+def test_a_refused_checkpoint_names_a_strategy_that_makes_images():
     """By the word for the cluster's file."""
     cluster = cluster_with(Capabilities(state="memory"), "a")
     cluster.submit(process("p"))

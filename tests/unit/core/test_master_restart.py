@@ -26,33 +26,30 @@ def test_the_queue_keeps_its_order() -> None:
     assert cluster.where("aside") == ["b"]
 
 
-def test_what_is_set_aside_stays_so_while_the_hosts_come_back() -> None:
+def test_a_process_stays_set_aside_while_the_hosts_register() -> None:
     """Reason and age are kept, because no host with known limits may take it."""
-    cluster = Cluster(Machine("a", memory=1000 * MIB))
-    cluster.submit(process("p", memory=900))
+    cluster = Cluster(Machine("a", memory=1000 * MIB)).with_processes(process("p", memory=900))
     reason, since = cluster["p"].reason, cluster["p"].since
     cluster.wait(5.0)
     cluster.restart_master()
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster["p"].reason) == ("set_aside", reason)
     assert cluster["p"].since == pytest.approx(since, abs=0.01)
-    assert len(cluster.told("set_aside")) == 1
+    assert len(cluster.recorded("set_aside")) == 1
 
 
-def test_the_reason_of_what_is_set_aside_follows_the_hosts() -> None:
+def test_the_reason_of_a_process_that_is_set_aside_follows_the_hosts() -> None:
     """The reason includes hosts that register later."""
-    cluster = Cluster("a")
-    cluster.submit(process("p", required_labels={"x": "y"}))
+    cluster = Cluster("a").with_processes(process("p", required_labels={"x": "y"}))
     cluster.add("b")
     cluster.wait(0.2)
     assert cluster["p"].reason == "no host may take it: a and b: it lacks the label x=y"
     assert cluster.intents["process"]["p"]["reason"] == cluster["p"].reason
 
 
-def test_what_runs_runs_on_and_is_not_started_twice() -> None:
+def test_running_processes_keep_running_and_are_not_started_twice() -> None:
     """The process is expected on its host, and its slave reports it."""
-    cluster = Cluster("a", "b")
-    cluster.submit(process("p"), process("q"))
+    cluster = Cluster("a", "b").with_processes(process("p"), process("q"))
     pids = {n: m.programs[next(iter(m.programs))].pid for n, m in cluster.machines.items()}
     cluster.kill_master()
     assert cluster.phase("p") == "unreachable"
@@ -63,10 +60,9 @@ def test_what_runs_runs_on_and_is_not_started_twice() -> None:
     assert len(cluster.assigned()) == 2
 
 
-def test_what_ended_meanwhile_is_heard_of() -> None:
+def test_ends_during_the_absence_of_the_master_are_known() -> None:
     """The slave reports ended instances when it registers."""
-    cluster = Cluster("a")
-    cluster.submit(job("good"), job("bad"))
+    cluster = Cluster("a").with_processes(job("good"), job("bad"))
     cluster.kill_master()
     cluster.machines["a"].finish("good", cluster.now)
     cluster.machines["a"].finish("bad", cluster.now, code=4)
@@ -75,10 +71,9 @@ def test_what_ended_meanwhile_is_heard_of() -> None:
 
 
 @pytest.mark.parametrize("spec", [process("p"), job("p"), movable("p")], ids=lambda one: one.kind)
-def test_what_a_slave_ended_while_the_master_was_away_is_queued_again(spec) -> None:
+def test_a_process_that_its_slave_ended_without_a_master_is_queued_again(spec) -> None:
     """Ctrl-C on the slave ended the processes without a failure, so they are queued again."""
-    cluster = Cluster("a")
-    cluster.submit(spec)
+    cluster = Cluster("a").with_processes(spec)
     machine = cluster.machines["a"]
     cluster.kill_master()
     machine.stop_unheard(cluster.now)
@@ -86,13 +81,12 @@ def test_what_a_slave_ended_while_the_master_was_away_is_queued_again(spec) -> N
     cluster.register(machine)
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
-    assert cluster.told("queued") == ["p returns to the queue: its instance on a was stopped"]
+    assert cluster.recorded("queued") == ["p returns to the queue: its instance on a was stopped"]
 
 
 def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled() -> None:
     """The cancel is in the journal, though it had not reached the slave."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
+    cluster = Cluster("a").with_processes(process("p"))
     cluster.journal(cluster.decide(happened.CancelRequested(9, ("p",))))
     cluster.kill_master()
     machine = cluster.machines["a"]
@@ -102,7 +96,7 @@ def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled(
     assert cluster.phase("p") == "cancelled"
 
 
-def test_since_when_and_where_outlive_the_master() -> None:
+def test_the_next_master_knows_hosts_and_starts_of_phases() -> None:
     """Start of the phase and host are kept, for running, waiting and ended processes."""
     cluster = Cluster("a")
     cluster.submit(process("runs"), process("waits", memory=1e6), job("ends"))
@@ -122,10 +116,9 @@ def test_since_when_and_where_outlive_the_master() -> None:
         assert row.since == pytest.approx(before[name].since) == pytest.approx(60.0, abs=1.0)
 
 
-def test_one_that_was_started_again_out_of_sight_runs_since_then() -> None:
+def test_a_restart_without_a_master_begins_the_run_time_again() -> None:
     """Its slave restarted it while the master was away."""
-    cluster = Cluster("a")
-    cluster.submit(process("p", restart=RestartPolicy("always")))
+    cluster = Cluster("a").with_processes(process("p", restart=RestartPolicy("always")))
     cluster.wait(60.0, tick=1.0)
     cluster.kill_master()
     cluster.machines["a"].finish("p", cluster.now)
@@ -134,7 +127,7 @@ def test_one_that_was_started_again_out_of_sight_runs_since_then() -> None:
     assert listing.process_row(cluster.state, cluster["p"], cluster.now).since < 1.0
 
 
-def test_an_assignment_that_was_not_delivered_is_given_again() -> None:
+def test_an_undelivered_assignment_is_repeated() -> None:
     """The assignment was durable but never sent, so its host does not report it."""
     cluster = Cluster("a")
     commands = cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
@@ -145,7 +138,7 @@ def test_an_assignment_that_was_not_delivered_is_given_again() -> None:
     assert cluster["p"].owner == 1001
 
 
-def test_an_outcome_that_was_not_made_durable_never_was() -> None:
+def test_an_outcome_that_was_not_journalled_has_no_effect() -> None:
     """The master was killed before the write and had not replied to the request."""
     cluster = Cluster("a")
     cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
@@ -154,7 +147,7 @@ def test_an_outcome_that_was_not_made_durable_never_was() -> None:
     assert cluster.submit(process("p")).accepted
 
 
-def test_hosts_keep_their_number_and_what_people_decided_about_them() -> None:
+def test_hosts_keep_their_numbers_and_are_still_cordoned_or_draining() -> None:
     """Cordoned and drained hosts stay so."""
     cluster = Cluster("a", "b", "c")
     cluster.set_host("b", "cordon")
@@ -168,22 +161,20 @@ def test_hosts_keep_their_number_and_what_people_decided_about_them() -> None:
     ]  # fmt: skip
 
 
-def test_what_was_learned_is_known() -> None:
+def test_learned_needs_survive_the_master() -> None:
     """Learned needs of earlier runs outlive the master."""
     cluster = Cluster("a")
     cluster.machines["a"].shown["first"] = {"memory": 160 * MIB}
     cluster.submit(job("first"))
-    cluster.machines["a"].finish("first", cluster.now)
-    cluster.settle()
+    cluster.finish("first")
     cluster.restart_master()
     cluster.submit(process("second"))
     assert cluster.explain("second")["decision"]["need"]["memory"] == 160 * MIB
 
 
-def test_a_cancel_that_was_answered_is_carried_out() -> None:
+def test_a_journalled_cancel_is_carried_out() -> None:
     """A running process and a queued one end as cancelled."""
-    cluster = Cluster("a")
-    cluster.submit(process("runs"), process("waits", memory=1e6))
+    cluster = Cluster("a").with_processes(process("runs"), process("waits", memory=1e6))
     commands = cluster.decide(happened.CancelRequested(9, ("runs", "waits")))
     cluster.journal(commands)
     cluster.restart_master()
@@ -192,7 +183,7 @@ def test_a_cancel_that_was_answered_is_carried_out() -> None:
     assert cluster.where("runs") == []
 
 
-def test_a_host_that_never_comes_back_is_lost_after_its_lease() -> None:
+def test_a_host_that_does_not_register_is_lost_after_its_lease() -> None:
     """Processes that fit only there do not block the queue forever."""
     cluster = Cluster("a", Machine("b", labels={"x": "y"}))
     cluster.submit(process("p", required_labels={"x": "y"}))
@@ -201,7 +192,7 @@ def test_a_host_that_never_comes_back_is_lost_after_its_lease() -> None:
     cluster.submit(process("special", required_labels={"x": "y"}), process("plain"))
     assert cluster.queue() == ["special", "plain"]
     cluster.wait(11.0)
-    assert len(cluster.told("host_lost")) == 1
+    assert len(cluster.recorded("host_lost")) == 1
     assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "b is lost")
     assert (cluster.phase("special"), cluster.where("plain")) == ("set_aside", ["a"])
 
@@ -209,20 +200,17 @@ def test_a_host_that_never_comes_back_is_lost_after_its_lease() -> None:
 @pytest.mark.parametrize("overlap", [True, False])
 @pytest.mark.parametrize("first", ["a", "b"])
 @pytest.mark.parametrize("ready", [True, False])
-def test_a_move_that_was_under_way_goes_on(overlap: bool, first: str, ready: bool) -> None:
+def test_a_move_in_progress_continues(overlap: bool, first: str, ready: bool) -> None:
     """Whichever slave registers first, before or after the commit, one owner runs in the end."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", overlap=overlap, ros=True))
-    cluster.machines["a"].seen_in_graph("p", cluster.now)
-    cluster.settle()
+    cluster.discover("p")
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")
     if not overlap:
-        cluster.machines["a"].let_go("p", cluster.now)
-        cluster.settle()
+        cluster.let_go("p")
     if ready:
-        cluster.machines["b"].seen_in_graph("p", cluster.now)
-        cluster.settle()
+        cluster.discover("p", "b")
     cluster.machines["a"].stubborn.clear()
     cluster.kill_master()
     second = "b" if first == "a" else "a"
@@ -240,12 +228,11 @@ def test_a_move_that_was_under_way_goes_on(overlap: bool, first: str, ready: boo
     assert not cluster.intents["migration"]
 
 
-def test_how_long_a_move_took_counts_from_its_beginning() -> None:
+def test_the_duration_of_a_move_counts_from_its_start() -> None:
     """The duration includes the time in which the master was away."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", ros=True))
-    cluster.machines["a"].seen_in_graph("p", cluster.now)
-    cluster.settle()
+    cluster.discover("p")
     cluster.migrate("p")
     cluster.wait(2.0)
     cluster.now += 3.0
@@ -256,7 +243,7 @@ def test_how_long_a_move_took_counts_from_its_beginning() -> None:
     assert moved.facts["seconds"] == pytest.approx(5.0, abs=0.3)
 
 
-def test_a_source_that_was_told_to_stop_has_not_finished() -> None:
+def test_a_source_that_was_ordered_to_stop_has_not_finished() -> None:
     """The master died after the stop order, so the source's exit code 0 is not its own end."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.submit(movable("p", overlap=False))
@@ -270,10 +257,9 @@ def test_a_source_that_was_told_to_stop_has_not_finished() -> None:
     assert len(cluster.where("p")) == 1
 
 
-def test_a_number_that_is_held_somewhere_is_not_given_again_by_a_lost_journal() -> None:
+def test_a_number_that_a_host_holds_is_not_used_again_after_a_lost_journal() -> None:
     """Otherwise statuses of the old instance would apply to the new one."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"), process("q"))
+    cluster = Cluster("a").with_processes(process("p"), process("q"))
     held = max(instance.number for instance in cluster.machines["a"].programs)
     cluster.intents.clear()
     cluster.restart_master()
@@ -282,18 +268,10 @@ def test_a_number_that_is_held_somewhere_is_not_given_again_by_a_lost_journal() 
     assert (cluster.where("p"), cluster.where("new")) == ([], ["a"])
 
 
-def test_what_is_said_of_a_namesake_in_number_is_not_taken_for_an_instance() -> None:
+def test_the_status_of_another_process_with_the_same_number_changes_nothing() -> None:
     """An instance of another process with the same number is stopped, without effect on p."""
-    cluster = Cluster("a")
-    cluster.submit(process("p"))
-    machine, number = cluster.machines["a"], cluster["p"].owner
+    cluster = Cluster("a").with_processes(process("p"))
     for state in (InstanceState.STOPPING, InstanceState.FAILED):
-        machine.batches += 1
-        cluster.tell(
-            happened.StatusesReceived(
-                machine.host_id, machine.incarnation, machine.batches, False,
-                (InstanceStatus(InstanceId("former", number), state),),
-            )
-        )  # fmt: skip
+        cluster.report("a", InstanceStatus(InstanceId("former", cluster["p"].owner), state))
     cluster.settle()
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])

@@ -41,19 +41,34 @@ def stateful(name: str = "p", **fields: Any) -> ProcessSpec:
     return process(name, ros=True, migration=MigrationPolicy("handoff"), **fields)
 
 
+def reported(*states: tuple[str, int, int]) -> tuple[SnapshotReport, ...]:
+    """Return reports of snapshots: process, instance, sequence."""
+    return tuple(
+        SnapshotReport(InstanceId(name, number), sequence, 100) for name, number, sequence in states
+    )
+
+
 def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
     """Report all snapshots of a host: process, instance, sequence."""
     machine = cluster.machines[host]
-    kept = tuple(
-        SnapshotReport(InstanceId(name, number), sequence, 100) for name, number, sequence in states
-    )
+    kept = reported(*states)
     cluster.tell(happened.KeptStatesReceived(machine.host_id, machine.incarnation, kept))
+
+
+def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
+    """Register a slave, which reports its snapshots at once."""
+    cluster.register(cluster.machines[host], reported(*states))
+
+
+def use(cluster: Cluster, policy: Any) -> None:
+    """Select a checkpoint policy."""
+    cluster.state.replication.policy, cluster.state.replication.policy_name = policy, "asked"
 
 
 def running(policy: Asked | None, *hosts: str, spec: ProcessSpec | None = None) -> Cluster:
     """Return a cluster with a running stateful process whose snapshot is on its own host."""
     cluster = Cluster(*(hosts or ("a", "b", "c")), lease=3.0)
-    cluster.state.replication.policy, cluster.state.replication.policy_name = policy, "asked"
+    use(cluster, policy)
     cluster.submit(spec or stateful())
     cluster.wait(1.0)
     assert cluster.phase("p") == "running"
@@ -66,8 +81,9 @@ def where(cluster: Cluster, name: str = "p") -> str:
     return host
 
 
-def others(cluster: Cluster) -> list[str]:
-    return [name for name in cluster.machines if name != where(cluster)]
+def others(cluster: Cluster, than: str = "") -> list[str]:
+    """Return the hosts without the process, or all but one."""
+    return [name for name in cluster.machines if name != (than or where(cluster))]
 
 
 def assigned(cluster: Cluster) -> Any:
@@ -75,7 +91,7 @@ def assigned(cluster: Cluster) -> Any:
     return [one for one in cluster.carried if isinstance(one, Assign)][-1].assignment
 
 
-def test_the_policys_choice_is_told_once():
+def test_the_slave_gets_the_choice_of_the_policy_once():
     """The slave receives the hosts of the replicas once, and again after a change."""
     policy = Asked("b")
     cluster = running(policy, "a", "b")
@@ -94,20 +110,20 @@ def test_the_policys_choice_is_told_once():
     assert len(cluster.orders(ReplicateSnapshot)) == told
 
 
-def test_the_order_of_the_hosts_that_are_chosen_makes_no_difference():
+def test_the_order_of_the_chosen_hosts_makes_no_difference():
     """A policy that lists the hosts as `kept_on` does causes no order and no event."""
     policy = Asked()
     cluster = running(policy)
     one, two = others(cluster)
     policy.answer = CheckpointChoice((one, two))
     cluster.wait(3.0)
-    told, recorded = len(cluster.orders(ReplicateSnapshot)), cluster.told("kept_on")
+    told, recorded = len(cluster.orders(ReplicateSnapshot)), cluster.recorded("kept_on")
     policy.answer = CheckpointChoice((two, one))
     cluster.wait(10.0)
-    assert (len(cluster.orders(ReplicateSnapshot)), cluster.told("kept_on")) == (told, recorded)
+    assert (len(cluster.orders(ReplicateSnapshot)), cluster.recorded("kept_on")) == (told, recorded)
 
 
-def test_what_the_policy_sees():
+def test_the_policy_gets_hosts_replicas_and_age():
     """The view has the hosts that are up, their labels, the replicas and the age of the newest."""
     policy = Asked()
     cluster = running(policy)
@@ -124,7 +140,7 @@ def test_what_the_policy_sees():
     assert view.size == 100
 
 
-def test_it_is_asked_about_once_a_second_for_each_process():
+def test_the_policy_is_called_once_a_second_for_each_process():
     """The rate does not depend on the number of processes or of ticks."""
     policy = Asked()
     cluster = Cluster("a", "b")
@@ -144,32 +160,29 @@ def test_it_is_asked_about_once_a_second_for_each_process():
 @pytest.mark.parametrize(
     "answer",
     [
-        ValueError("no idea"),
-        CheckpointChoice(("nowhere",)),
-        CheckpointChoice(("b", "b")),
-        CheckpointChoice(("b",), every=0.0),
-        "b",
+        lambda own, other: CheckpointChoice(("nowhere",)),
+        lambda own, other: CheckpointChoice((other, other)),
+        lambda own, other: CheckpointChoice((own,)),
+        lambda own, other: CheckpointChoice((other,), every=0.0),
+        lambda own, other: ValueError("no idea"),
+        lambda own, other: other,
     ],
+    ids=["unknown host", "one host twice", "own host", "period", "exception", "type"],
 )
-def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
+def test_a_policy_that_raises_or_gives_an_invalid_choice_is_named(answer):
     """The replication that was ordered before stays in place."""
     policy = Asked()
     cluster = running(policy, "a", "b")
-    policy.answer = answer
-    if isinstance(answer, CheckpointChoice) and where(cluster) == "b":
-        cluster.migrate("p", "a")
-        cluster.wait(10.0)
-        keep(cluster, where(cluster), ("p", cluster["p"].owner, 5))
-    told = len(cluster.orders(ReplicateSnapshot))
+    policy.answer = answer(where(cluster), others(cluster)[0])
+    ordered = len(cluster.orders(ReplicateSnapshot))
     cluster.wait(25.0)
-    (first, *_) = cluster.told("plugin_failed")
-    assert first.startswith("the checkpoint policy 'asked' fails: choose: ")
-    assert len(cluster.told("plugin_failed")) == 1
-    assert all(order.hosts == () for order in cluster.orders(ReplicateSnapshot)[told:])
+    (message,) = cluster.recorded("plugin_failed")
+    assert message.startswith("the checkpoint policy 'asked' fails: choose: ")
+    assert all(order.hosts == () for order in cluster.orders(ReplicateSnapshot)[ordered:])
 
 
 @pytest.mark.parametrize("answer", [None, ValueError("no idea"), TimeoutError("late")])
-def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer):
+def test_replicas_stay_after_a_start_of_the_master_until_the_policy_answers(answer):
     """The snapshot is sent to the hosts that report a replica, and no replica is deleted."""
     policy = Asked("b", "c")
     cluster = running(policy, "a", "b", "c")
@@ -177,7 +190,7 @@ def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer
     one, two = others(cluster)
     policy.answer = answer
     cluster.kill_master()
-    cluster.state.replication.policy, cluster.state.replication.policy_name = policy, "asked"
+    use(cluster, policy)
     register(cluster, host, ("p", number, 9))
     register(cluster, one, ("p", number, 8))
     cluster.wait(3.0)
@@ -191,32 +204,22 @@ def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer
     assert dropped.host_id == cluster.machines[two].host_id
 
 
-def test_a_choice_of_the_processs_own_host_is_refused():
-    policy = Asked()
-    cluster = running(policy, "a", "b")
-    policy.answer = CheckpointChoice((where(cluster),))
-    cluster.wait(2.0)
-    assert cluster.told("plugin_failed")
-
-
-def test_a_slave_that_was_started_anew_is_told_again():
+def test_the_next_run_of_a_slave_gets_the_order_again():
     """A new run of a slave does not know the orders of the former run."""
     policy = Asked()
     cluster = running(policy, "a", "b")
     policy.answer = CheckpointChoice((others(cluster)[0],))
     cluster.wait(2.0)
-    told, machine = len(cluster.orders(ReplicateSnapshot)), cluster.machines[where(cluster)]
-    machine.incarnation += 100
-    machine.connected = False
-    cluster.wait(1.5)
-    machine.connected = True
-    cluster.register(machine)
-    keep(cluster, machine.name, ("p", cluster["p"].owner, 6))
+    orders, host = len(cluster.orders(ReplicateSnapshot)), where(cluster)
+    cluster.machines[host].incarnation += 100
+    cluster.cut(host, seconds=1.5)
+    cluster.rejoin(host, 0.0)
+    keep(cluster, host, ("p", cluster["p"].owner, 6))
     cluster.wait(2.0)
-    assert len(cluster.orders(ReplicateSnapshot)) == told + 1
+    assert len(cluster.orders(ReplicateSnapshot)) == orders + 1
 
 
-def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
+def test_a_start_after_a_loss_names_the_hosts_of_the_snapshot():
     """The hosts are listed newest first, without lost ones; a host with a snapshot is preferred."""
     cluster = running(Asked())
     host, (one, two) = where(cluster), others(cluster)
@@ -224,8 +227,7 @@ def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
     # Without the snapshot the host with less load would be chosen.
     cluster.machines[two].busy = {"memory": 0.3, "cpu": 0.3}
     keep(cluster, two, ("p", number, 4))
-    cluster.machines[host].connected = False
-    cluster.wait(6.0)
+    cluster.cut(host, seconds=6.0)
     assert cluster.where("p")[-1:] == [two] or two in cluster.where("p")
     assignment = assigned(cluster)
     assert assignment.kept_on == (two,)
@@ -233,14 +235,13 @@ def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
     assert one not in assignment.kept_on
 
 
-def test_a_restarted_one_is_kept_elsewhere_from_its_first_state_on():
+def test_a_restarted_process_is_replicated_from_its_first_snapshot_on():
     """The slave receives the order before its first report, because a second loss may come soon."""
     policy = Asked()
     cluster = running(policy)
     lost, (keeper, _) = where(cluster), others(cluster)
     keep(cluster, keeper, ("p", cluster["p"].owner, 4))
-    cluster.machines[lost].connected = False
-    cluster.wait(6.0)
+    cluster.cut(lost, seconds=6.0)
     now_on = next(host for host in cluster.where("p") if host != lost)
     policy.answer = CheckpointChoice(
         tuple(name for name in cluster.machines if name not in (lost, now_on))
@@ -251,7 +252,7 @@ def test_a_restarted_one_is_kept_elsewhere_from_its_first_state_on():
     assert newest.host_id == cluster.machines[now_on].host_id
 
 
-def test_a_failed_process_that_is_restarted_goes_on_from_its_state():
+def test_a_failed_process_that_is_restarted_continues_from_its_snapshot():
     """The restart does not ask for a start from nothing, so the snapshot is used."""
     cluster = running(Asked())
     host, number = where(cluster), cluster["p"].owner
@@ -267,7 +268,7 @@ def test_a_failed_process_that_is_restarted_goes_on_from_its_state():
     assert cluster.where("p") == [host]
 
 
-def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
+def test_the_replicas_of_a_cancelled_process_are_dropped_everywhere():
     """The drop includes hosts that were away at the cancel."""
     policy = Asked()
     cluster = running(policy)
@@ -276,8 +277,7 @@ def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
     policy.answer = CheckpointChoice((other,))
     cluster.wait(2.0)
     keep(cluster, other, ("p", number, 4))
-    cluster.machines[other].connected = False
-    cluster.wait(2.0)
+    cluster.cut(other, seconds=2.0)
     cluster.cancel("p")
     cluster.wait(3.0)
     dropped = {sent.host_id for sent in cluster.sent(DropReplica)}
@@ -286,8 +286,7 @@ def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
     cluster.submit(stateful())
     assert assigned(cluster).kept_on == ()
     assert assigned(cluster).kept_from > number
-    cluster.machines[other].connected = True
-    cluster.wait(3.0)
+    cluster.reconnect(other, seconds=3.0)
     assert cluster.sent(DropReplica)[-1].host_id == cluster.machines[other].host_id
     assert cluster.orders(DropReplica)[-1].instance == InstanceId("p", number)
 
@@ -308,8 +307,7 @@ def test_the_replicas_of_a_pruned_process_are_dropped():
     cluster.wait(2.0)
     assert {sent.host_id for sent in cluster.sent(DropReplica)} == {cluster.machines[host].host_id}
     keep(cluster, host)
-    cluster.machines[other].connected = True
-    cluster.wait(3.0)
+    cluster.reconnect(other, seconds=3.0)
     last = cluster.sent(DropReplica)[-1]
     assert (last.host_id, last.order) == (
         cluster.machines[other].host_id, DropReplica(InstanceId("p", number))
@@ -318,7 +316,7 @@ def test_the_replicas_of_a_pruned_process_are_dropped():
     assert cluster.machines[third].host_id not in dropped_on
 
 
-def test_what_was_pruned_is_not_forgotten_with_the_master():
+def test_the_next_master_drops_the_replicas_of_a_pruned_process():
     """A host that returns after a restart of the master is ordered to drop it, and nothing else."""
     cluster = running(Asked())
     number, (other, *_) = cluster["p"].owner, others(cluster)
@@ -334,7 +332,7 @@ def test_what_was_pruned_is_not_forgotten_with_the_master():
     }
 
 
-def test_where_it_was_submitted_is_not_forgotten_with_the_master():
+def test_the_next_master_uses_no_snapshot_from_before_the_submission():
     """A snapshot from before the submission stays unused after a restart of the master too."""
     cluster = running(Asked())
     other, number = others(cluster)[0], cluster["p"].owner
@@ -345,7 +343,7 @@ def test_where_it_was_submitted_is_not_forgotten_with_the_master():
     assert cluster["p"].born > number
 
 
-def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer_one():
+def test_after_a_move_the_replicas_of_the_source_are_dropped_with_a_newer_one():
     """The old replicas are the only ones if the new host is lost before its first snapshot."""
     cluster = running(Asked(), "a", "b")
     source = where(cluster)
@@ -362,7 +360,7 @@ def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer
     assert sent.order == DropReplica(InstanceId("p", number))
 
 
-def test_an_explanation_says_where_the_state_is_kept():
+def test_an_explanation_lists_the_replicas():
     """Replicas are listed newest first, with the sequence number and the age."""
     cluster = running(Asked("b", "c"))
     number = cluster["p"].owner
@@ -376,7 +374,7 @@ def test_an_explanation_says_where_the_state_is_kept():
     assert kept[1]["elapsed"] == pytest.approx(0.5)
 
 
-def test_without_a_policy_it_is_kept_on_its_own_host_alone():
+def test_without_a_policy_a_snapshot_is_on_its_own_host_alone():
     """An assignment to another host still lists where the snapshot is."""
     cluster = running(None)
     cluster.wait(3.0)
@@ -384,10 +382,9 @@ def test_without_a_policy_it_is_kept_on_its_own_host_alone():
     assert not cluster.orders(DropReplica)
 
 
-def test_stateless_processes_and_strangers_are_left_alone():
+def test_stateless_and_unknown_processes_cause_no_order():
     """Snapshots of an unknown process stay, because the journal may be lost."""
-    cluster = Cluster("a")
-    cluster.submit(process("s"), job("j"))
+    cluster = Cluster("a").with_processes(process("s"), job("j"))
     keep(cluster, "a", ("unknown", 70, 3))
     cluster.wait(3.0)
     assert not cluster.orders(ReplicateSnapshot)
@@ -397,16 +394,7 @@ def test_stateless_processes_and_strangers_are_left_alone():
     assert assigned(cluster).instance.number > 70, "no number is used twice"
 
 
-def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
-    """Register a slave, which reports its snapshots at once."""
-    machine = cluster.machines[host]
-    kept = tuple(
-        SnapshotReport(InstanceId(name, number), sequence, 100) for name, number, sequence in states
-    )
-    cluster.register(machine, kept)
-
-
-def test_a_master_that_starts_knows_what_a_host_keeps_as_soon_as_it_registers():
+def test_a_registration_brings_the_replicas_of_the_host():
     """A start caused by this registration already uses the reported snapshot."""
     cluster = running(Asked(), "a", "b")
     host, number = where(cluster), cluster["p"].owner
@@ -415,25 +403,20 @@ def test_a_master_that_starts_knows_what_a_host_keeps_as_soon_as_it_registers():
     machine = cluster.machines[host]
     machine.programs.clear()  # the process ended and was forgotten while there was no master
     machine.slave.held.clear()
-    register(cluster, others_of(cluster, host)[0])
+    register(cluster, others(cluster, host)[0])
     register(cluster, host, ("p", number, 5))
     cluster.wait(1.0)
     assert assigned(cluster).instance.number > number
     assert assigned(cluster).kept_on == (host,)
 
 
-def others_of(cluster: Cluster, host: str) -> list[str]:
-    return [name for name in cluster.machines if name != host]
-
-
-def test_after_a_start_of_the_master_its_state_may_lie_on_a_host_that_comes_back_later():
+def test_after_a_start_of_the_master_a_process_waits_for_the_host_of_its_snapshot():
     """The process waits for that host for one lease; other queued processes do not wait."""
     cluster = running(Asked())
     host, left = where(cluster), others(cluster)
     for name in left:
         cluster.machines[name].takes = False
-    cluster.machines[host].connected = False
-    cluster.wait(6.0)
+    cluster.cut(host, seconds=6.0)
     assert cluster.queue() == ["p"]
     cluster.kill_master()
     for name in left:
@@ -448,7 +431,7 @@ def test_after_a_start_of_the_master_its_state_may_lie_on_a_host_that_comes_back
     assert cluster.phase("p") == "running"
 
 
-def test_the_last_copy_may_vanish_while_processes_are_looked_at():
+def test_the_last_replica_may_vanish_during_the_review():
     """The last replica may be on a host that was ordered to drop it."""
     policy = Asked()
     cluster = running(policy)
@@ -460,36 +443,28 @@ def test_the_last_copy_may_vanish_while_processes_are_looked_at():
     assert policy.views[-1].size == 0
 
 
-def lost_with_its_copy() -> tuple[Cluster, str, str]:
-    """Return a cluster that lost the hosts of a process and of its replica at the same time."""
+@pytest.mark.parametrize("rejoins", [True, False])
+def test_a_process_whose_replica_is_lost_too_waits_one_lease_for_it(rejoins: bool):
+    """A host that rejoins within the next lease provides the snapshot.
+
+    Otherwise the process starts from nothing, because no host has its snapshot.
+    """
     cluster = running(Asked())
     host, (keeper, left) = where(cluster), others(cluster)
     keep(cluster, keeper, ("p", cluster["p"].owner, 4))
-    for name in (host, keeper):
-        cluster.machines[name].connected = False
-    cluster.wait(4.5)  # the lease has expired, and the next one has begun
+    cluster.cut(host, keeper, seconds=4.5)  # the lease has expired, and the next one has begun
     assert cluster.queue() == ["p"]
     assert "has not come back yet" in cluster["p"].reason
-    return cluster, keeper, left
+    if rejoins:
+        cluster.reconnect(keeper, seconds=1.0)
+        assert assigned(cluster).kept_on == (keeper,)
+    else:
+        cluster.wait(3.0)
+        assert left in cluster.where("p")
+        assert assigned(cluster).kept_on == ()
 
 
-def test_when_the_copy_is_lost_too_its_host_may_come_back():
-    """A host that rejoins within the next lease provides the snapshot."""
-    cluster, keeper, _ = lost_with_its_copy()
-    cluster.machines[keeper].connected = True
-    cluster.wait(1.0)
-    assert assigned(cluster).kept_on == (keeper,)
-
-
-def test_when_the_copy_stays_lost_it_begins_from_nothing():
-    """One lease later the process starts from nothing, because no host has its snapshot."""
-    cluster, _, left = lost_with_its_copy()
-    cluster.wait(3.0)
-    assert left in cluster.where("p")
-    assert assigned(cluster).kept_on == ()
-
-
-def test_a_host_that_was_to_keep_the_state_is_asked_for_it_though_it_has_not_said_so():
+def test_a_start_also_names_a_host_whose_replica_is_not_reported_yet():
     """The newest replica may have arrived there after the last report."""
     policy = Asked()
     cluster = running(policy)
@@ -497,6 +472,5 @@ def test_a_host_that_was_to_keep_the_state_is_asked_for_it_though_it_has_not_sai
     keep(cluster, stale, ("p", cluster["p"].owner, 1))
     policy.answer = CheckpointChoice((keeper,))
     cluster.wait(2.0)
-    cluster.machines[host].connected = False
-    cluster.wait(4.0)
+    cluster.cut(host, seconds=4.0)
     assert assigned(cluster).kept_on == (keeper, stale)

@@ -8,14 +8,12 @@ from tests.unit.core.cluster import Cluster, Machine, job
 
 def cluster_of_one_slot(run_time: float) -> Cluster:
     """Return a cluster of one host with one slot, on which a job has run once."""
-    cluster = Cluster(Machine("a", max_processes=1))
-    cluster.submit(job("first"))
-    cluster.machines["a"].finish("first", cluster.now, run_time=run_time)
-    cluster.settle()
+    cluster = Cluster(Machine("a", max_processes=1)).with_processes(job("first"))
+    cluster.finish("first", run_time=run_time)
     return cluster
 
 
-def test_one_short_job_waits_on_the_host_that_runs_another() -> None:
+def test_one_short_job_is_prefetched_behind_another() -> None:
     """The slave holds the next job and starts it as soon as the slot is free."""
     cluster = cluster_of_one_slot(run_time=0.1)
     cluster.submit(job("p"), job("q"), job("r"))
@@ -26,14 +24,14 @@ def test_one_short_job_waits_on_the_host_that_runs_another() -> None:
     assert [cluster.phase(name) for name in "pqr"] == ["finished", "running", "assigned"]
 
 
-def test_nothing_waits_behind_a_job_that_is_long_or_unknown() -> None:
+def test_no_job_is_prefetched_behind_a_long_one() -> None:
     """An assignment ahead needs a known run time from earlier runs of the same program."""
     cluster = cluster_of_one_slot(run_time=60.0)
     cluster.submit(job("p"), job("q"))
     assert [cluster.phase(name) for name in "pq"] == ["running", "queued"]
 
 
-def test_what_waits_behind_a_job_that_proves_long_goes_back_to_its_place() -> None:
+def test_a_prefetched_job_behind_a_long_one_returns_to_its_place() -> None:
     """The job is withdrawn unstarted, and goes to the next host with a free slot."""
     cluster = cluster_of_one_slot(run_time=0.1)
     cluster.submit(job("p"), job("q"), job("r"))
@@ -45,7 +43,7 @@ def test_what_waits_behind_a_job_that_proves_long_goes_back_to_its_place() -> No
     assert cluster.where("q") == ["b"]
 
 
-def test_a_job_that_waits_ahead_can_be_cancelled() -> None:
+def test_a_prefetched_job_can_be_cancelled() -> None:
     """A cancelled job that waits ahead never starts."""
     cluster = cluster_of_one_slot(run_time=0.1)
     cluster.submit(job("p"), job("q"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -23,49 +24,49 @@ def cluster_of(*machines: Machine, **settings: Any) -> Cluster:
     return Cluster(*machines, **{"settle": 1.0, "hysteresis": 2.0, "cooldown": 30.0, **settings})
 
 
-def on_a(cluster: Cluster, **memory: float) -> None:
-    """Submit processes that run on a and use this memory, MiB."""
+def on_a(memory: Mapping[str, float], *others: Machine, **settings: Any) -> Cluster:
+    """Return a cluster where processes run on a and use this memory, MiB; others join later."""
+    cluster = cluster_of(machine("a"), **settings)
     for name, used in memory.items():
         cluster.machines["a"].shown[name] = {"memory": used * MIB}
         cluster.submit(movable(name))
         assert cluster.where(name) == ["a"]
     cluster.wait(1.5)
+    for other in others:
+        cluster.add(other)
+    return cluster
 
 
-def test_the_largest_relief_leaves_a_host_that_is_over_its_limit() -> None:
+def test_the_largest_user_leaves_a_host_over_its_limit() -> None:
     """One process leaves, the largest user of that resource, to a host with room."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, small=50, large=300, middle=200)
-    cluster.add(machine("b"))
+    cluster = on_a({"small": 50, "large": 300, "middle": 200}, machine("b"))
     cluster.machines["a"].busy["memory"] = 0.3
     cluster.wait(3.0)
     assert cluster.where("large") == ["b"]
     assert cluster.counts() == {"a": 2, "b": 1}
-    assert cluster.told("over_limit") == ["a reached its limit of memory"]
-    (said,) = cluster.told("migration_begun")
+    assert cluster.recorded("over_limit") == ["a reached its limit of memory"]
+    (said,) = cluster.recorded("migration_begun")
     assert said == "large moves from a to b by relaunch: a is over its limit of memory"
     assert cluster.explain("large")["decision"]["kind"] == "migrated"
 
 
-def test_a_stale_reading_says_nothing_of_a_limit() -> None:
+def test_a_stale_reading_neither_exceeds_nor_meets_a_limit() -> None:
     """A stale reading does not fall when processes leave, so it would evict all of them.
 
     It does not show the host under its limit either.
     """
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, large=300, middle=200)
-    cluster.add(machine("b"))
+    cluster = on_a({"large": 300, "middle": 200}, machine("b"))
     cluster.machines["a"].stale.add("memory")
     cluster.machines["a"].busy["memory"] = 0.5
     cluster.wait(5.0)
-    assert cluster.told("over_limit") == []
+    assert cluster.recorded("over_limit") == []
     assert cluster.counts() == {"a": 2, "b": 0}
     cluster.machines["a"].stale.clear()
     cluster.wait(0.5)
     cluster.machines["a"].stale.add("memory")
     cluster.wait(5.0)
-    assert cluster.told("over_limit") == ["a reached its limit of memory"]
-    assert cluster.told("under_limit") == []
+    assert cluster.recorded("over_limit") == ["a reached its limit of memory"]
+    assert cluster.recorded("under_limit") == []
     assert cluster.counts() == {"a": 2, "b": 0}
 
 
@@ -76,16 +77,15 @@ def test_a_reading_that_crosses_the_limit_each_second_is_recorded_once() -> None
         for memory in (0.9, 0.3):
             cluster.machines["a"].busy["memory"] = memory
             cluster.wait(1.0)
-    assert cluster.told("over_limit") == ["a reached its limit of memory"]
-    assert cluster.told("under_limit") == []
+    assert cluster.recorded("over_limit") == ["a reached its limit of memory"]
+    assert cluster.recorded("under_limit") == []
     cluster.wait(1.5)
-    assert cluster.told("under_limit") == ["a is under its limits"]
+    assert cluster.recorded("under_limit") == ["a is under its limits"]
 
 
-def test_it_must_relieve_the_resource_that_is_over() -> None:
+def test_the_process_that_leaves_uses_the_exceeded_resource() -> None:
     """A process that uses no CPU does not leave a host over its CPU limit."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, fat=400, busy=10)
+    cluster = on_a({"fat": 400, "busy": 10})
     cluster.machines["a"].shown["busy"]["cpu"] = 1.0
     cluster.add(machine("b"))
     cluster.wait(0.3)
@@ -94,10 +94,9 @@ def test_it_must_relieve_the_resource_that_is_over() -> None:
     assert (cluster.where("busy"), cluster.where("fat")) == (["b"], ["a"])
 
 
-def test_it_must_fit_where_it_goes() -> None:
+def test_the_process_that_leaves_fits_at_the_destination() -> None:
     """The largest process that fits leaves; a destination keeps its headroom below the limit."""
-    cluster = cluster_of(machine("a"), headroom=0.05)
-    on_a(cluster, large=300, small=100)
+    cluster = on_a({"large": 300, "small": 100}, headroom=0.05)
     cluster.add(machine("b", memory=0.5))  # 0.5 + 0.3 reaches the limit, without headroom
     cluster.machines["a"].busy["memory"] = 0.45
     cluster.wait(3.0)
@@ -106,14 +105,13 @@ def test_it_must_fit_where_it_goes() -> None:
 
 def test_nothing_moves_when_every_host_is_at_its_limits() -> None:
     """Nothing is assigned either: the queue waits."""
-    cluster = cluster_of(machine("a"), machine("b", memory=0.2))
-    on_a(cluster, p=300)
+    cluster = on_a({"p": 300}, machine("b", memory=0.2))
     for name in "ab":
         cluster.machines[name].busy["memory"] = 0.85
     cluster.wait(5.0)
     cluster.submit(movable("q"))
     assert (cluster.where("p"), cluster.queue()) == (["a"], ["q"])
-    assert cluster.told("nothing_moves")[0] == "nothing can leave a: no host has room for p"
+    assert cluster.recorded("nothing_moves")[0] == "nothing can leave a: no host has room for p"
 
 
 def test_a_full_resource_without_a_limit_is_no_reason_to_move() -> None:
@@ -126,15 +124,13 @@ def test_a_full_resource_without_a_limit_is_no_reason_to_move() -> None:
     cluster.machines["a"].busy["cpu"] = 0.9
     assert cluster.machines["a"].usage(cluster.now)["cpu"] == 1.0
     cluster.wait(5.0)
-    assert cluster.told("over_limit") == []
+    assert cluster.recorded("over_limit") == []
     assert cluster.where("p") == ["a"]
 
 
-def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
+def test_a_host_over_its_limit_within_the_hysteresis_keeps_its_processes() -> None:
     """Nothing moves within the hysteresis."""
-    cluster = cluster_of(machine("a"), hysteresis=2.0)
-    on_a(cluster, p=300)
-    cluster.add(machine("b"))
+    cluster = on_a({"p": 300}, machine("b"), hysteresis=2.0)
     for _ in range(3):
         cluster.machines["a"].busy["memory"] = 0.6
         cluster.wait(1.5)
@@ -142,14 +138,12 @@ def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
         cluster.wait(0.5)
     assert cluster.where("p") == ["a"]
     cluster.wait(2.0)
-    assert cluster.told("under_limit")
+    assert cluster.recorded("under_limit")
 
 
-def test_a_process_that_moved_is_left_alone_for_its_cool_down() -> None:
+def test_a_process_that_moved_stays_for_its_cool_down() -> None:
     """The cool-down keeps a process from flapping between two full hosts."""
-    cluster = cluster_of(machine("a"), cooldown=30.0)
-    on_a(cluster, p=300)
-    cluster.add(machine("b"))
+    cluster = on_a({"p": 300}, machine("b"), cooldown=30.0)
     cluster.machines["a"].busy["memory"] = 0.6
     cluster.wait(3.0)
     assert cluster.where("p") == ["b"]
@@ -158,16 +152,14 @@ def test_a_process_that_moved_is_left_alone_for_its_cool_down() -> None:
     cluster.machines["b"].shown["p"] = {"memory": 300 * MIB}
     cluster.wait(20.0)
     assert cluster.where("p") == ["b"]
-    assert "p is in its cool-down of 30 s after a move" in cluster.told("nothing_moves")[-1]
+    assert "p is in its cool-down of 30 s after a move" in cluster.recorded("nothing_moves")[-1]
     cluster.wait(12.0)
     assert cluster.where("p") == ["a"]
 
 
-def test_one_move_at_a_time_leaves_a_host_and_its_effect_is_seen_first() -> None:
+def test_one_process_at_a_time_leaves_a_host() -> None:
     """After each move the hysteresis starts again before the next process leaves."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, p=150, q=150, r=150)
-    cluster.add(machine("b"))
+    cluster = on_a({"p": 150, "q": 150, "r": 150}, machine("b"))
     cluster.machines["a"].busy["memory"] = 0.9
     cluster.wait(2.5)
     assert cluster.counts() == {"a": 2, "b": 1}
@@ -177,7 +169,7 @@ def test_one_move_at_a_time_leaves_a_host_and_its_effect_is_seen_first() -> None
     assert cluster.counts() == {"a": 1, "b": 2}
 
 
-def test_at_most_max_migrations_are_under_way() -> None:
+def test_at_most_max_migrations_are_in_progress() -> None:
     """The limit holds for the whole cluster."""
     cluster = cluster_of(machine("a"), max_migrations=2)
     for name in "pqrs":
@@ -196,10 +188,9 @@ def test_at_most_max_migrations_are_under_way() -> None:
     assert cluster.counts()["b"] == 4
 
 
-def test_a_drained_host_is_emptied_of_what_can_move() -> None:
+def test_all_movable_processes_leave_a_draining_host() -> None:
     """The reply and the record name the processes that cannot leave, with the reason."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, p=50, q=50)
+    cluster = on_a({"p": 50, "q": 50})
     cluster.submit(process("fixed"), process("rooted"))
     cluster.add(machine("b"))
     stays = (
@@ -210,28 +201,25 @@ def test_a_drained_host_is_emptied_of_what_can_move() -> None:
     assert said == f"a is draining: 2 processes leave (p and q); cannot {stays}"
     cluster.wait(3.0)
     assert cluster.counts() == {"a": 2, "b": 2}
-    assert cluster.told("host_drained") == [f"a is drained: nothing can {stays}"]
+    assert cluster.recorded("host_drained") == [f"a is drained: nothing can {stays}"]
     assert listing.host_rows(cluster.state, cluster.now)[0].drained
     cluster.submit(process("new"))
     assert cluster.where("new") == ["b"]
 
 
-def test_a_draining_host_is_drained_only_when_what_can_leave_has_left() -> None:
+def test_a_host_is_drained_when_all_movable_processes_have_left() -> None:
     """The drain waits while no host has room or the host is lost; a new process ends the state."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, p=50)
-    cluster.add(machine("b"))
+    cluster = on_a({"p": 50}, machine("b"))
     cluster.set_host("b", "cordon")
     cluster.set_host("a", "drain")
     cluster.wait(3.0)
-    assert "no host has room for p" in cluster.told("nothing_moves")[0]
+    assert "no host has room for p" in cluster.recorded("nothing_moves")[0]
     cluster.machines["a"].connected = False
     cluster.set_host("b", "uncordon")
     cluster.wait(12.0)
-    assert cluster.told("host_drained") == []
-    cluster.machines["a"].connected = True
-    cluster.wait(5.0)
-    assert (cluster.where("p"), len(cluster.told("host_drained"))) == (["b"], 1)
+    assert cluster.recorded("host_drained") == []
+    cluster.reconnect("a", seconds=5.0)
+    assert (cluster.where("p"), len(cluster.recorded("host_drained"))) == (["b"], 1)
     cluster.set_host("a", "uncordon")
     assert not listing.host_rows(cluster.state, cluster.now)[0].drained
 
@@ -245,7 +233,7 @@ def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> Non
         "nothing can leave: p may run on no other host (`rosrm explain NAME` shows the reason)"
     )
     cluster.wait(3.0)
-    assert len(cluster.told("host_drained")) == 1
+    assert len(cluster.recorded("host_drained")) == 1
     cluster.add(Machine("c", labels={"camera": "front"}))
     cluster.wait(3.0)
     assert cluster.where("p") == ["c"]
@@ -258,23 +246,20 @@ def test_a_process_too_large_for_every_other_host_stays_on_a_draining_host() -> 
     assert cluster.where("p") == ["a"]
     assert "nothing can leave: p may run on no other" in cluster.set_host("a", "drain").message
     cluster.wait(3.0)
-    assert len(cluster.told("host_drained")) == 1
+    assert len(cluster.recorded("host_drained")) == 1
 
 
-def test_that_there_is_no_other_host_is_said_once() -> None:
+def test_the_lack_of_another_host_is_one_reason() -> None:
     """Both a command and a drain name the missing host, not missing room."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, p=50, q=50)
+    cluster = on_a({"p": 50, "q": 50})
     assert cluster.migrate("p").message == "there is no other host"
     said = cluster.set_host("a", "drain").message
     assert said == "a is draining: nothing can leave: there is no other host"
 
 
-def test_with_automatic_off_nothing_moves_by_itself() -> None:
+def test_without_automatic_no_process_is_evicted() -> None:
     """Drain and `migrate` still move processes."""
-    cluster = cluster_of(machine("a"), automatic=False)
-    on_a(cluster, p=300)
-    cluster.add(machine("b"))
+    cluster = on_a({"p": 300}, machine("b"), automatic=False)
     cluster.machines["a"].busy["memory"] = 0.6
     cluster.wait(5.0)
     assert cluster.where("p") == ["a"]
@@ -282,24 +267,22 @@ def test_with_automatic_off_nothing_moves_by_itself() -> None:
     assert cluster.where("p") == ["b"]
 
 
-def test_that_nothing_can_move_is_said_once_for_each_reason() -> None:
+def test_a_reason_against_eviction_is_recorded_once() -> None:
     """The reason is recorded again when the host exceeds its limit again, not every ten seconds."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, p=300)
+    cluster = on_a({"p": 300})
     cluster.machines["a"].busy["memory"] = 0.6
     cluster.wait(60.0)
-    assert len(cluster.told("nothing_moves")) == 1
+    assert len(cluster.recorded("nothing_moves")) == 1
     cluster.machines["a"].busy["memory"] = 0.1
     cluster.wait(20.0)
     cluster.machines["a"].busy["memory"] = 0.6
     cluster.wait(20.0)
-    assert len(cluster.told("nothing_moves")) == 2
+    assert len(cluster.recorded("nothing_moves")) == 2
 
 
 def test_a_move_goes_to_the_largest_margin() -> None:
     """The order of hosts is the same as for a new process."""
-    cluster = cluster_of(machine("a"))
-    on_a(cluster, p=100)
+    cluster = on_a({"p": 100})
     cluster.add(machine("b", memory=0.4))
     cluster.add(machine("c", memory=0.2))
     cluster.migrate("p")
@@ -307,7 +290,7 @@ def test_a_move_goes_to_the_largest_margin() -> None:
 
 
 @pytest.mark.parametrize("resource", ["memory", "cpu"])
-def test_what_leaves_is_counted_as_it_was_seen(resource: str) -> None:
+def test_eviction_counts_the_measured_usage(resource: str) -> None:
     """The relief is the measured usage, not the declared needs."""
     cluster = cluster_of(machine("a"))
     cluster.machines["a"].shown["p"] = {"memory": 300 * MIB, "cpu": 1.6}
@@ -321,7 +304,7 @@ def test_what_leaves_is_counted_as_it_was_seen(resource: str) -> None:
     assert (cluster.where("p"), cluster.where("q")) == (["b"], ["a"])
 
 
-def test_what_no_host_has_a_probe_for_keeps_nobody_where_it_is() -> None:
+def test_a_resource_without_a_probe_prevents_no_move() -> None:
     """Slaves report CPU usage per process even where no probe measures the host's CPU."""
     memory = (ResourceDescription("memory", "B", 16 * GIB),)
     cluster = Cluster(*(Machine(name, resources=memory) for name in ("a", "b")))

@@ -77,7 +77,7 @@ def waits(cluster: Cluster) -> None:
     assert "the master waits for all hosts to report" in cluster["p"].reason
 
 
-def test_it_is_said_once_with_how_much(cluster) -> None:
+def test_a_gap_is_recorded_once_with_its_size(cluster) -> None:
     """The first host reveals the gap; later hosts cause a record only if they know more."""
     loss = Loss(cluster)
     cluster.submit(process("p"))
@@ -91,7 +91,7 @@ def test_it_is_said_once_with_how_much(cluster) -> None:
     assert len(told(cluster)) == 1
 
 
-def test_a_whole_journal_is_not_suspected(cluster) -> None:
+def test_a_complete_journal_shows_no_gap(cluster) -> None:
     """The journal has all records that hosts have seen, so work is assigned at once."""
     cluster.submit(process("p"))
     loss = Loss(cluster)
@@ -103,7 +103,7 @@ def test_a_whole_journal_is_not_suspected(cluster) -> None:
     assert cluster.phase("q") == "running"
 
 
-def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
+def test_a_process_that_was_started_in_the_gap_never_runs_twice(cluster) -> None:
     """By the journal p is queued, while a host that registers later runs it.
 
     That instance ends first.
@@ -125,7 +125,7 @@ def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, there) -> None:
+def test_after_a_reboot_the_master_waits_for_all_known_hosts(cluster, there) -> None:
     """The master waits for every known host, though none can prove the gap.
 
     An absent host blocks placement for one lease.
@@ -147,7 +147,7 @@ def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, th
     assert cluster.phase("p") == "running"
 
 
-def test_a_master_that_is_killed_while_it_waits_forgets_nothing_of_it(cluster) -> None:
+def test_a_master_that_is_killed_during_the_wait_keeps_waiting(cluster) -> None:
     """The next master waits for the same hosts, and then for no more."""
     loss = lost_with_p_on_b(cluster)
     loss.strike(fell=True)
@@ -163,7 +163,7 @@ def test_a_master_that_is_killed_while_it_waits_forgets_nothing_of_it(cluster) -
     assert "unheard" not in cluster.intents["cluster"]
 
 
-def test_nothing_is_waited_for_twice(cluster) -> None:
+def test_a_later_restart_does_not_wait_again(cluster) -> None:
     """Once all hosts have registered, a later restart of the master does not wait."""
     loss = Loss(cluster)
     loss.strike(fell=True)
@@ -178,7 +178,7 @@ def test_nothing_is_waited_for_twice(cluster) -> None:
     assert cluster.where("p") == ["a"]
 
 
-def test_what_one_host_knew_to_be_lost_counts_for_the_next_master_too(cluster) -> None:
+def test_a_gap_that_one_host_revealed_holds_for_the_next_master(cluster) -> None:
     """After both restarts the master still waits for the hosts that have not registered."""
     loss = lost_with_p_on_b(cluster)
     loss.strike()
@@ -195,7 +195,7 @@ def test_what_one_host_knew_to_be_lost_counts_for_the_next_master_too(cluster) -
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_numbers_of_what_is_lost_are_not_given_again(cluster, killed) -> None:
+def test_instance_numbers_from_the_gap_are_not_used_again(cluster, killed) -> None:
     """This includes ended instances that no host remembers, and holds for the next master, too."""
     loss = Loss(cluster)
     cluster.submit(process("p"))
@@ -216,7 +216,7 @@ def test_numbers_of_what_is_lost_are_not_given_again(cluster, killed) -> None:
     assert cluster["q"].owner > given + 100
 
 
-def test_an_absurd_number_harms_nobody(cluster) -> None:
+def test_an_invalid_record_number_costs_one_lease(cluster) -> None:
     """An invalid record number costs one lease and no instance numbers."""
     loss = Loss(cluster)
     loss.strike()
