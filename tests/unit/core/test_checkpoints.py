@@ -297,7 +297,7 @@ def test_a_host_that_is_closed_or_away_restores_nothing() -> None:
     assert "on a alone, which is lost" in cluster.restore("p").message
     assert cluster.explain("p")["reason"] == "its image is on a, which is lost"
     cluster.kill_master()
-    assert "a, which has not come back" in cluster.explain("p")["reason"]
+    assert "a, which has not reported" in cluster.explain("p")["reason"]
     cluster.rejoin("a", 0.5)
     assert cluster.explain("p")["reason"] == "its image is on a"
     assert cluster.restore("p").accepted
