@@ -1,6 +1,6 @@
-"""The kinds of events in the event record, each with its meaning.
+"""Kinds of events in the event record, with their meanings.
 
-`docs/reference/events.md` has the same table: `python scripts/event_table.py` writes it.
+`python scripts/event_table.py` copies the table to `docs/reference/events.md`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class EventKind(str, Enum):
     meaning: str
 
     def __new__(cls, text: str, meaning: str = "") -> Self:
-        """Make a member from its name in the journal and its meaning."""
+        """Create a member from its name in the journal and its meaning."""
         kind = str.__new__(cls, text)
         kind._value_ = text
         kind.meaning = meaning

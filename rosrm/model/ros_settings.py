@@ -9,7 +9,7 @@ from typing import Final
 
 from rosrm.errors import ConfigError
 
-#: A higher domain would need ports beyond the range of UDP.
+#: Highest domain id, because higher ones need ports beyond 65535.
 HIGHEST_DOMAIN: Final = 232
 
 
@@ -22,7 +22,7 @@ class RosSettings:
         discovery_range: "localhost", "subnet", "off" or "system_default".
         discovery_server: "host:port" of a Fast DDS discovery server, instead of multicast.
         transports: FASTDDS_BUILTIN_TRANSPORTS, for example "UDPv4".
-        namespace: of rosrm's topics and services.
+        namespace: namespace of rosrm's topics and services.
     """
 
     domain: int | None = None
@@ -37,7 +37,7 @@ class RosSettings:
             "ROS_DOMAIN_ID": "" if self.domain is None else str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": self.discovery_range.upper(),
             "ROS_DISCOVERY_SERVER": self.discovery_server,
-            # A plain client gets only its own topics from the server: too little to see nodes.
+            # A plain client gets only its own topics from the server and sees no other nodes.
             "ROS_SUPER_CLIENT": "TRUE" if self.discovery_server else "",
             "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
         }
@@ -46,7 +46,7 @@ class RosSettings:
     def check_domain(self) -> None:
         """Raise `ConfigError` if the ROS_DOMAIN_ID in force is invalid.
 
-        Otherwise DDS would print a fault of its own, or rclpy would raise a traceback.
+        Otherwise DDS would print an error without a remedy, or rclpy a traceback.
         """
         word = os.environ.get("ROS_DOMAIN_ID", "")
         if self.domain is not None or not word:
@@ -58,7 +58,7 @@ class RosSettings:
             )
 
     def describe(self) -> str:
-        """Return domain, RMW and discovery in force, for messages."""
+        """Return a text on the domain, RMW and discovery in force."""
         joined = {**os.environ, **self.environment()}
         discovery = joined.get("ROS_DISCOVERY_SERVER") or joined.get(
             "ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET"
