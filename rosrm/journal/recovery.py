@@ -98,9 +98,9 @@ def _not_recovered(path: Path, error: BaseException) -> JournalError:
     why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     room = room_for(path)
     return JournalError(
-        f"the journal {path} was not recovered and is unchanged: {why}. A recovery needs free space "
-        f"beside it of twice its size{f' ({room})' if room else ''}, and the right to write into "
-        f"its folder"
+        f"the journal {path} was not recovered and is unchanged: {why}. A recovery needs free "
+        f"space beside it of twice its size{f' ({room})' if room else ''}, and the right to write "
+        f"into its folder"
     )
 
 

@@ -388,9 +388,9 @@ def test_a_standby_needs_a_strategy_that_can_shadow(file, refusal):
     follow = MigrationOffer("follow", lambda options: options, capabilities=follows)
     registry = registry_of(RELAUNCH, follow)
     said = refusal(load_work, text.replace("STRATEGY", "relaunch"), registry)
-    assert "f.yaml:1:44: a standby follows the state of its process, and relaunch cannot" in said
-    assert "say `migration: follow`" in said
-    assert "without a migration strategy" in refusal(load_work, text.replace("STRATEGY", "null"))
+    assert "f.yaml:1:44: a standby needs a migration strategy that copies state" in said
+    assert "relaunch has no standby: write `migration: follow`" in said
+    assert "no migration strategy is given" in refusal(load_work, text.replace("STRATEGY", "null"))
     for known in (registry, None):
         (spec,) = load_work(file(text.replace("STRATEGY", "follow")), known)
         assert spec.standby.wanted
