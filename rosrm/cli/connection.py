@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from rosrm.model.rows import Listing
     from rosrm.ros.master_connection import MasterClient
 
-#: Seconds from the start of the command until the message that there is no master: less than 3,
-#: because leaving ROS takes time too.
+#: Seconds from the start of the command until the message that no master answers. The command ends
+#: within 3 s, and leaving ROS takes time too.
 SAID_WITHIN: Final = 2.6
-#: Seconds for finding a master on this machine, counted after the imports.
+#: Shortest time, in seconds, for finding a master, counted after the imports.
 LEAST: Final = 1.5
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
-    """Return the settings with which to join ROS.
+    """Return the ROS settings of the command.
 
-    The option of the command comes before the common options, and these before the file.
+    An option of the command overrides the common options, which override the file.
     """
     common = ctx.obj if isinstance(ctx.obj, CommonOptions) else CommonOptions()
     chosen = common.domain if domain is None else domain
@@ -52,7 +52,7 @@ def note(text: str) -> None:
 
 
 def say_trouble(snapshot: Listing) -> None:
-    """Print beside the listing that the master accepts no new work, and why."""
+    """Print to standard error why the master accepts no new work, if it does not."""
     if snapshot.trouble:
         note(snapshot.trouble)
 

@@ -3,8 +3,8 @@
 ======  ===========================================================
 exit    when
 ======  ===========================================================
-0       it was done
-1       it was refused, or failed
+0       the command succeeded
+1       the master refused the request, or the command failed
 2       a file, option or argument is wrong; nothing was done
 3       no master (or slave) answered
 130     Ctrl-C

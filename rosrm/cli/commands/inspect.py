@@ -1,6 +1,6 @@
 """Commands that print once: status, ps, hosts, plugins, explain."""
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations

@@ -170,7 +170,7 @@ def test_braces_are_plain_without_foreach(file):
         ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is required, not a list"),
         ("[{i: 1}, {j: 1}]", "n{i}", "f.yaml:1:46: foreach: gives j, and the first of the list i"),
         ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is required"),
-        ("[1]", "n", "f.yaml:1:35: foreach: each of a list is a mapping from names to values"),
+        ("[1]", "n", "f.yaml:1:35: foreach: each entry of a list must map names to values"),
     ],
 )
 def test_a_wrong_foreach_is_refused_with_its_place(refusal, foreach, name, said):
@@ -343,7 +343,7 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
     [
         ("", "f.yaml:1:1: processes: a list of at least one process is required"),
         ("processes: []", "f.yaml:1:12: processes: a list of at least one"),
-        ("processes: [a]", "f.yaml:1:13: processes: each of the list is a mapping"),
+        ("processes: [a]", "f.yaml:1:13: processes: each entry must be a mapping"),
         ("- {name: a}", "f.yaml:1:1: a work file is a mapping, not a list; put the list under `pr"),
         ("exec python3 robot", "f.yaml:1:1: a work file is a mapping, not text; it has `proces"),
         ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name belongs to one"),
