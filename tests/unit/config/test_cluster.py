@@ -257,7 +257,7 @@ class ByResource:
     ("text", "said"),
     [
         ("scoring: {policy: w, options: {weights: {memroy: 1.0}}}",
-         "weights: unknown resource 'memroy'; did you mean 'memory'? Allowed: memory (what"),
+         "weights: unknown resource 'memroy'; did you mean 'memory'? Allowed: memory (resources"),
         ("scoring: {policy: w, options: {watch: [memory, dsk]}}",
          "f.yaml:1:48: options of scoring policy 'w': watch: unknown resource 'dsk'. Allowed"),
         ("scoring: {policy: w}\ndefaults: {needs: {memroy: 1MB}}", "2:20: defaults.needs: unknown"),

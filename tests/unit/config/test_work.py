@@ -168,7 +168,11 @@ def test_braces_are_plain_without_foreach(file):
             "f.yaml:1:41: foreach.i: a list or range(first, end) is required, not 5",
         ),
         ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is required, not a list"),
-        ("[{i: 1}, {j: 1}]", "n{i}", "f.yaml:1:46: foreach: gives j, and the first of the list i"),
+        (
+            "[{i: 1}, {j: 1}]",
+            "n{i}",
+            "f.yaml:1:46: foreach: this entry has the names j, and the first entry i",
+        ),
         ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is required"),
         ("[1]", "n", "f.yaml:1:35: foreach: each entry of a list must map names to values"),
     ],
