@@ -79,7 +79,7 @@ def cancel(
     timeout: Timeout = "",
     domain: Domain = None,
 ) -> None:
-    """Cancel processes: take them out of the queue, or stop them for good.
+    """Cancel processes: remove them from the queue, or stop them for good.
 
     For a work file, all its processes that have not ended are cancelled.
     """
