@@ -234,18 +234,18 @@ def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
     if standby.wanted and spec.kind == "job":
         yield Complaint(("standby",), "a job runs to completion; only a service has a standby")
     if standby.apart_by and not standby.wanted:
-        yield Complaint(("standby", "apart_by"), "standby.apart_by goes with `wanted: true`")
+        yield Complaint(("standby", "apart_by"), "standby.apart_by requires `wanted: true`")
     if spec.isolation.after and spec.isolation.then == "keep":
-        yield Complaint(("isolation", "after"), "isolation.after goes with `then: stop`")
+        yield Complaint(("isolation", "after"), "isolation.after requires `then: stop`")
     if spec.host_loss.delay and spec.host_loss.then == "wait":
-        text = "host_loss.delay goes with `then: elsewhere` or `stop`"
+        text = "host_loss.delay requires `then: elsewhere` or `then: stop`"
         yield Complaint(("host_loss", "delay"), text)
 
 
 def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
     health = spec.health
     if bool(health.topic) != bool(health.rate):
-        text = "health.topic and health.rate (Hz, above 0) go together"
+        text = "health.topic and health.rate (Hz, above 0) must be given together"
         yield Complaint(("health",), text)
     if health.topic and not _TOPIC.fullmatch(health.topic):
         text = f"health.topic {health.topic!r} is no ROS topic; for example /scan, scan or ~/scan"

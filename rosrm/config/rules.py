@@ -42,7 +42,7 @@ def refuse_namesakes(nodes: Sequence[Node], what: str, problems: Problems) -> No
         if before is None:
             first[name.value] = name.place
         elif before == name.place:
-            text = f"foreach gives every {what} the name {name.value!r}; put one of its names in"
+            text = f"foreach gives every {what} the name {name.value!r}; use one of its names in it"
             problems.add(name.place, text)
         else:
             where = f"first given at line {before.line}, column {before.column}"

@@ -93,7 +93,8 @@ def _defaults(root: Node, problems: Problems) -> Node:
     for name in _NOT_IN_DEFAULTS:
         node = defaults.get(name)
         if node is not None:
-            problems.add(node.key_place or node.place, f"defaults: {name} belongs to one process")
+            text = f"defaults: {name} is allowed in a process only"
+            problems.add(node.key_place or node.place, text)
     return written_out(defaults)
 
 

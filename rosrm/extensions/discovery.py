@@ -1,7 +1,7 @@
 """Discovery of installed plugins: import, call of the hooks, checks of the offers.
 
-A plugin that does not import, raises in a hook or misspells one is reported as broken, with its
-distribution, the hook and the place of its definition. It does not affect the other plugins.
+A plugin that cannot be imported, raises in a hook or misspells a hook is broken. It is listed with
+its distribution and with name and place of the hook, and does not affect other plugins.
 """
 
 from __future__ import annotations

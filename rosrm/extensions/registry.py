@@ -540,7 +540,7 @@ class Registry:
         title, names = TITLES[kind], self.names(kind)
         near = get_close_matches(name, names, 1)
         meant = f"; did you mean {near[0]!r}?" if near else "."
-        shipped = f"; {_SHIPPED_IN[kind]} brings rosrm's own" if kind in _SHIPPED_IN else ""
+        shipped = f"; {_SHIPPED_IN[kind]} has rosrm's own" if kind in _SHIPPED_IN else ""
         installed = f"Installed: {', '.join(names)}." if names else f"None is installed{shipped}."
         raise ConfigError(
             f"unknown {title} {name!r}{meant} {installed}{self._broken_note(kind, name)}"
@@ -610,7 +610,7 @@ def _fault_of_resources(
                 f"write ProbeOffer(..., resources={declared})"
             )
     if len(taken) + len(resources) > RESOURCE_SLOTS:
-        return f"brings the resources of this host to more than {RESOURCE_SLOTS}"
+        return f"exceeds the {RESOURCE_SLOTS} resources that a host may have"
     return ""
 
 

@@ -27,8 +27,8 @@ from rosrm.runtime.disk_space import room_for
 from rosrm.wording import counted
 
 _BESIDE: Final = ("-wal", "-shm")
-#: A scan ends at a damaged page. So events are read from the end and in small groups, and intents
-#: from both ends, then one by one by the names in the events.
+#: A scan ends at a damaged page. So events are read from the end and in small groups. Intents are
+#: read from both ends, then one by one by the names in the events.
 _EVENTS: Final = "SELECT * FROM record WHERE sequence BETWEEN ? AND ? AND facts IS NOT NULL"
 _NEWEST_EVENTS: Final = "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence DESC"
 _FEW: Final = 50
@@ -133,7 +133,7 @@ def _salvage(path: Path, place: Path) -> _Found:
         _read_intents(database, found)
     if not found.intents:
         raise JournalError(
-            f"nothing can be read of the journal {path}: restore it from a backup, or move it away "
+            f"the journal {path} has no readable part: restore it from a backup, or move it away "
             f"to start with an empty one"
         )
     return found

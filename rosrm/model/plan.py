@@ -312,11 +312,11 @@ def _handoff_fault(step: Step) -> str:
     if not isinstance(step, Configure):
         return ""
     if step.phase not in _FORWARD:
-        return f"it says {step.phase.name} on the way forward"
+        return f"it has the phase {step.phase.name}, which only an undo may have"
     undo = step.undo
     aborts = isinstance(undo, Configure) and undo.phase is HandoffPhase.ABORT and undo.awaited
     if step.phase is HandoffPhase.SWITCH and not aborts:
-        return "it says SWITCH, and its undo is not ABORT"
+        return "it has the phase SWITCH, and its undo is not ABORT"
     return ""
 
 

@@ -38,7 +38,7 @@ class HostRow:
     Attributes:
         state: "up", "suspect", "lost", "left" or "detached" (its slave was stopped and left
             processes running).
-        accepting: the slave is under all its limits and has asked for work.
+        accepting: the slave is under all its limits and has requested work.
         reading_age: seconds since the newest `resource_info`.
         drained: the host is draining, and no process that can leave is left on it.
     """

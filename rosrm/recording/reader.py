@@ -123,7 +123,7 @@ class _Reader:
         else:
             event = decode(kind, content)
             if self._events and event.now < self._events[-1].now:
-                raise ValueError("time goes back")
+                raise ValueError("its time is before that of the previous event")
             self._events.append(event)
 
     def _nonsense(self, what: str) -> RecordError:

@@ -78,7 +78,7 @@ class HostLeft:
 
 @dataclass(frozen=True, slots=True)
 class ProcessRequested:
-    """A slave is under all its limits and asks for work."""
+    """A slave is under all its limits and requests work."""
 
     request: int
     host_id: int

@@ -21,7 +21,7 @@ def shared_nodes(processes: Iterable[tuple[str, str]]) -> list[str]:
         if node:
             users.setdefault(node, []).append(name)
     return [
-        f"{listed(names)} put {node} into the ROS graph; give each node a name of its own"
+        f"{listed(names)} put {node} into the ROS graph; give each node its own name"
         for node, names in users.items()
         if len(names) > 1
     ]

@@ -203,7 +203,7 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
 def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
     process.wanted, process.left_behind = DesiredState.CANCEL, None
     state.record(
-        now, EventKind.CANCEL_REQUESTED, f"{process.name} is to be cancelled",
+        now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
         process=process.name, by=by,
     )  # fmt: skip
     if process.phase in WAITING:
@@ -325,7 +325,7 @@ def _begin(
 
 def _cause(by: str) -> str:
     """Return the cause of a client's change, for records."""
-    return f"asked for by {by}" if by else "asked for"
+    return f"requested by {by}" if by else "requested"
 
 
 def known_host(state: MasterState, name: str) -> Host:

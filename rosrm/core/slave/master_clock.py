@@ -13,7 +13,7 @@ class BeatClock:
 
     A slave that was stopped (SIGSTOP) finds old beats in its sockets. They name the silent hosts at
     their send time, not now. The monotonic clocks of two machines share only their rate. So the
-    fastest beat since the handshake gives the difference of the clocks, and a beat with a longer
+    fastest beat since the handshake gives the difference of the clocks. A beat with a longer
     transport was sent earlier by the additional time. The estimate is late only by the transport
     time of the fastest beat.
     """

@@ -136,7 +136,7 @@ class SlaveState:
 def under_limits(
     usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
 ) -> bool:
-    """Return True if a host may ask for work: each limited reading is fresh and under its limit.
+    """Return True if a host may request work: each limited reading is fresh and under its limit.
 
     Args:
         usage, limit: (slots,) fractions; limit 1: no limit.

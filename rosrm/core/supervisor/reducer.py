@@ -47,8 +47,8 @@ running slave counts as contact. A fenced instance is not restarted on this host
 policy and of later orders.
 
 `ShutdownOrdered` stops every instance as `StopOrdered` does. An instance that no order had stopped
-before ends as withdrawn, not exited, which shows the master that neither the process nor an order
-of the master caused the end.
+before ends as withdrawn, not exited. So the master can distinguish this end from an end by its own
+order or by the process.
 
 `ClientLost` changes nothing: each instance runs on as long as its fence allows.
 

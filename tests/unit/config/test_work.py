@@ -239,7 +239,7 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
     [
         ("command: x, module: y, prioritty: 1", "module and command are given; give one of"),
         ("command: x, health: {topic: /scan}, prioritty: 1", "health.topic and health.rate"),
-        ("command: x, isolation: {after: 1s}, priority: high", "isolation.after goes with"),
+        ("command: x, isolation: {after: 1s}, priority: high", "isolation.after requires"),
         ("command: x, migration: relunch, prioritty: 1", "unknown migration strategy 'relunch'"),
         ("command: x, migration: {strategy: relunch, overlapp: true}, prioritty: 1",
          "unknown migration strategy 'relunch'"),
@@ -350,7 +350,7 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
         ("processes: [a]", "f.yaml:1:13: processes: each entry must be a mapping"),
         ("- {name: a}", "f.yaml:1:1: a work file is a mapping, not a list; put the list under `pr"),
         ("exec python3 robot", "f.yaml:1:1: a work file is a mapping, not text; it has `proces"),
-        ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name belongs to one"),
+        ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name is allowed in a process"),
         ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is required"),
     ],
 )

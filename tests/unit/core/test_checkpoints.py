@@ -241,7 +241,7 @@ def test_without_a_strategy_that_takes_images_there_is_no_checkpoint() -> None:
     """The refusal names the strategy to use."""
     cluster = Cluster("a").with_processes(movable("p"))
     said = cluster.checkpoint("p").message
-    assert "nothing that is selected here can checkpoint p: name `criu`" in said
+    assert "no selected strategy can checkpoint p: name `criu`" in said
 
 
 def test_a_host_without_the_capability_takes_no_image() -> None:
@@ -340,7 +340,7 @@ def test_the_record_of_a_checkpoint_names_its_requester() -> None:
     _, cluster = playing()
     cluster.ask(happened.CheckpointRequested, "p", "anna@desk:42")
     (message,) = cluster.recorded("checkpoint_begun")
-    assert message.endswith("; asked for by anna@desk:42")
+    assert message.endswith("; requested by anna@desk:42")
 
 
 @POLICIES

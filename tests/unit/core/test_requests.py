@@ -104,7 +104,7 @@ def test_a_submission_warns_of_two_nodes_of_one_name() -> None:
     reply = cluster.submit(node("q", arguments=alias))
     assert reply.message == (
         "1 process queued. Warning: q and p put the node /robot/p into the ROS graph; give each "
-        "node a name of its own"
+        "node its own name"
     )
     cluster.cancel("p", "q")
     cluster.settle()
@@ -469,7 +469,7 @@ def test_the_record_of_a_request_names_its_requester() -> None:
         record = next(record for record in cluster.records if record.kind == kind)
         assert record.message.endswith(f" (by {by})"), kind
         assert record.facts["by"] == by
-    assert cluster.recorded("migration_begun")[0].endswith(f"asked for by {by}")
+    assert cluster.recorded("migration_begun")[0].endswith(f"requested by {by}")
 
 
 def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ended() -> None:

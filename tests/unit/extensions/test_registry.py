@@ -317,7 +317,7 @@ UNCLOSABLE = SimpleNamespace(resources=[NOTHING], read=None, close=None)  # None
         (Probe("a"), "reads 'a', as 'first' does already"),
         (Probe("b", capacity=0.0), "gives 'b' a capacity of 0.0; a number above 0"),
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
-        (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
+        (Probe(*(f"r{i}" for i in range(16))), "exceeds the 16 resources"),
         (Probe(), "describes no resource; raise SkipPlugin in `create`"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
         (UNCLOSABLE, "gives 'b' a capacity of 0.0; a number above 0"),

@@ -192,7 +192,7 @@ def framed(body: bytes) -> bytes:
         (b"E" + bytes(16) + b"no json", "is invalid for"),
         (b"E" + bytes(16) + b'{"kind":"HostLeft","request":1}', "is missing"),
         (b"R" + bytes(16) + b"\xff\xff", "is invalid for"),
-        (b"E" + struct.pack("<dd", -5.0, 0.0) + b'{"kind":"TimePassed"}', "time goes back"),
+        (b"E" + struct.pack("<dd", -5.0, 0.0) + b'{"kind":"TimePassed"}', "its time is before"),
         (b"D{}", "a list of decisions"),
     ],
 )

@@ -230,7 +230,7 @@ def _assign(
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     state.record(
-        now, EventKind.ASSIGNED, f"{process.name} goes to {host.name}", process=process.name,
+        now, EventKind.ASSIGNED, f"{process.name} is assigned to {host.name}", process=process.name,
         host=host.name, facts={"number": instance.number, "decision": process.decision},
     )  # fmt: skip
     state.save(process)

@@ -2,9 +2,9 @@
 
 Several messages pass between the end of one job and the start of the next. For a job of 0.1 s that
 delay is long, so a host with `max_processes` may get one assignment more. Its slave starts that job
-without a further order as soon as a slot is free. Only the mean run time of earlier runs of a
-program shows that a running job ends soon, so a program without one is never waited for. A
-prefetched job that waits longer than expected returns to its place in the queue.
+without a further order as soon as a slot is free. A host gets it only if the mean run times of
+earlier runs show that all of its running jobs end soon. A prefetched job that waits longer than
+expected returns to its place in the queue.
 """
 
 from __future__ import annotations

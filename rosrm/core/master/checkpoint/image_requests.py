@@ -102,7 +102,7 @@ def _why_no_strategy(state: MasterState, process: Process) -> str:
     able = [f"`{name}`" for name, it in state.declared.capabilities.items() if it.state == "memory"]
     remedy = f"name {listed(able, 'or')}" if able else "install a strategy that can, and name it"
     return (
-        f"nothing that is selected here can checkpoint {process.name}: {remedy} below "
+        f"no selected strategy can checkpoint {process.name}: {remedy} below "
         f"`migration: strategies:` in the cluster's file, and start the master again"
     )
 

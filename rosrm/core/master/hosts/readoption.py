@@ -40,8 +40,8 @@ def _readopt(
     state.unqueue(process)
     again = InstanceId(process.name, left.number)
     instance = state.add_instance(again, host, now, state.estimate(process.spec))
-    # The state is set, unlike for a new assignment, so that the instance is dropped if the host
-    # does not report it.
+    # Unlike a new assignment, the instance has a state. So it is dropped if the host does not
+    # report it.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
     process.owner, process.left_behind = left.number, None
     state.set_phase(process, ProcessPhase.STARTING, now)

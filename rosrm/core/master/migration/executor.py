@@ -164,8 +164,8 @@ def _commit(state: MasterState, migration: Migration, step: Commit, now: float) 
 def _cannot_be_done(state: MasterState, migration: Migration, step: Step, now: float) -> bool:
     """Return True if a retry cannot help: the instance has ended, or its slot was given away."""
     if isinstance(step, Execute):
-        # A retry would give the same bad result. But a restore needs the result, which may show
-        # that the destination is active, so a restore stays stuck until the plugin is corrected.
+        # A retry would give the same bad result. But the result of a restore may show that the
+        # destination is active. So a restore stays stuck until the plugin is corrected.
         answer = migration.answer
         bad = answer is not None and answer.outcome is OrderOutcome.BAD_RESULT
         done = bad and migration.aim is not Aim.RESTORE
@@ -214,7 +214,7 @@ def _failed(state: MasterState, migration: Migration, step: Step, reason: str, n
         migration.stuck = True
         end = "finished" if migration.undo is None else "undone"
         process = state.processes[migration.process]
-        why = f"its {migration.aim.value} cannot be {end} yet: {reason}; the master tries again"
+        why = f"its {migration.aim.value} cannot be {end} yet: {reason}; the master retries"
         state.set_phase(process, ProcessPhase.STUCK, now, why)
         message = f"{process.name} is stuck: {why}"
         state.record(now, EventKind.MIGRATION_STUCK, message, process=process.name)
@@ -247,7 +247,7 @@ def _go_forward(state: MasterState, migration: Migration, now: float) -> None:
 def _undo_reason(state: MasterState, migration: Migration) -> str:
     """Return why a plan must be undone before its commit; "" if it need not."""
     if state.processes[migration.process].wanted is DesiredState.CANCEL:
-        return f"{migration.process} is to be cancelled"
+        return f"a cancellation of {migration.process} was requested"
     end = migration.ended.get(migration.source.number)
     if end is None:
         return ""

@@ -124,7 +124,7 @@ def why_never_movable(state: MasterState, process: Process) -> str:
         return f"{process.name} has no migration strategy; give it `migration:` in its file"
     if strategy not in state.strategies:
         return (
-            f"{process.name} wants the migration strategy {strategy!r}, which is not selected "
+            f"{process.name} names the migration strategy {strategy!r}, which is not selected "
             f"here; there are {', '.join(sorted(state.strategies)) or 'none'}"
         )
     return ""

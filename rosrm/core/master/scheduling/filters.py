@@ -30,7 +30,7 @@ class Lasts(Enum):
 
     MOMENT = "until a message or the end of a process changes it"
     RETURN = "until the slave reports to this run of the master, which is expected"
-    AWAY = "until a user or the slave brings the host back"
+    AWAY = "until the host registers or rejoins, or a user uncordons it"
     PERMANENT = "until the host registers with other labels, resources or plugins"
 
 
@@ -206,7 +206,7 @@ def _has_asked(hosts: Candidates) -> BoolArray:
 
 
 def _why_not_asked(_hosts: Candidates, _row: int) -> str:
-    return "it has not asked for work yet"
+    return "it has not requested work yet"
 
 
 # --- filters that an assignment changes -------------------------------------------------------

@@ -36,7 +36,7 @@ class HostColumns:
         capacity: (R, H) base units; NaN where a host has no such resource.
         busy: (R, H) usage + load.
         condition: (H,) HostCondition.
-        asking: (H,) the host has asked for work since its registration.
+        asking: (H,) the host has requested work since its registration.
         accepting: (H,) the host is under all its limits, by its newest reading.
         closed: (H,) cordoned or draining.
         report_due: (H,) the host was lost, and has not reported its instances since.

@@ -26,8 +26,8 @@ from rosrm.core.master.state.host_arrays import (
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.values import HostDescription
 
-#: An estimated need counts as at most this share of a host's limit, because an estimate alone must
-#: not exclude a process from every host. Declared needs have no such bound.
+#: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
+#: could exclude a process from every host. Declared needs have no such bound.
 _MOST_GUESSED: Final = 0.5
 
 
@@ -345,7 +345,7 @@ class HostTable(HostColumns):
         return "next" if sequence == newest + 1 else "after a gap"
 
     def is_accepting(self, host: Host) -> bool:
-        """Return True if a host is under all its limits and has asked for work."""
+        """Return True if a host is under all its limits and has requested work."""
         return bool(self.accepting[host.column] and self.asking[host.column])
 
 
