@@ -241,7 +241,7 @@ def test_options_that_nothing_takes_are_refused(refusal, registry, text, said):
 
 def test_a_default_plugin_that_is_not_installed_is_reported(refusal):
     said = refusal(load_cluster, "", Registry.of())
-    assert "unknown scoring policy 'weighted'. None is installed; rosrm-scoring brings" in said
+    assert "unknown scoring policy 'weighted'. None is installed; rosrm-scoring has" in said
     assert "unknown migration strategy 'relaunch'" in said
 
 

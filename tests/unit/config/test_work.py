@@ -350,7 +350,7 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
         ("processes: [a]", "f.yaml:1:13: processes: each entry must be a mapping"),
         ("- {name: a}", "f.yaml:1:1: a work file is a mapping, not a list; put the list under `pr"),
         ("exec python3 robot", "f.yaml:1:1: a work file is a mapping, not text; it has `proces"),
-        ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name is allowed in a process"),
+        ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name is allowed in"),
         ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is required"),
     ],
 )
