@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 #: Seconds from the start of the command until the message that no master answers. The command ends
 #: within 3 s, and leaving ROS takes time too.
-SAID_WITHIN: Final = 2.6
+REPORT_WITHIN: Final = 2.6
 #: Shortest time, in seconds, for finding a master, counted after the imports.
-LEAST: Final = 1.5
+SHORTEST_SEARCH: Final = 1.5
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
@@ -51,13 +51,13 @@ def note(text: str) -> None:
     typer.echo(f"rosrm: {text}", err=True)
 
 
-def say_trouble(snapshot: Listing) -> None:
+def print_trouble(snapshot: Listing) -> None:
     """Print to standard error why the master accepts no new work, if it does not."""
     if snapshot.trouble:
         note(snapshot.trouble)
 
 
 def connect(settings: RosSettings) -> MasterClient:
-    """Find the master within `SAID_WITHIN` s of the command's start, but in at least `LEAST` s."""
-    timeout = max(LEAST, SAID_WITHIN - (time.monotonic() - BEGUN))
+    """Find the master within `REPORT_WITHIN` of the start, but for at least `SHORTEST_SEARCH`."""
+    timeout = max(SHORTEST_SEARCH, REPORT_WITHIN - (time.monotonic() - BEGUN))
     return connecting.connect(settings, timeout=timeout, joined=early.take(settings), begun=BEGUN)

@@ -181,7 +181,7 @@ def _rows(
 
 
 def _write(path: Path, found: _Found, aside: Path) -> None:
-    _put_right(found)
+    _add_lost_rows(found)
     SqliteJournal(path).close()
     with contextlib.closing(sqlite3.connect(path)) as database, database:
         database.executemany(
@@ -196,7 +196,7 @@ def _write(path: Path, found: _Found, aside: Path) -> None:
     journal.close()
 
 
-def _put_right(found: _Found) -> None:
+def _add_lost_rows(found: _Found) -> None:
     """Add lost rows on which the remaining intents depend."""
     hosts = {key for table, key in found.intents if table == "host"}
     ids = [int(found.intents["host", name].get("host_id", 0)) for name in hosts]

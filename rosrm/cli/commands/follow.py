@@ -43,7 +43,7 @@ def events(  # noqa: PLR0917 - an argument for each option
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(events=True, process=process, host=host, newest=newest)
-        connection.say_trouble(snapshot)
+        connection.print_trouble(snapshot)
         if not snapshot.events:
             _check_names(client, process, host)
         console = tables.console()

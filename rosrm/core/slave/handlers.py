@@ -169,7 +169,7 @@ def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float
 def _restart_policy_set(state: SlaveState, event: events.RestartPolicySet, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is None:
-        return [_not_held(event)]
+        return [_unknown(event)]
     if held.status.state.ended:
         return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
     news = _pause_or_watch(held, event)
@@ -198,7 +198,7 @@ def _pause_or_watch(held: HeldInstance, order: events.RestartPolicySet) -> bool:
     return paused != watch.paused
 
 
-def _not_held(order: events.RestartPolicySet) -> commands.Settle:
+def _unknown(order: events.RestartPolicySet) -> commands.Settle:
     never = f"{order.instance} is not known here: it never ran on this host, or ended long ago"
     return commands.Settle(order.instance, order.restart, never)
 
@@ -262,7 +262,7 @@ def _amend_again(
     """Return the command that repeats an order, because the former supervisor may have lost it."""
     if held.status.state.ended:
         return commands.Settle(order.instance, order.restart)
-    return _not_held(order) if lost else commands.Amend(order.instance, order.restart)
+    return _unknown(order) if lost else commands.Amend(order.instance, order.restart)
 
 
 def _follow(

@@ -55,10 +55,10 @@ def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Com
     """
     commands = [command for event in events for command in step(state, event, now)]
     return [
-        _still_held(state, command) if isinstance(command, Launch) else command
+        _without_dropped(state, command) if isinstance(command, Launch) else command
         for command in commands
     ]
 
 
-def _still_held(state: SlaveState, launch: Launch) -> Launch:
+def _without_dropped(state: SlaveState, launch: Launch) -> Launch:
     return Launch(tuple(one for one in launch.assignments if one.instance in state.held))

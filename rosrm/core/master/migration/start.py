@@ -203,7 +203,7 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
             plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
         except ValueError as reason:  # by its contract: the strategy cannot move this process
             return _no_plan(name, describe_fault(reason))
-        fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
+        fault = plan_fault(plan, move, aim) or _executor_fault(state, name, plan)
         if fault:
             raise PluginError(f"an unsound plan: {fault}")
         return checked(plan, "plan")  # the plan is written to the journal
@@ -218,7 +218,7 @@ def _no_plan(strategy: str, reason: str) -> Rejected:
     return Rejected(f"the migration strategy {strategy!r} gave no plan: {reason}")
 
 
-def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
+def _executor_fault(state: MasterState, name: str, plan: Plan) -> str:
     """Return a sentence on an executor of a plan that its strategy's offer lacks; "": none."""
     own = state.declared.executors.get(name)
     images = [step.image for step in plan.steps if isinstance(step, Commit) and step.image]

@@ -74,7 +74,9 @@ class _Labels(_PerHost[Mapping[str, str]]):
         return MappingProxyType(dict(host.description.labels))
 
 
-def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:
+def checked_scores(
+    scores: Scores, hosts: HostView, fits: BoolArray
+) -> tuple[FloatArray, BoolArray | None]:
     """Return value and veto of a policy's answer; raise PluginError if it breaks the contract."""
     size = len(fits)
     required(scores, Scores)

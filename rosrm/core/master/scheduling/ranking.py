@@ -24,7 +24,7 @@ from rosrm.core.master.scheduling.filters import (
     passing,
     refusals,
 )
-from rosrm.core.master.scheduling.host_views import host_view, process_view, sound
+from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
@@ -190,8 +190,9 @@ class Ranking:
         name, policy = self._left[0]
         try:
             value, veto = self.plugins.ask(
-                "scoring", name, "score", lambda: sound(policy.score(hosts, process), hosts, fits)
-            )
+                "scoring", name, "score",
+                lambda: checked_scores(policy.score(hosts, process), hosts, fits),
+            )  # fmt: skip
         except PluginError as error:
             self._leave_out(error)
             return None
