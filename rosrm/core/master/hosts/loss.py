@@ -1,4 +1,4 @@
-"""Loss of a host, its processes' fate by `host_loss`, and its rejoin.
+"""Loss and rejoin of a host, and the treatment of its instances.
 
 A detached host, whose slave was stopped and left processes running, counts as lost when its lease
 has passed: no process of it may start elsewhere sooner than after a loss.
@@ -13,7 +13,7 @@ possible owner             as the owner: the destination of a migration that may
 cancelled                  tracked until its host reports its end or is pruned; with `elsewhere` and
                            `isolation: stop` given up after `delay`, when its fence has ended it
 being restored             never given up, because its memory is on that host alone
-other                      given up at once: a former source, a shadow
+other                      given up at once, for example a former source or a shadow
 =========================  ======================================================================
 
 An instance that is given up may still run while its host is silent; `readoption` handles it then.
