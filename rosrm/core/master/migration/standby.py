@@ -10,7 +10,7 @@ runs without standby    a standby is started as a shadow, on another host that h
 standby starts          `state_config` names primary and standby, until the standby is READY
 standby has failed      the standby is stopped; another one starts after a delay that doubles
 is in back-off          the primary is stopped for good, and the standby takes over
-migrates                the standby stays until the migration is committed, which may fail
+migrates                the standby stays until the commit, because the migration may fail
 has ended               the standby is stopped
 ======================  =====================================================================
 """

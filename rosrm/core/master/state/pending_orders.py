@@ -51,7 +51,7 @@ class PeriodicCheckpoint:
 
 Purpose = MigrationStep | ImageRemoval | Replication | CapabilityQuery | PeriodicCheckpoint
 
-#: Purposes with an own series of numbers, because they depend on optional plugins: a replay without
+#: Purposes with their own series of numbers, because they depend on optional plugins: a replay without
 #: such a plugin must give all other orders the same numbers.
 _SERIES: Final[dict[type, Literal["replication", "capability", "periodic"]]] = {
     Replication: "replication",
