@@ -51,8 +51,8 @@ class PeriodicCheckpoint:
 
 Purpose = MigrationStep | ImageRemoval | Replication | CapabilityQuery | PeriodicCheckpoint
 
-#: Purposes with their own series of numbers, because they depend on optional plugins: a replay without
-#: such a plugin must give all other orders the same numbers.
+#: Purposes with their own series of numbers, because they depend on optional plugins: a replay
+#: without such a plugin must give all other orders the same numbers.
 _SERIES: Final[dict[type, Literal["replication", "capability", "periodic"]]] = {
     Replication: "replication",
     CapabilityQuery: "capability",
