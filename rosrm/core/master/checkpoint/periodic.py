@@ -3,7 +3,7 @@
 ==================================  ==========================================================
 observed                            ordered
 ==================================  ==========================================================
-a process requests them, and runs   `execute` of its strategy's step, at the policy's pace
+a process requests them, and runs   `RunExecutor` of its strategy's step, at the policy's pace
 a dump fails                        recorded once, and retried at the same pace
 an instance with images is gone     its images are removed from its host
 ==================================  ==========================================================
