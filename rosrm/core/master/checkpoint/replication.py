@@ -138,7 +138,6 @@ def review(state: MasterState, now: float) -> None:
         name = known.waiting.pop()
         process = state.processes.get(name)
         if process is None:
-            known.last_orders.pop(name, None)
             _drop_removed(state, name, now)
         else:
             _review(state, process, now)
