@@ -313,6 +313,13 @@ def test_old_events_are_pruned(opened) -> None:
     assert opened(keep_events=50).last_sequence == 2500
 
 
+def test_the_events_of_many_short_runs_are_pruned(opened) -> None:
+    for _ in range(5):
+        with contextlib.closing(opened(keep_events=50)) as journal:
+            journal.write([Record("n")] * 100, [], 0.0)
+    assert len(opened().records(newest=10**6)) == 50
+
+
 def test_damaged_facts_of_an_event_hide_no_other(path, opened) -> None:
     """Facts are information for users only, and the event shows the damage."""
     fill(path)
