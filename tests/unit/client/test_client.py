@@ -84,6 +84,19 @@ def test_events_follow_until_their_time_out(client, master, monkeypatch):
     assert [one.sequence for one in following] == [1, 2, 3]
 
 
+def test_followed_events_are_complete(client, master, monkeypatch):
+    """More events than one listing has by default may follow between two requests."""
+    many = [event(number) for number in range(3, 2003)]
+
+    def later(seconds):
+        master.events += many
+        many.clear()
+
+    monkeypatch.setattr("time.sleep", later)
+    following = client.events(follow=True, timeout=0.2)
+    assert [one.sequence for one in following] == list(range(1, 2003))
+
+
 def test_events_that_are_not_followed_do_not_wait_for_a_master(client, master):
     master.fails = NoMaster("no answer")
     with pytest.raises(NoMaster):
