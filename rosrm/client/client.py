@@ -60,6 +60,7 @@ class Client:
     Raises:
         NoMaster: no master answered in time.
         Refused: the master is of another version.
+        ConfigError: ROS cannot use a setting, or `cluster` is wrong.
         RosrmError: ROS 2 cannot be imported.
     """
 
