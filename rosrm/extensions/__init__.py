@@ -1,7 +1,7 @@
 """Plugins: contracts, hooks, and the registry of installed plugins.
 
 hookspecs.py         every hook, in one list
-contracts.py         Protocols of probes, policies, strategies and ports, and their offers
+contracts.py         Protocols of probes, policies, strategies and launchers, and their offers
 options.py           the options of a process, merged over those of the cluster
 units.py             numbers with units in options
 installed.py         the installed plugins, as entry points

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import JournalBlocked, JournalError
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record
 from rosrm.runtime.disk_space import room_for
 from rosrm.wording import counted
 

@@ -15,9 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record, StoredRecord
 
 #: Version of the tables; a file with another version is refused.
 SCHEMA: Final = 1

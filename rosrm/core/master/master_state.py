@@ -27,12 +27,13 @@ from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.replicas import ReplicationState
-from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
+from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 

@@ -14,9 +14,9 @@ from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.images import UnwantedImage
 from rosrm.core.master.state.process import WAITING
-from rosrm.extensions.contracts import Intent
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.codec import to_plain
+from rosrm.model.records import Intent
 from rosrm.model.values import ProcessSpec
 from tests.unit.core.cluster import Eq1
 

@@ -14,8 +14,8 @@ import textwrap
 import pytest
 
 from rosrm.errors import JournalBlocked, JournalError
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.records import Intent, Record
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ WRITER = """
     import sys
     from pathlib import Path
     from rosrm.journal.sqlite import SqliteJournal
-    from rosrm.extensions.contracts import Intent, Record
+    from rosrm.model.records import Intent, Record
 
     journal = SqliteJournal(Path(sys.argv[1]))
     number = 0
@@ -229,7 +229,7 @@ def test_a_full_disk_is_reported(path, opened) -> None:
         from pathlib import Path
         from rosrm.errors import JournalError
         from rosrm.journal.sqlite import SqliteJournal
-        from rosrm.extensions.contracts import Intent, Record
+        from rosrm.model.records import Intent, Record
 
         journal = SqliteJournal(Path(sys.argv[1]))
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
