@@ -287,6 +287,10 @@ class PeriodicImaging(Protocol):
         """
 
 
+#: Function on a slave that an `Execute` step calls: arguments and answer are JSON objects.
+Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+
+
 @dataclass(frozen=True)
 class Capabilities:
     """Declares what a migration strategy can do for a process; by default it only moves it.
@@ -324,9 +328,7 @@ class MigrationOffer:
     create: Callable[[Any], MigrationStrategy]
     options: type[Any] = NoOptions
     summary: str = ""
-    executors: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any]]] = field(
-        default_factory=lambda: EMPTY
-    )
+    executors: Mapping[str, Executor] = field(default_factory=lambda: EMPTY)
     own_options: type[Any] | None = None
     capabilities: Capabilities | Callable[[Any], Capabilities] = Capabilities()
 

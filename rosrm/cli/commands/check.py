@@ -96,7 +96,7 @@ def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
     A probe that reports itself absent is no failure, because the file may be for another host.
     """
     from rosrm.extensions.contracts import ProbeContext
-    from rosrm.extensions.registry import FailedProbe, close_quietly
+    from rosrm.extensions.made import FailedProbe, close_quietly
     from rosrm.slave.sessions import SessionTable
 
     context = ProbeContext(host.scope, host.budget, host.state, SessionTable())

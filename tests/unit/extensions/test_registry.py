@@ -19,7 +19,8 @@ from rosrm.extensions.contracts import (
     ScoringOffer,
 )
 from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import FailedProbe, Probes, Registry
+from rosrm.extensions.made import FailedProbe, Probes
+from rosrm.extensions.registry import Registry
 from rosrm.model.values import Reading, ResourceDescription
 from tests.plugin_kit import plugin, registry_of
 
