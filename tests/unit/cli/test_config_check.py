@@ -68,7 +68,7 @@ def test_the_kind_of_a_right_file_is_known_by_its_keys(check, text, said):
     ],
 )
 def test_the_standard_input_is_checked(rosrm, monkeypatch, text, said):
-    """It is read once only: first for its kind, then for its content."""
+    """One read must do for the kind of the file and for its content."""
     stdin = SimpleNamespace(buffer=io.BytesIO(text.encode()))
     monkeypatch.setattr("rosrm.config.documents.sys", SimpleNamespace(stdin=stdin))
     assert said in rosrm("config", "check", "-").out
