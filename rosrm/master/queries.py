@@ -10,8 +10,8 @@ from typing import Any, Final
 from rosrm.core.master import listing
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
-from rosrm.extensions.contracts import StoredRecord
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.records import StoredRecord
 from rosrm.model.rows import EventRow, Listing, PluginRow
 
 _DEFAULT_EVENTS: Final = 1000

@@ -31,14 +31,7 @@ from rosrm.core.master.reducer import step
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Instance
 from rosrm.errors import JournalBlocked, Refused
-from rosrm.extensions.contracts import (
-    CheckpointPolicy,
-    Intent,
-    MigrationStrategy,
-    Record,
-    ScoringPolicy,
-    StoredRecord,
-)
+from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
@@ -47,6 +40,7 @@ from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.master.endpoint import MasterEndpoint

@@ -4,6 +4,7 @@ values.py               processes, hosts, instances, resources
 plan.py                 plans of migrations: steps, undo, commit
 orders.py               orders of the master to a slave
 event_kinds.py          the kinds of events in the event record
+records.py              records and intents, and the contract of a journal
 rows.py                 the rows of listings
 ros_settings.py         how a part joins the ROS graph
 codec.py                values as JSON

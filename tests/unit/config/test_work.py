@@ -162,6 +162,8 @@ def test_braces_are_plain_without_foreach(file):
         ("{i: range(0)}", "n{i}", "f.yaml:1:37: foreach: makes no process"),
         ("{i: 'range(0,5,0)'}", "n{i}", "f.yaml:1:41: foreach.i: a step of 0"),
         ("{i: range(10001)}", "n{i}", "foreach: makes more than 10000 processes"),
+        (f"{{i: range({'9' * 5000})}}", "n{i}", "foreach.i: a list or range(first, end) is requi"),
+        ("{i: [-1]}", "n{i:c}", "'n{i:c}': 'c' is no format for -1"),
         (
             "{i: 5}",
             "n{i}",

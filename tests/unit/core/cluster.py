@@ -27,7 +27,7 @@ from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.process import Process
 from rosrm.core.slave import events
-from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
+from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.registry import Registry
@@ -45,6 +45,7 @@ from rosrm.model.plan import (
     Start,
     Stop,
 )
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import (
     EMPTY,
     InstanceStatus,

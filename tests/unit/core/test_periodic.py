@@ -134,6 +134,19 @@ def test_the_first_checkpoint_is_recorded_and_explained():
     assert 0.0 <= told["elapsed"] <= 11.0
 
 
+@pytest.mark.parametrize(
+    "number", [float("inf"), float("nan"), pytest.param(10**400, id="huge"), -1, "big"]
+)
+def test_a_strange_number_in_a_result_counts_as_zero(number):
+    """A plugin's executor may answer anything that JSON can hold, and the master continues."""
+    host = Host()
+    host.answer = {"size": number, "seconds": {"dump": number}}
+    cluster = running(Pacing(), host)
+    cluster.wait(15.0)
+    assert cluster.explain("p")["checkpoint"]["size"] == 0
+    assert len(cluster.recorded("periodic_checkpoint")) == 1
+
+
 def test_a_failed_checkpoint_is_recorded_once_and_retried():
     """The record of the next success follows, too."""
     host = Host()

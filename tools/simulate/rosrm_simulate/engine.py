@@ -25,9 +25,10 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.slave.events import AssignmentsReceived, TimePassed
-from rosrm.extensions.contracts import Intent, MigrationStrategy, Record
+from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.model.orders import seconds_of
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, Assignment
 from rosrm_simulate.agenda import Agenda
 from rosrm_simulate.machine import Machine
