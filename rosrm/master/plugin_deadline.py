@@ -19,11 +19,11 @@ class Deadlines:
     """Deadline for each call of each plugin.
 
     The core treats a late call like any other failure, and decides without the plugin. A plugin
-    that was late is not called again for a while. Otherwise the master would wait for the plugin
-    at every reading, and have no time for its slaves.
+    that was late is not called again for a while. Otherwise the master would wait for the plugin at
+    every reading, and neglect its slaves.
 
     Args:
-        seconds: for one call.
+        seconds: time limit of one call.
         pause: seconds for which a plugin is not called after a late call.
 
     Attributes:
@@ -51,7 +51,9 @@ class Deadlines:
                 fault_text = describe_plugin_fault(fault)
                 self._late[plugin] = (self._late[plugin][0], fault_text)
             raise
-        except KeyboardInterrupt as fault:  # of the plugin: Ctrl-C raises nothing in a master
+        except (
+            KeyboardInterrupt
+        ) as fault:  # raised by the plugin: in a master Ctrl-C raises nothing
             raise PluginError(describe_plugin_fault(fault)) from fault
         finally:
             self.spent += time.monotonic() - began
