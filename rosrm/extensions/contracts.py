@@ -236,7 +236,7 @@ class HostChecking(Protocol):
     """A migration strategy that does not work on every host, or not between all of them."""
 
     @property
-    def ability(self) -> str:
+    def host_check(self) -> str:
         """Return the executor that checks on a host that the strategy works there.
 
         The core runs it once after each registration of a host, without arguments. It answers with

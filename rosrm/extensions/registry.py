@@ -276,9 +276,9 @@ class Registry:
         return made
 
     def _check_executors(self, name: str, strategy: object) -> None:
-        """Refuse a strategy whose `ability` or `discard` is no executor of its own offer."""
+        """Refuse a strategy whose `host_check` or `discard` is no executor of its own offer."""
         own = self._strategy(name).executors
-        for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
+        for kind, named in ((HostChecking, "host_check"), (PeriodicImaging, "discard")):
             fault = ""
             try:
                 if implements(strategy, kind) and (executor := getattr(strategy, named)) not in own:

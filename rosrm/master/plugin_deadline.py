@@ -51,9 +51,7 @@ class Deadlines:
                 fault_text = describe_plugin_fault(fault)
                 self._late[plugin] = (self._late[plugin][0], fault_text)
             raise
-        except (
-            KeyboardInterrupt
-        ) as fault:  # raised by the plugin: in a master Ctrl-C raises nothing
+        except KeyboardInterrupt as fault:  # of the plugin: Ctrl-C raises nothing in a master
             raise PluginError(describe_plugin_fault(fault)) from fault
         finally:
             self.spent += time.monotonic() - began

@@ -270,7 +270,7 @@ class NodeEntities:
                     self._catch_up(one)
 
     def input_with_gap(self) -> str:
-        """Return an input that needs every message and has lost one for good; "" if there is none."""
+        """Return an input that has lost a message and needs every one; "" if there is none."""
         wanting = (one for one in self.inputs if one.buffered and one.wants_all)
         return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
 

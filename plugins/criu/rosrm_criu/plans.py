@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rosrm_criu.options import CriuOptions
 
 #: Executors of a migration; see `executors/move.py`.
-ABILITY: Final = "criu_ability"
+HOST_CHECK: Final = "criu_host_check"
 INTRODUCE: Final = "criu_introduce"
 CHECKPOINT: Final = "criu_checkpoint"
 GO_ON: Final = "criu_go_on"

@@ -17,7 +17,7 @@ Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 #: Function of each step, below `rosrm_criu.executors`.
 EXECUTORS: Final = {
-    plans.ABILITY: "move.report_capability",
+    plans.HOST_CHECK: "move.report_capability",
     plans.INTRODUCE: "move.introduce",
     plans.CHECKPOINT: "move.checkpoint",
     plans.GO_ON: "move.go_on",

@@ -1,4 +1,4 @@
-"""Destination of a handoff: follows the source's state, becomes active when the source is silent."""
+"""Destination of a handoff: follows the source's state until it takes over."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ class Destination:
             self._channel.report(HandoffReport.SWITCHING, self._sequence())
 
     def _is_last(self, cut: Cut) -> bool:
-        """Return True for the last state of this handoff; that of an earlier one may be latched too."""
+        """Return True for the last state of this handoff; an earlier one may be latched too."""
         return bool(cut.mark.last) and cut.mark.sequence == self._silent_at
 
     def _sequence(self) -> int:

@@ -189,7 +189,10 @@ class HandoffSource:
         self._release_timer = steady_timer(entities.plain, _LOOK, self._release)
 
     def _release(self) -> None:
-        """Report RELEASED when all outputs are acknowledged, or after the time-out. | |        Outputs without an acknowledgement are lost when the process stops.
+        """Report RELEASED when all outputs are acknowledged, or after the time-out.
+
+        An output without an acknowledgement is lost when the process stops.
+        """
         with self._entities.turn:
             received = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
             if received or time.monotonic() - self._silent_since >= _ACK_PATIENCE:

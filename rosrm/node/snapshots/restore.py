@@ -28,7 +28,7 @@ _REMEDY: Final = (
 
 
 def newest_snapshot(identity: NodeIdentity) -> tuple[Listing | None, list[str]]:
-    """Return a process's newest snapshot (None without one), and the faults of its damaged files."""
+    """Return a process's newest snapshot, None without one, and faults of damaged files."""
     if identity.shadow or not identity.keep:
         return None, []
     return newest(Path(identity.keep), up_to=identity.instance)

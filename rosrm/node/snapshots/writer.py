@@ -195,7 +195,7 @@ class _Writer:
             self._slots.close()
 
     def _write(self, sequence: int, blocks: Sequence[Block]) -> bool:
-        """Write a snapshot; return False, which ends the thread, if a newer instance writes there."""
+        """Write a snapshot; return False, to end the thread, if a newer instance writes there."""
         identity = self._entities.identity
         try:
             if self._slots is None:

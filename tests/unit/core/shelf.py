@@ -17,7 +17,7 @@ PATIENCE = 5.0
 class Freezer(StartFirstOrStopFirst):
     """Strategy that moves like `relaunch` and takes checkpoint images."""
 
-    ability = "can_freeze"
+    host_check = "can_freeze"
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         return ""

@@ -94,6 +94,32 @@ def test_the_process_that_leaves_uses_the_exceeded_resource() -> None:
     assert (cluster.where("busy"), cluster.where("fat")) == (["b"], ["a"])
 
 
+def test_a_resource_that_no_process_can_relieve_does_not_block_another() -> None:
+    """A host over its limits of memory and cpu: the user of cpu leaves if the others cannot."""
+    cluster = on_a({"busy": 10})
+    cluster.submit(process("fixed"))
+    cluster.machines["a"].shown["busy"] = {"memory": 0.0, "cpu": 1.0}
+    cluster.machines["a"].shown["fixed"] = {"memory": 400 * MIB, "cpu": 0.0}
+    cluster.add(machine("b"))
+    cluster.wait(0.3)
+    cluster.machines["a"].busy.update(memory=0.6, cpu=0.7)
+    cluster.wait(3.0)
+    assert (cluster.where("busy"), cluster.where("fixed")) == (["b"], ["a"])
+
+
+def test_the_time_over_a_limit_does_not_grow_while_a_host_is_silent() -> None:
+    """The hysteresis begins again with the first reading after the silence."""
+    cluster = on_a({"p": 300}, machine("b"), hysteresis=2.0)
+    cluster.machines["a"].busy["memory"] = 0.6
+    cluster.wait(0.5)
+    cluster.cut("a", seconds=2.0)
+    cluster.reconnect("a")
+    cluster.wait(1.0)
+    assert cluster.where("p") == ["a"]
+    cluster.wait(2.0)
+    assert cluster.where("p") == ["b"]
+
+
 def test_the_process_that_leaves_fits_at_the_destination() -> None:
     """The largest process that fits leaves; a destination keeps its headroom below the limit."""
     cluster = on_a({"large": 300, "small": 100}, headroom=0.05)

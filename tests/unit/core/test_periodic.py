@@ -46,7 +46,7 @@ class Host:
         self.sweeps = 0
         self.answer: Any = {"size": 5000, "seconds": {"prepare": 0.1, "dump": 0.2, "join": 0.3}}
         executors = {
-            "criu_ability": lambda _: {**HOST_FACTS, "host": name, "no_transfer": ""},
+            "criu_host_check": lambda _: {**HOST_FACTS, "host": name, "no_transfer": ""},
             "criu_dump": self._dump, "criu_sweep": self._sweep,
         }  # fmt: skip
         self.machine = Machine(name, executors=executors)
@@ -110,6 +110,17 @@ def test_the_policy_gets_the_cost_of_the_last_checkpoint():
     made = len(host.dumps)
     cluster.wait(100.0)
     assert len(host.dumps) == made
+
+
+@pytest.mark.parametrize("size", [float("nan"), float("inf"), -1, 10**400, "5", None])
+def test_a_size_that_is_no_number_counts_as_unknown(size: object):
+    """JSON may hold integers that no float can; the master is not ended by them."""
+    host, policy = Host(), Pacing()
+    host.answer = {"size": size, "seconds": {"dump": 0.2}}
+    cluster = running(policy, host)
+    cluster.wait(25.0)
+    assert len(host.dumps) >= 2
+    assert policy.views[-1].size == 0
 
 
 @pytest.mark.parametrize("spec", [portable(None), portable(0.0)])

@@ -64,6 +64,18 @@ def test_a_process_gets_a_standby_on_another_host() -> None:
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 1)
 
 
+def test_standbys_begin_in_the_order_of_submission() -> None:
+    """A replay of the same events, in another process, gives the same orders."""
+    cluster = Cluster("a", "b")
+    cluster.wait(0.5)
+    names = [f"p{number}" for number in (3, 1, 4, 5, 9, 2, 6)]
+    cluster.submit(*(stateful(name, standby=STANDBY) for name in names))
+    cluster.wait(30.0)
+    ready = [f"the standby of {name} is ready on" for name in names]
+    recorded = cluster.recorded("standby_ready")
+    assert [line.rpartition(" ")[0] for line in recorded] == ready
+
+
 def test_a_standby_waits_for_a_second_host_with_one_record() -> None:
     """The process itself keeps running."""
     cluster = Cluster("a").with_processes(stateful(standby=STANDBY))

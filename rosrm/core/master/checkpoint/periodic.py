@@ -3,7 +3,7 @@
 ==================================  ==========================================================
 observed                            ordered
 ==================================  ==========================================================
-a process requests them, and runs   `execute` of its strategy's step, at the policy's pace
+a process requests them, and runs   `RunExecutor` of its strategy's step, at the policy's pace
 a dump fails                        recorded once, and retried at the same pace
 an instance with images is gone     its images are removed from its host
 ==================================  ==========================================================
@@ -39,6 +39,8 @@ from rosrm.wording import size
 _LOOK_EVERY: Final = 1.0
 #: Seconds for a removal.
 _PATIENCE: Final = 30.0
+#: Upper bound of numbers in results, because JSON may hold integers that no float can.
+_MOST: Final = 1e18
 
 
 def review(state: MasterState, now: float) -> None:
@@ -203,7 +205,8 @@ def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now
 
 
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else 0.0
+    """Return a number of an executor's result; 0.0 for anything else, NaN and infinity too."""
+    return float(value) if isinstance(value, int | float) and 0 <= value < _MOST else 0.0
 
 
 def _record_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:

@@ -7,15 +7,16 @@ reviewed about once a second.
 ==========================================  =====================================================
 observed                                    ordered
 ==========================================  =====================================================
-it runs, and the policy chooses hosts       `keep`: its slave ships the snapshot to them from now
-                                            on, beginning with the first of this instance
-its slave has an older choice               `keep`: the new choice
+it runs, and the policy chooses hosts       `ReplicateSnapshot`: the slave sends snapshots to them,
+                                            beginning with the first of this instance
+its slave has an older choice               `ReplicateSnapshot`: the new choice
 it runs, and the policy gives no answer     as it chose last; where it has not chosen since the
-                                            master started, `keep` on the hosts with a replica
-it is cancelled, or has finished            `drop_kept` of every replica
-it was submitted again                      `drop_kept` of the replicas from before
-it was removed, by the journal              `drop_kept` of every replica
-a host that is not chosen has a replica     `drop_kept`, once a newer one lies where it should;
+                                            master started, `ReplicateSnapshot` to the hosts with
+                                            a replica
+it is cancelled, or has finished            `DropReplica` for every replica
+it was submitted again                      `DropReplica` for those from before
+it was removed, by the journal              `DropReplica` for every replica
+a host that is not chosen has a replica     `DropReplica`, once a newer one lies where it should;
                                             never before the policy has chosen
 ==========================================  =====================================================
 
@@ -137,7 +138,6 @@ def review(state: MasterState, now: float) -> None:
         name = known.waiting.pop()
         process = state.processes.get(name)
         if process is None:
-            known.last_orders.pop(name, None)
             _drop_removed(state, name, now)
         else:
             _review(state, process, now)

@@ -3,10 +3,10 @@
 =============================  ==============================================================
 a host                         action
 =============================  ==============================================================
-is up, and was not asked       `execute` of the strategy's executor
+is up, and was not asked       `RunExecutor` with the strategy's `host_check`
 has answered                   its answer holds until it registers again
 did not answer                 it is asked again after a while
-the plugin's `ability` fails   the plugin is asked again after a while
+`host_check` cannot be read    the plugin is asked again after a while
 =============================  ==============================================================
 
 Nothing of this is durable. Until a host has answered, nothing is moved to or from it.
@@ -55,10 +55,10 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
     state.capability_answers[name, host.name] = answer
     try:
         executor = state.plugins.ask(
-            "migration", name, "ability", lambda: required(strategy.ability, str)
+            "migration", name, "host_check", lambda: required(strategy.host_check, str)
         )
     except PluginError as error:
-        answer.reason = f"its ability is not known: {error}"
+        answer.reason = f"its host check is not known: {error}"
         return
     if executor not in host.description.executors:
         # Asked again, because the slave reports broken plugins only after its registration.
