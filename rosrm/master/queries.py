@@ -22,12 +22,12 @@ class MasterQueries:
 
     Args:
         master: name of the master.
-        state: of its core.
+        state: the state of the master's core.
         journal: holds the events.
         plugins: rows of `rosrm plugins` for the master's own plugins.
         uptime: returns the seconds since the master's start.
         core_now: returns the time of the core's clock.
-        trouble: returns the reason why the master accepts no new work; "": it does.
+        trouble: returns the reason why the master accepts no new work; "" if it accepts work.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ EXECUTORS: Final = {
     plans.KILL: "checkpoint.kill",
     plans.TAKE: "checkpoint.take",
     plans.PUT_BACK: "checkpoint.put_back",
-    plans.AWAIT_KEPT: "checkpoint.await_kept",
+    plans.AWAIT_CHECKPOINT: "checkpoint.await_checkpoint",
     plans.DROP: "checkpoint.drop",
     plans.DUMP: "periodic.dump",
     plans.SWEEP: "periodic.sweep",

@@ -422,12 +422,12 @@ class Cluster(World[Machine]):
         """Deliver all messages between the master and a host; return True if there were any."""
         if not machine.connected:
             return False
-        busy = bool(machine.polled or machine.ordered or machine.said)
+        busy = bool(machine.polled or machine.ordered or machine.status_batches)
         machine.fetch(self.now)
         while machine.ordered:
             self.tell(machine.obey(machine.ordered.popleft(), self.now))
-        while machine.said:
-            self.tell(machine.said.popleft())
+        while machine.status_batches:
+            self.tell(machine.status_batches.popleft())
         return busy
 
     def nodes_talk(self, *, heard: bool = True) -> bool:

@@ -110,7 +110,7 @@ class Shelf:
             answer = task(arguments) or {}
             if name in self.mute:
                 self.mute -= {name} if self.passing else set()
-                raise RuntimeError("nothing was heard")
+                raise RuntimeError("no answer")
             return answer
 
         return execute

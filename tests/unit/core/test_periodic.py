@@ -46,7 +46,7 @@ class Host:
         self.sweeps = 0
         self.answer: Any = {"size": 5000, "seconds": {"prepare": 0.1, "dump": 0.2, "join": 0.3}}
         executors = {
-            "criu_ability": lambda _: {**HOST_FACTS, "host": name, "no_transfer": ""},
+            "criu_host_check": lambda _: {**HOST_FACTS, "host": name, "no_transfer": ""},
             "criu_dump": self._dump, "criu_sweep": self._sweep,
         }  # fmt: skip
         self.machine = Machine(name, executors=executors)

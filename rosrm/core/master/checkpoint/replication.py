@@ -113,7 +113,7 @@ def note_answer(state: MasterState, process: str, event: happened.OrderAnswered)
 # --- requests -------------------------------------------------------------------------------
 
 
-def begin_anew(state: MasterState, process: Process) -> None:
+def drop_former_replicas(state: MasterState, process: Process) -> None:
     """Start a terminal process without its past: discard its snapshots if finished or cancelled."""
     if process.phase in _DONE:
         process.born = state.next_instance
