@@ -19,7 +19,7 @@ A plugin marks its hooks with `hookimpl` and returns offers::
     def register_scoring_policies():
         return [ScoringOffer(name="fewest", create=Fewest, options=FewestOptions)]
 
-The public names by purpose:
+The public names, by purpose:
 
 Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
@@ -152,7 +152,7 @@ if TYPE_CHECKING:
         StopPolicy,
     )
 
-# Written out, for the tools that read this file and do not run it. A test compares the three lists.
+# Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
     "PROTOCOL_VERSION", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
@@ -209,7 +209,7 @@ _MODULES: Final = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name at its first use."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module  # noqa: PLC0415 - `import rosrm` has no use for it

@@ -10,23 +10,23 @@ _LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy"})
 
 
 class RosrmError(Exception):
-    """An error for the user: its text is the whole message, and no traceback is shown."""
+    """Error for the user: its text is the whole message, and no traceback is shown."""
 
     exit_code = 1
 
 
 class ConfigError(RosrmError):
-    """A file or an option that cannot be accepted; nothing of it was used."""
+    """A file or an option is invalid; none of its values were used."""
 
     exit_code = 2
 
 
 class PluginError(RosrmError):
-    """A plugin that cannot be imported, raises, hangs or returns an invalid value."""
+    """A plugin cannot be imported, raised, hung or returned an invalid value."""
 
 
 class Refused(RosrmError):
-    """A valid request that was refused; nothing was changed.
+    """A valid request was refused; nothing was changed.
 
     Args:
         message: cause, place, allowed values and remedy.
@@ -45,7 +45,7 @@ class NoMaster(RosrmError):
 
 
 class LaunchError(RosrmError):
-    """A process cannot be started on this host.
+    """A process cannot be started on this host; the text gives the reason.
 
     The first line is the reason; further lines have details, such as the PATH.
     """
@@ -78,18 +78,18 @@ class LabError(RosrmError):
 
 
 class CriuError(RosrmError):
-    """This host has no working CRIU, or CRIU could not dump or restore."""
+    """CRIU does not work on this host, or failed to dump or restore; the text gives the reason."""
 
 
 class PortableError(RosrmError):
-    """A node does not accept or execute a request to leave or rejoin the ROS graph."""
+    """A portable node cannot be asked to leave or rejoin the ROS graph, or does not do so."""
 
 
 class SkipPlugin(Exception):
-    """A plugin is absent on this host; its `create` raises this with the reason."""
+    """Raised by a plugin's `create` if it is absent on this host; the text gives the reason."""
 
 
-# --- exceptions of plugins --------------------------------------------------------------------
+# --- exceptions of plugins ----------------------------------------------------------------------
 
 
 def describe_fault(fault: BaseException) -> str:
@@ -113,7 +113,7 @@ def describe_plugin_fault(fault: BaseException) -> str:
 
 
 def place_in_rosrm(fault: BaseException) -> str:
-    """Return file and line of the innermost frame of rosrm itself; "" if there is none."""
+    """Return file and line of the innermost frame of rosrm; "" if there is none."""
     return _innermost(_frames(fault), "rosrm")
 
 

@@ -180,7 +180,7 @@ def _note(
         problems.add(target.key_place or target.place, note)
         return
     prefix = _named(path, where)
-    problems.add(target.place, (f"{prefix}: " if prefix else "") + _message(error))
+    problems.add(target.place, (f"{prefix}: " if prefix else "") + _message_of(error))
 
 
 def _named(path: tuple[str | int, ...], where: str) -> str:
@@ -191,7 +191,7 @@ def _named(path: tuple[str | int, ...], where: str) -> str:
     return ": ".join(part for part in (where, text) if part)
 
 
-def _message(error: Mapping[str, Any]) -> str:
+def _message_of(error: Mapping[str, Any]) -> str:
     kind, given = error["type"], error.get("input")
     if kind == "value_error":
         return _cause(error["ctx"]["error"], error["loc"])

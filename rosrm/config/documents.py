@@ -136,7 +136,7 @@ def parse(text: str, file: str) -> Node:
         root = _Loader(text).get_single_node()
         return Node({}, Place(file, 1, 1)) if root is None else _Builder(file).build(root)
     except yaml.MarkedYAMLError as error:
-        raise ConfigError(f"{_place_of(error, file)}: unreadable YAML: {_message(error)}") from None
+        raise ConfigError(f"{_place_of(error, file)}: unreadable YAML: {_text_of(error)}") from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         column = error.position - (text.rfind("\n", 0, error.position) + 1) + 1
@@ -187,7 +187,7 @@ def _place_of(error: yaml.MarkedYAMLError, file: str) -> Place:
     return Place(file, mark.line + 1, mark.column + 1) if mark else Place(file, 1, 1)
 
 
-def _message(error: yaml.MarkedYAMLError) -> str:
+def _text_of(error: yaml.MarkedYAMLError) -> str:
     return " ".join(part for part in (error.context, error.problem) if part)
 
 

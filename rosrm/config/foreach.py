@@ -25,7 +25,9 @@ MOST: Final = 10_000
 Scalar = bool | int | float | str
 Row = Mapping[str, Scalar]
 
-_RANGE: Final = re.compile(r"range\(\s*(-?\d+)\s*(?:,\s*(-?\d+)\s*)?(?:,\s*(-?\d+)\s*)?\)")
+_RANGE: Final = re.compile(
+    r"range\(\s*(-?\d{1,18})\s*(?:,\s*(-?\d{1,18})\s*)?(?:,\s*(-?\d{1,18})\s*)?\)"
+)
 _PIECE: Final = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
 _TOO_WIDE: Final = re.compile(r"\d{4}")
 _WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
@@ -168,6 +170,6 @@ def _piece(found: re.Match[str], row: Row) -> str:
 
 def _formatted(value: Scalar, form: str) -> str:
     if not _TOO_WIDE.search(form):
-        with suppress(ValueError):
+        with suppress(ValueError, OverflowError):
             return format(value, form)
     raise ValueError(f"{form!r} is no format for {described(value)}")

@@ -32,7 +32,7 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
         registry: the installed plugins, for a check of the migration strategies; None: only the
             master checks them.
     """
-    return _specs(read(path), path, registry)
+    return checked_work(read(path), path, registry)
 
 
 def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
@@ -41,12 +41,15 @@ def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
     Relative paths start at the current directory. Raises one `ConfigError` with all problems.
     """
     if "processes" in work:
-        return _specs(node_of(work, Place("work", 0, 0)), "work", None)
+        return checked_work(node_of(work, Place("work", 0, 0)), "work", None)
     place = Place(f"process {work.get('name')!r}", 0, 0)
-    return _specs(node_of({"processes": [work]}, place), "work", None)
+    return checked_work(node_of({"processes": [work]}, place), "work", None)
 
 
-def _specs(root: Node, path: str | Path, registry: Registry | None) -> tuple[ProcessSpec, ...]:
+def checked_work(
+    root: Node, path: str | Path, registry: Registry | None
+) -> tuple[ProcessSpec, ...]:
+    """Return the processes of a parsed document; otherwise as `load_work`."""
     problems = Problems()
     check_kind(root, "work")
     entries = _entries(root, problems)

@@ -1,12 +1,13 @@
 """Plugins: contracts, hooks, and the registry of installed plugins.
 
 hookspecs.py         every hook, in one list
-contracts.py         protocols of probes, policies, strategies and the journal, and their offers
+contracts.py         protocols of probes, policies, strategies and launchers, and their offers
 options.py           options of a process, merged over those of the cluster
 units.py             numbers with units in options
 installed.py         addresses of the installed plugins (entry points)
 discovery.py         import of the installed plugins, call of their hooks
 registry.py          selection of plugins by name, creation of their objects
+made.py              created objects, and checks of them
 declared_fields.py   fields of a spec that an offer declares to read
 plugin_calls.py      guard of every call of a plugin
 time_limit.py        time-out of a call

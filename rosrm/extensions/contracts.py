@@ -12,12 +12,11 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
     EMPTY,
@@ -236,7 +235,7 @@ class HostChecking(Protocol):
     """A migration strategy that works only on some hosts, or only between some hosts."""
 
     @property
-    def ability(self) -> str:
+    def host_check(self) -> str:
         """Return the name of the executor that checks whether the strategy works on a host.
 
         The core runs the executor once after each registration of a host, without arguments. The
@@ -288,6 +287,10 @@ class PeriodicImaging(Protocol):
         """
 
 
+#: Function on a slave that an `Execute` step calls: arguments and answer are JSON objects.
+Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+
+
 @dataclass(frozen=True)
 class Capabilities:
     """Capabilities of a migration strategy for a process; by default it moves the process only.
@@ -326,9 +329,7 @@ class MigrationOffer:
     create: Callable[[Any], MigrationStrategy]
     options: type[Any] = NoOptions
     summary: str = ""
-    executors: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any]]] = field(
-        default_factory=lambda: EMPTY
-    )
+    executors: Mapping[str, Executor] = field(default_factory=lambda: EMPTY)
     own_options: type[Any] | None = None
     capabilities: Capabilities | Callable[[Any], Capabilities] = Capabilities()
 
@@ -507,79 +508,3 @@ class CheckpointOffer:
     create: Callable[[Any], CheckpointPolicy]
     options: type[Any] = NoOptions
     summary: str = ""
-
-
-# --- the durable record -----------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """One line of the event record.
-
-    Attributes:
-        process: name of the process; "" for none.
-        host: name of the host; "" for none.
-        message: one sentence for logs and listings.
-        facts: details by name, valid JSON.
-    """
-
-    kind: EventKind
-    process: str = ""
-    host: str = ""
-    message: str = ""
-    facts: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
-
-
-@dataclass(frozen=True, slots=True)
-class StoredRecord:
-    """A record in the journal.
-
-    Attributes:
-        sequence: 1, 2, 3, ... without a gap.
-        wall_time: unix time by the master's clock, seconds.
-        elapsed: seconds since this master's start, by its monotonic clock.
-    """
-
-    sequence: int
-    wall_time: float
-    elapsed: float
-    record: Record
-
-
-@dataclass(frozen=True, slots=True)
-class Intent:
-    """A durable value of the desired state; the newest value of a key replaces older ones.
-
-    Attributes:
-        table: "process", "migration", "host", "learned", "cluster" or "removed".
-        key: key within the table.
-        value: valid JSON; None: remove the key.
-    """
-
-    table: str
-    key: str
-    value: Mapping[str, Any] | None
-
-
-@runtime_checkable
-class Journal(Protocol):
-    """Stores intents and the event record; they survive a SIGKILL once `write` has returned."""
-
-    def write(
-        self, records: Sequence[Record], intents: Sequence[Intent], now: float
-    ) -> Sequence[StoredRecord]:
-        """Append records and replace intents in one atomic group; raises `JournalError`."""
-
-    def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
-        """Return all intents of a table by key."""
-
-    def records(
-        self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
-    ) -> Sequence[StoredRecord]:
-        """Return the newest matching records after a sequence, oldest first.
-
-        The records of a host include migrations from it, whose facts have the host as `from`.
-        """
-
-    def close(self) -> None:
-        """Flush and close the files."""

@@ -126,7 +126,7 @@ class PluginCalls:
         for plugin, noted in self._failed.items():
             if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):
                 found.append((plugin, noted.error))
-        for plugin in self._worked - self._failed.keys():
+        for plugin in sorted(self._worked - self._failed.keys()):
             if now - self.failing[plugin].last >= WORKS_AFTER:
                 del self.failing[plugin]
                 found.append((plugin, ""))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, Final, TypeVar, cast
 
@@ -17,13 +16,11 @@ from rosrm.extensions.contracts import (
     Capabilities,
     CheckpointPolicy,
     HostChecking,
-    Launcher,
     LauncherContext,
     LauncherOffer,
     MigrationOffer,
     MigrationStrategy,
     PeriodicImaging,
-    Probe,
     ProbeContext,
     ProbeOffer,
     ScoringOffer,
@@ -43,30 +40,28 @@ from rosrm.extensions.discovery import (
     load_objects,
 )
 from rosrm.extensions.installed import PluginAddress, installed_plugins
+from rosrm.extensions.made import (
+    MadeLauncher,
+    MadeLaunchers,
+    MadeProbe,
+    OfferedExecutor,
+    Probes,
+    close_quietly,
+    failed_probe,
+    fault_of_resources,
+    missing_method,
+)
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import from_plain
-from rosrm.model.description_checks import resource_fault
 from rosrm.model.rows import PluginKind, PluginRow, PluginState
 from rosrm.model.values import (
     EMPTY,
-    RESOURCE_SLOTS,
     MigrationPolicy,
     ProcessSpec,
-    Reading,
-    ResourceDescription,
 )
 from rosrm.wording import counted, get_close_matches
-
-#: Members that an object of each kind must have.
-_METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
-    "probe": ("resources", "read", "close"),
-    "scoring": ("score",),
-    "migration": ("propose",),
-    "checkpoint": ("choose",),
-    "launcher": ("prepare",),
-}
 
 #: Distribution with rosrm's own plugins of each kind, for messages if none is installed.
 _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
@@ -79,94 +74,13 @@ _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
 #: Time-out of `create` in seconds; it may load a large library.
 CREATE_LIMIT: Final = 30.0
 
-#: Seconds between two reads of a `FailedProbe`.
-_FAILED_PERIOD: Final = 10.0
 #: Highest number of broken plugins in a message if the intended one is unknown.
 _MOST_BROKEN: Final = 3
 
 _NO_CAPABILITIES: Final = Capabilities()
 
-Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NameToOptions = Mapping[str, Mapping[str, Any]]
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class MadeProbe:
-    """A probe on this host; period and deadline, in seconds, are those of its offer."""
-
-    name: str
-    probe: Probe
-    resources: tuple[ResourceDescription, ...]
-    period: float
-    deadline: float
-
-
-@dataclass(frozen=True)
-class Probes:
-    """The probes of a host.
-
-    Attributes:
-        made: created probes, and a `FailedProbe` for each probe that could not be created.
-        absent: name of each probe that is absent on this host to the reason (`SkipPlugin`).
-    """
-
-    made: tuple[MadeProbe, ...]
-    absent: Mapping[str, str]
-
-
-class FailedProbe:
-    """Substitute for a chosen probe that could not be created; each read fails with the reason.
-
-    So its resources are stale, and the host gets no new work if one of them has a limit, as after a
-    failed read of a probe.
-
-    Attributes:
-        resources: resources that the offer declares and no other probe reads, of unknown capacity.
-        reason: why the probe could not be created, with the plugin and the place.
-    """
-
-    def __init__(self, resources: Sequence[ResourceDescription], reason: str) -> None:
-        self.resources = resources
-        self.reason = reason
-
-    def read(self) -> Iterable[Reading]:
-        """Raise `PluginError` with the reason."""
-        raise PluginError(self.reason)
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-@dataclass(frozen=True)
-class MadeLauncher:
-    """A launcher of this host, and the environment variables that it sets."""
-
-    launcher: Launcher
-    variables: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class MadeLaunchers:
-    """The launchers of a host.
-
-    Attributes:
-        made: name to the created launcher.
-        absent: name of each launcher that is absent on this host to the reason (`SkipPlugin`).
-        broken: name of each launcher that could not be created to the reason.
-    """
-
-    made: Mapping[str, MadeLauncher]
-    absent: Mapping[str, str]
-    broken: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class OfferedExecutor:
-    """An executor, and the name of the migration strategy that offers it."""
-
-    strategy: str
-    call: Executor
 
 
 class Registry:
@@ -276,9 +190,9 @@ class Registry:
         return made
 
     def _check_executors(self, name: str, strategy: object) -> None:
-        """Refuse a strategy with an `ability` or `discard` that its own offer lacks."""
+        """Refuse a strategy with a `host_check` or `discard` that its own offer lacks."""
         own = self._strategy(name).executors
-        for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
+        for kind, named in ((HostChecking, "host_check"), (PeriodicImaging, "discard")):
             fault = ""
             try:
                 if implements(strategy, kind) and (executor := getattr(strategy, named)) not in own:
@@ -411,21 +325,9 @@ class Registry:
                 )
                 failed[name] = f"{source}: {reason}"
         for name, reason in failed.items():
-            made.append(self._failed_probe(name, reason, made))
+            offer = cast(ProbeOffer, self.offer("probe", name))
+            made.append(failed_probe(offer, reason, made))
         return Probes(tuple(made), absent)
-
-    def _failed_probe(self, name: str, reason: str, others: Sequence[MadeProbe]) -> MadeProbe:
-        """Return a substitute for a probe that could not be created."""
-        taken = {resource.name for other in others for resource in other.resources}
-        declared = cast(ProbeOffer, self.offer("probe", name)).resources
-        described = [
-            ResourceDescription(resource, "1", 1.0, "unknown")
-            for resource in dict.fromkeys(declared)
-            if resource not in taken
-        ]
-        valid = [one for one in described if not resource_fault(one)]
-        probe = FailedProbe(tuple(valid[: RESOURCE_SLOTS - len(taken)]), reason)
-        return MadeProbe(name, probe, tuple(probe.resources), _FAILED_PERIOD, 1.0)
 
     def _probe(
         self,
@@ -438,7 +340,7 @@ class Registry:
         probe = self._make("probe", name, options, context)
         try:
             resources = tuple(probe.resources)
-            fault = _fault_of_resources(resources, offer, before)
+            fault = fault_of_resources(resources, offer, before)
             fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
         except FAULTS as raised:
             resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
@@ -482,7 +384,7 @@ class Registry:
         except FAULTS as fault:
             reason = f"`create` ({definition(create)}) raised {describe_plugin_fault(fault)}"
             raise self._fault(kind, name, reason) from fault
-        lacks = _missing_method(kind, thing)
+        lacks = missing_method(kind, thing)
         if lacks:
             raise self._fault(kind, name, f"`create` ({definition(create)}) made {lacks}")
         self._outcome[kind, name] = ("selected", offer.summary)
@@ -574,49 +476,3 @@ def _is_named_like(source: PluginSource, name: str) -> bool:
 
 def _words(text: str) -> list[str]:
     return [word for word in re.split(r"[^a-z]+", text.lower()) if word not in ("", "rosrm")]
-
-
-def _missing_method(kind: PluginKind, thing: object) -> str:
-    """Return the fault of an object that an offer created; "": it has all its methods."""
-    if thing is None:
-        wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
-        return f"None; an object with {wanted} is required (does it lack a `return`?)"
-    for name in _METHODS[kind]:
-        if not hasattr(type(thing), name) and not hasattr(thing, name):
-            has = [one for one in dir(thing) if not one.startswith("_")]
-            near = get_close_matches(name, has, 1)
-            misspelt = f"; is its `{near[0]}` misspelt?" if near else ""
-            return f"a {type(thing).__name__}, which has no `{name}`{misspelt}"
-    return ""
-
-
-def _fault_of_resources(
-    resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
-) -> str:
-    """Return why a host cannot have these resources, as a predicate; "" if it can."""
-    taken = {resource.name: other.name for other in before for resource in other.resources}
-    if not resources:
-        return "describes no resource; raise SkipPlugin in `create` where there is nothing to read"
-    for resource in resources:
-        fault = resource_fault(resource)
-        if fault:
-            return fault
-        if resource.name in taken:
-            return f"reads {resource.name!r}, as {taken[resource.name]!r} does already"
-        if resource.name not in offer.resources:
-            declared = repr((*offer.resources, resource.name))
-            return (
-                f"reads {resource.name!r}, which its offer does not declare: "
-                f"write ProbeOffer(..., resources={declared})"
-            )
-    if len(taken) + len(resources) > RESOURCE_SLOTS:
-        return f"exceeds the {RESOURCE_SLOTS} resources that a host may have"
-    return ""
-
-
-def close_quietly(probe: Probe) -> None:
-    """Close a probe that is not used; ignore a failure."""
-    try:
-        probe.close()
-    except FAULTS:
-        return

@@ -113,7 +113,10 @@ class Quantity:
 
     def _number(self, given: object) -> float:
         if isinstance(given, (int, float)) and not isinstance(given, bool):
-            return float(given)
+            try:
+                return float(given)
+            except OverflowError:  # an integer of more than 308 digits
+                return math.inf
         found = _NUMBER_AND_UNIT.fullmatch(given) if isinstance(given, str) else None
         if found is None:
             raise ValueError(f"{given!r} is not {self._form()}")

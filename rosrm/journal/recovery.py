@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import JournalBlocked, JournalError
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record
 from rosrm.runtime.disk_space import room_for
 from rosrm.wording import counted
 
@@ -188,7 +188,7 @@ def _write(path: Path, found: _Found, aside: Path) -> None:
             f"INSERT INTO record VALUES ({', '.join('?' * 8)})",  # noqa: S608 - fixed words
             [found.events[sequence] for sequence in sorted(found.events)],
         )
-    journal = SqliteJournal(path)
+    journal = SqliteJournal(path, keep_events=_MOST_EVENTS)  # the master's own bound holds later
     intents = [Intent(table, key, value) for (table, key), value in found.intents.items()]
     journal.write(
         [Record(EventKind.JOURNAL_RECOVERED, message=_summary(found, aside))], intents, 0.0

@@ -15,9 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record, StoredRecord
 
 #: Version of the tables; a file with another version is refused.
 SCHEMA: Final = 1
@@ -73,7 +73,8 @@ class SqliteJournal:
             lambda: self._database.execute("SELECT max(sequence) FROM record").fetchone()
         )
         self._sequence = int(newest[0] or 0)
-        self._since_pruned = 0
+        # The first write prunes, because short runs would add up to any number of records.
+        self._since_pruned = _PRUNE_EVERY
 
     def _open(self, sync: str) -> sqlite3.Connection:
         if self._path.is_file() and not self._path.stat().st_size:

@@ -31,14 +31,7 @@ from rosrm.core.master.reducer import step
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Instance
 from rosrm.errors import JournalBlocked, Refused
-from rosrm.extensions.contracts import (
-    CheckpointPolicy,
-    Intent,
-    MigrationStrategy,
-    Record,
-    ScoringPolicy,
-    StoredRecord,
-)
+from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
@@ -47,6 +40,7 @@ from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.master.endpoint import MasterEndpoint
@@ -60,8 +54,8 @@ from rosrm.wording import counted, listed
 
 _log = logging.getLogger("rosrm.master")
 
-#: Period of the tick in seconds, which checks readings and deadlines. A tick costs the same for any
-#: number of readings (docs/decisions/0014).
+#: Period of the tick in seconds, which checks readings and deadlines. The cost of a tick does not
+#: depend on the number of readings (docs/decisions/0014).
 _TICK: Final = 0.05
 #: Seconds for the discovery of another running master.
 _DISCOVERY: Final = 1.0
@@ -70,7 +64,7 @@ _DISCOVERY: Final = 1.0
 _COLLECT_AT: Final = (10_000, 20, 20)
 #: Seconds within which two starts of masters count as simultaneous.
 _AT_ONCE: Final = 1.0
-#: Seconds of plugin calls in one turn beyond which the core's clock is set back by them.
+#: Seconds of plugin calls in one turn; beyond this limit the core's clock is set back by them.
 _BLOCKED: Final = 0.5
 #: Seconds between two attempts to write the journal during a stall.
 _TRY_AGAIN: Final = 0.5
@@ -393,7 +387,7 @@ class MasterRuntime:
 
 
 def what_runs(state: MasterState) -> str:
-    """Return how many processes keep running without the master, and what slaves still stop."""
+    """Return a sentence that counts the processes that keep running, and those being stopped."""
     stopping: list[Instance] = []
     running = 0
     for instance in state.instances.values():

@@ -4,6 +4,7 @@ values.py               processes, hosts, instances, resources
 plan.py                 plans of migrations: steps, undo, commit
 orders.py               orders of the master to a slave
 event_kinds.py          the kinds of events in the event record
+records.py              records and intents, and the protocol of a journal
 rows.py                 rows of listings
 ros_settings.py         ROS settings of a part: domain, discovery, transports
 codec.py                conversion of values to JSON and back

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -11,6 +12,8 @@ from rosrm.errors import ConfigError
 
 #: Highest domain id, because higher ones need ports beyond 65535.
 HIGHEST_DOMAIN: Final = 232
+#: An absolute ROS namespace.
+NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +46,25 @@ class RosSettings:
         }
         return {name: value for name, value in variables.items() if value}
 
-    def check_domain(self) -> None:
-        """Raise `ConfigError` if the ROS_DOMAIN_ID in force is invalid.
+    def check(self) -> None:
+        """Raise `ConfigError` for a setting, or a ROS_DOMAIN_ID in force, that ROS cannot use.
 
-        Otherwise DDS would print an error without a remedy, or rclpy a traceback.
+        Otherwise DDS would print an error without a remedy or end the process, or rclpy would raise
+        a traceback.
         """
+        if not NAMESPACE.fullmatch(self.namespace):
+            raise ConfigError(
+                f'{self.namespace!r} is not an absolute ROS namespace such as "/rosrm"'
+            )
+        if self.domain is not None:
+            if type(self.domain) is not int or not 0 <= self.domain <= HIGHEST_DOMAIN:
+                raise ConfigError(
+                    f"the ROS domain {self.domain!r} is not a whole number from 0 to "
+                    f"{HIGHEST_DOMAIN}"
+                )
+            return
         word = os.environ.get("ROS_DOMAIN_ID", "")
-        if self.domain is not None or not word:
+        if not word:
             return
         if not (word.isascii() and word.isdigit() and int(word) <= HIGHEST_DOMAIN):
             raise ConfigError(

@@ -224,6 +224,12 @@ class ProcessSpec:
         return " ".join(self.command)
 
 
+def qualified_name(namespace: str, node_name: str) -> str:
+    """Return a node's name with its namespace: `/robot/camera`."""
+    inside = namespace.strip("/")
+    return f"/{inside}/{node_name}" if inside else f"/{node_name}"
+
+
 @dataclass(frozen=True, slots=True, order=True)
 class InstanceId:
     """Id of an instance: one start of a process on one host.

@@ -10,9 +10,10 @@ from functools import partial
 from typing import Any
 
 from rosrm.errors import Refused, RosrmError, describe_fault, describe_plugin_fault
+from rosrm.extensions.contracts import Executor
 from rosrm.extensions.discovery import definition
+from rosrm.extensions.made import OfferedExecutor
 from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given
-from rosrm.extensions.registry import Executor, OfferedExecutor
 from rosrm.ros.slave.services import ExecutorOutcome
 
 #: Takes the outcome of an executor.

@@ -40,8 +40,8 @@ def test_an_offer_survives_its_way_as_json():
     assert Offer.from_json(OFFER.as_json()) == OFFER
 
 
-def test_the_token_is_in_no_representation():
-    """What is logged or shown of an offer does not open it."""
+def test_the_representation_of_an_offer_has_no_token():
+    """A logged offer does not allow a fetch."""
     assert "secret" not in repr(OFFER)
 
 
@@ -256,8 +256,8 @@ def test_without_an_end_nothing_stays(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_fetch_has_left_is_removed_and_what_lives_is_not(tmp_path):
-    """The lock tells them apart; and files of other names are nobody's business."""
+def test_the_directory_of_a_killed_fetch_is_removed_and_a_used_one_is_kept(tmp_path):
+    """A lock marks a directory in use; files of other names stay."""
     stale = Path(tempfile.mkdtemp(prefix=".rosrm-fetch-", dir=tmp_path))
     (stale / "file").write_bytes(b"1")
     (tmp_path / "other").mkdir()

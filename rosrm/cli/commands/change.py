@@ -190,7 +190,9 @@ def _with_ending(
         since = client.list().last_sequence if wait else 0
         typer.echo(ask(client))
         if wait:
-            with interruptible(f"the request for {name} continues (`rosrm events --process`)"):
+            with interruptible(
+                f"the request for {name} continues (`rosrm events --process {name}`)"
+            ):
                 show_end(
                     client.wait_for_migration(
                         name, after=since, timeout=limit, on_change=show_change

@@ -132,7 +132,7 @@ def _without_this_folder() -> list[str]:
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
     chosen = ctx.ensure_object(CommonOptions).domain if domain is None else domain
     settings = settings if chosen is None else replace(settings, domain=chosen)
-    settings.check_domain()
+    settings.check()
     return settings
 
 

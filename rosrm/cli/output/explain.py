@@ -33,7 +33,7 @@ def render(explanation: Mapping[str, Any]) -> RenderableType:
 def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield _headline(explanation)
     if explanation.get("kept"):
-        yield _kept(explanation["kept"])
+        yield _replicas(explanation["kept"])
     if explanation.get("checkpoint"):
         yield _checkpoint(explanation["checkpoint"])
     decision = explanation.get("decision")
@@ -65,7 +65,7 @@ def _headline(explanation: Mapping[str, Any]) -> Text:
     return text
 
 
-def _kept(replicas: list[Mapping[str, Any]]) -> Text:
+def _replicas(replicas: list[Mapping[str, Any]]) -> Text:
     """Return the hosts with a replica of the snapshot, and the cycle of each."""
     places = [
         f"{one['host']} (cycle {one['sequence']}, {size(one['size'])}, "

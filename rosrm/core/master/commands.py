@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.model.orders import Order, StartInstance, StopInstance
 from rosrm.model.plan import HandoffPhase
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import Assignment, InstanceId
 
 #: Id of an order, unique within one run of the master: its number, or its series and number

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from rosrm.model.values import ProcessSpec
+from rosrm.model.values import ProcessSpec, qualified_name
 from rosrm.wording import listed
 
 _RUN: Final = ("ros2", "run")
@@ -38,8 +38,7 @@ def node_of(spec: ProcessSpec) -> str:
     )
     name = rules.get("__node") or (spec.name if spec.ros else "")
     if name:
-        namespace = rules.get("__ns", spec.namespace).strip("/")
-        return f"the node /{namespace}/{name}" if namespace else f"the node /{name}"
+        return f"the node {qualified_name(rules.get('__ns', spec.namespace), name)}"
     if spec.command[:2] == _RUN and len(spec.command) >= 4:
         return f"the default node of {' '.join(spec.command[2:4])}"
     return ""

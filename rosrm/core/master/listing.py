@@ -9,11 +9,10 @@ from rosrm.core.master.assignment.assign import decide_now
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration import handoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
-from rosrm.model.values import InstanceState, StopPolicy
+from rosrm.model.values import InstanceState, StopPolicy, qualified_name
 
 _CONDITION: Final = {
     HostCondition.UP: "up",
@@ -129,7 +128,7 @@ def _awaited_node(process: Process, owner: Instance | None) -> str:
     spec = process.spec
     if owner.state is not InstanceState.RUNNING or not spec.ros or spec.readiness.kind == "running":
         return ""
-    node = handoff.qualified(spec, owner.node_name or spec.name)
+    node = qualified_name(spec.namespace, owner.node_name or spec.name)
     return f"waits for its node {node} in the ROS graph, for at most {spec.readiness.timeout:g} s"
 
 

@@ -27,12 +27,13 @@ from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.replicas import ReplicationState
-from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
+from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 
@@ -77,7 +78,8 @@ class MasterState:
         declared: declarations in the offers of the selected plugins.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
-        wants_standby: names of the processes that ask for a standby and are not terminal.
+        wants_standby: names of the processes that ask for a standby and are not terminal, in order
+            of submission, because a replay must begin them in the same order.
         held_since: time since when placement waits for first requests for work; inf: no wait.
         contact_since: time since when at least one host reports; inf: none does.
         unowned_instances: name of a removed process to its instances that may still run.
@@ -112,7 +114,7 @@ class MasterState:
         self.instances: dict[int, Instance] = {}
         self.migrations: dict[str, Migration] = {}
         self.standbys: dict[str, Migration] = {}
-        self.wants_standby: set[str] = set()
+        self.wants_standby: dict[str, None] = {}
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.set_aside: set[str] = set()
@@ -264,10 +266,10 @@ class MasterState:
         if not process.phase.is_terminal:
             self.terminal.pop(process.name, None)
             if process.spec.standby.wanted:
-                self.wants_standby.add(process.name)
+                self.wants_standby.setdefault(process.name)
         else:
             self.terminal.setdefault(process.name)
-            self.wants_standby.discard(process.name)
+            self.wants_standby.pop(process.name, None)
 
     def collect_garbage(self) -> None:
         """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
@@ -285,6 +287,7 @@ class MasterState:
     def remove_process(self, name: str) -> None:
         """Remove a terminal process from memory and journal; none of its instances may run."""
         del self.terminal[name]
+        self.replication.last_orders.pop(name, None)
         if self.declared.has_snapshots(self.processes.pop(name).spec):
             self._note_removed(name)
         self._unsaved.pop(name, None)

@@ -13,8 +13,8 @@ from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.requests import count, known_host, known_processes
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent
 from rosrm.wording import counted, listed
 
 _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)

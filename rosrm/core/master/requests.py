@@ -256,7 +256,7 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
     )  # fmt: skip
     if process.phase.is_terminal or process.image is not None:
         images.drop(state, process)
-        replication.discard_snapshots(state, process)
+        replication.drop_former_replicas(state, process)
         process.excluded.clear()
         process.demand = None
         process.order = state.next_order

@@ -9,9 +9,15 @@ from typing import Any, Final
 
 from rosrm.core.slave import commands, events, fencing
 from rosrm.core.slave.health import InstanceHealth, watch_of
-from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph, qualified_name
+from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph
 from rosrm.core.slave.watches import Awaited, Memo
-from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
+from rosrm.model.values import (
+    Assignment,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    qualified_name,
+)
 
 #: Seconds for which an end is remembered for a master that may not have received its report.
 REMEMBER_END: Final = 60.0

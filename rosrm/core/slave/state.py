@@ -153,9 +153,3 @@ def awaits_graph(spec: ProcessSpec) -> bool:
     """Return True if an instance is ready when its node appears, False as soon as it runs."""
     kind = spec.readiness.kind
     return kind == "graph" or (kind == "auto" and bool(spec.ros))
-
-
-def qualified_name(namespace: str, node_name: str) -> str:
-    """Return a node's name with its namespace: `/robot/camera`."""
-    inside = namespace.strip("/")
-    return f"/{inside}/{node_name}" if inside else f"/{node_name}"

@@ -1,4 +1,4 @@
-"""The parts of a node's state: saved and published by the source, restored by the destination."""
+"""Parts of a node's state: saved and published by the source, restored by the destination."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ LARGEST_PART: Final = 256 << 20
 
 
 class StateError(Exception):
-    """A state cannot be saved or restored; the text names it and the reason."""
+    """A state cannot be saved or restored; the text names the state and the reason."""
 
 
 class StateTopic:
     """One topic of a node's state; the arguments are those of `Migratable.keep_state`.
 
     Attributes:
-        retained: the saved message is held after publishing too, because snapshots store it.
+        retained: the saved message stays in memory after publishing, because snapshots store it.
     """
 
     def __init__(

@@ -187,7 +187,7 @@ def test_a_cancelled_restore_that_has_succeeded_is_stopped() -> None:
     def cancel_meanwhile(arguments: Any) -> Any:
         restored(arguments)
         shelf.machine.executors["await"] = restored
-        raise RuntimeError("nothing was heard")
+        raise RuntimeError("no answer")
 
     shelf.machine.executors["await"] = cancel_meanwhile
     shelf.trouble["put_back"] = "busy"
@@ -536,7 +536,7 @@ def look(shelf: Shelf, cluster: Cluster, first: int) -> None:
         assert (running, len(shelf.images), shelf.taken) == ([], 1, {})
     else:
         assert awake == running == [cluster["p"].owner]
-        assert set(running) <= shelf.alive | {first}, "it has begun anew"
+        assert set(running) <= shelf.alive | {first}, "the process began again"
         assert not shelf.images
 
 

@@ -316,6 +316,22 @@ def test_the_replicas_of_a_pruned_process_are_dropped():
     assert cluster.machines[third].host_id not in dropped_on
 
 
+def test_the_order_about_a_pruned_process_is_forgotten():
+    """Otherwise a master would keep one for each name that ever had a snapshot."""
+    policy = Asked()
+    cluster = running(policy)
+    policy.answer = CheckpointChoice((others(cluster)[0],))
+    cluster.wait(2.0)
+    assert "p" in cluster.state.replication.last_orders
+    for name in cluster.machines:
+        keep(cluster, name)
+    cluster.cancel("p")
+    cluster.wait(2.0)
+    assert cluster.ask(happened.PruneRequested, ("p",), ()).accepted
+    cluster.wait(2.0)
+    assert cluster.state.replication.last_orders == {}
+
+
 def test_the_next_master_drops_the_replicas_of_a_pruned_process():
     """A host that returns after a restart of the master is ordered to drop it, and nothing else."""
     cluster = running(Asked())

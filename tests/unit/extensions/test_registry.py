@@ -19,7 +19,8 @@ from rosrm.extensions.contracts import (
     ScoringOffer,
 )
 from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import FailedProbe, Probes, Registry
+from rosrm.extensions.made import FailedProbe, Probes
+from rosrm.extensions.registry import Registry
 from rosrm.model.values import Reading, ResourceDescription
 from tests.plugin_kit import plugin, registry_of
 
@@ -390,30 +391,31 @@ def test_executors_that_cannot_be_called_break_their_offer(executors, said):
     assert said in broken.reason
 
 
-def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
+def test_a_host_check_that_is_no_executor_of_the_offer_is_refused():
     """Otherwise every host would count as one without the plugin."""
-    able = SimpleNamespace(propose=None, ability="m.abel", host_fault=max)
+    able = SimpleNamespace(propose=None, host_check="m.abel", host_fault=max)
     offer = MigrationOffer("m", lambda options: able, executors={"m.able": dict})
     registry = registry_of(offer)
-    with pytest.raises(PluginError, match=r"`ability` is 'm\.abel', no executor .*are: m\.able"):
+    said = r"`host_check` is 'm\.abel', no executor .*are: m\.able"
+    with pytest.raises(PluginError, match=said):
         registry.migrations({"m": {}})
 
 
-def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
+def test_a_host_check_that_cannot_be_read_is_the_plugins_fault():
     """Report a property that raises and a value that cannot be hashed as a broken plugin."""
 
     class Angry:
         propose = host_fault = max
 
         @property
-        def ability(self):
+        def host_check(self):
             raise OSError("no")
 
-    listed = SimpleNamespace(propose=None, ability=["m.able"], host_fault=max)
+    listed = SimpleNamespace(propose=None, host_check=["m.able"], host_fault=max)
     for strategy, said in ((Angry(), "OSError: no"), (listed, "TypeError: ")):
         offer = MigrationOffer("m", lambda options, made=strategy: made)
         registry = registry_of(offer)
-        with pytest.raises(PluginError, match=f"its `ability` raised {said}"):
+        with pytest.raises(PluginError, match=f"its `host_check` raised {said}"):
             registry.migrations({"m": {}})
 
 

@@ -9,9 +9,9 @@ import sqlite3
 import pytest
 
 from rosrm.errors import JournalError
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.recovery import recover
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.records import Intent, Record
 
 PAGE = 4096
 COUNT = 300

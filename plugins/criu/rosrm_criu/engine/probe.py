@@ -188,11 +188,11 @@ def _receive(ours: socket.socket, trial: _Trial, count: str, after: str) -> tupl
     """Return the sender of the expected count; raise `CriuError` for another count or none."""
     ours.settimeout(max(0.1, trial.left))
     try:
-        said, address = ours.recvfrom(16)
+        answer, address = ours.recvfrom(16)
     except TimeoutError:
         raise CriuError(f"a child that {after} does not answer over UDP on loopback") from None
-    if said.decode("ascii", "replace") != count:
-        raise CriuError(f"a child that {after} counts {said!r}, not {count}")
+    if answer.decode("ascii", "replace") != count:
+        raise CriuError(f"a child that {after} counts {answer!r}, not {count}")
     return str(address[0]), int(address[1])
 
 

@@ -207,7 +207,7 @@ def id_for_criu(ids: tuple[int, ...], most: int) -> int:
     return 300
 
 
-def mark_anew(pid: int, marks: Mapping[str, str]) -> None:
+def replace_marks(pid: int, marks: Mapping[str, str]) -> None:
     """Change environment variables of a process, as /proc shows them to others.
 
     Values that the process has already read stay as they were. A new value that is longer than the

@@ -139,7 +139,7 @@ def _link(source: str, target: str) -> None:
         shutil.copy2(source, target)
 
 
-def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+def await_checkpoint(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait until the image is restored, and remove it."""
     asked = StepArguments.of(arguments)
     found = artifacts.await_restored(asked)

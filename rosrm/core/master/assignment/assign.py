@@ -162,11 +162,10 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a snapshot and do not block those behind them."""
     if not np.isin(state.hosts.condition, _AWAY).any():
         return frozenset()
-    names = (name for name in state.queue if awaits_states(state, state.processes[name], now))
-    passed_over = frozenset(names)
-    for name in passed_over:
+    names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
+    for name in names:
         _record_wait_reason(state, state.processes[name], _AWAITS_SNAPSHOT, now)
-    return passed_over
+    return frozenset(names)
 
 
 def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:

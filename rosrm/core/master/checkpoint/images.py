@@ -20,10 +20,10 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.images import UnwantedImage
 from rosrm.core.master.state.pending_orders import ImageRemoval
 from rosrm.core.master.state.process import Image, Process, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
+from rosrm.model.records import Intent
 
 #: Time-out of a removal, and delay before its retry; seconds.
 _PATIENCE: Final = 30.0

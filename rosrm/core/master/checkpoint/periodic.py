@@ -3,9 +3,9 @@
 ==================================  ==========================================================
 observed                            ordered
 ==================================  ==========================================================
-a process that requests them runs   `execute` of its strategy's step, at the policy's pace
+a process that requests them runs   `RunExecutor` of its strategy's step, at the policy's pace
 a dump fails                        the same; the failure is recorded once for each reason
-an instance with images is gone     `execute` of the strategy's executor that removes images
+an instance with images is gone     `RunExecutor` of the strategy's executor that removes images
 ==================================  ==========================================================
 
 This state is not persisted. The slave that dumps a process resumes it without a further order, and
@@ -39,6 +39,8 @@ from rosrm.wording import size
 _LOOK_EVERY: Final = 1.0
 #: Time-out of a removal, in seconds.
 _PATIENCE: Final = 30.0
+#: Upper bound of numbers in results, because JSON may hold integers that no float can.
+_MOST: Final = 1e18
 
 
 def review(state: MasterState, now: float) -> None:
@@ -203,7 +205,8 @@ def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now
 
 
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else 0.0
+    """Return a number of an executor's result; 0.0 for anything else, NaN and infinity too."""
+    return float(value) if isinstance(value, int | float) and 0 <= value < _MOST else 0.0
 
 
 def _record_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:

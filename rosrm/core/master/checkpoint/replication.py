@@ -7,15 +7,15 @@ is reviewed about once a second.
 ==========================================  =====================================================
 observed                                    ordered
 ==========================================  =====================================================
-a process runs, and the policy chooses      `keep`: the slave replicates each snapshot of this
-hosts                                       instance to them
-its slave has an older choice               `keep`: the new choice
+a process runs, and the policy chooses      `ReplicateSnapshot`: the slave sends each snapshot of
+hosts                                       this instance to them
+its slave has an older choice               `ReplicateSnapshot`: the new choice
 it runs, and the policy gives no answer     the last choice; without one since the master's
-                                            start, `keep` on the hosts with a replica
-it is cancelled, or has finished            `drop_kept` of every replica
-it was submitted again                      `drop_kept` of the replicas from before
-the journal shows that it was removed       `drop_kept` of every replica
-a host that is not chosen has a replica     `drop_kept`, once a chosen host has a newer replica;
+                                            start, `ReplicateSnapshot` to the hosts with a replica
+it is cancelled, or has finished            `DropReplica` for every replica
+it was submitted again                      `DropReplica` for those from before
+the journal shows that it was removed       `DropReplica` for every replica
+a host that is not chosen has a replica     `DropReplica`, once a chosen host has a newer replica;
                                             never before the policy has chosen
 ==========================================  =====================================================
 
@@ -112,7 +112,7 @@ def note_answer(state: MasterState, process: str, event: happened.OrderAnswered)
 # --- requests -------------------------------------------------------------------------------
 
 
-def discard_snapshots(state: MasterState, process: Process) -> None:
+def drop_former_replicas(state: MasterState, process: Process) -> None:
     """Make the snapshots of a restarted process void if it had finished or was cancelled."""
     if process.phase in _DONE:
         process.born = state.next_instance
@@ -137,7 +137,6 @@ def review(state: MasterState, now: float) -> None:
         name = known.waiting.pop()
         process = state.processes.get(name)
         if process is None:
-            known.last_orders.pop(name, None)
             _drop_removed(state, name, now)
         else:
             _review(state, process, now)

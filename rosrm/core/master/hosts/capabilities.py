@@ -3,10 +3,10 @@
 =============================  ==============================================================
 observed                       action
 =============================  ==============================================================
-a host is up, and unchecked    `execute` of the strategy's executor
+a host is up, and unchecked    `RunExecutor` with the strategy's `host_check`
 the host has answered          the answer is valid until the host registers again
 no answer within 30 s          the order is repeated after 10 s
-the plugin's `ability` fails   the plugin is called again after 10 s
+`host_check` cannot be read    the plugin is called again after 10 s
 =============================  ==============================================================
 
 The answers are not persisted. Until a host has answered, no process moves to or from it by that
@@ -56,10 +56,10 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
     state.capability_answers[name, host.name] = answer
     try:
         executor = state.plugins.ask(
-            "migration", name, "ability", lambda: required(strategy.ability, str)
+            "migration", name, "host_check", lambda: required(strategy.host_check, str)
         )
     except PluginError as error:
-        answer.reason = f"its ability is not known: {error}"
+        answer.reason = f"its host check is not known: {error}"
         return
     if executor not in host.description.executors:
         # Checked again later, because a slave reports broken plugins only after its registration.

@@ -23,11 +23,11 @@ from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import ReportInstances
 from rosrm.model.plan import Execute
+from rosrm.model.records import Intent
 from rosrm.model.values import InstanceStatus
 from rosrm.wording import counted
 

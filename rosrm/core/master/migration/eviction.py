@@ -29,7 +29,7 @@ from rosrm.core.master.scheduling.decision import decide, verdict_of
 from rosrm.core.master.scheduling.feasibility import may_ever_take
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
-from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Instance, Process
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
@@ -64,6 +64,8 @@ def _note_limits(state: MasterState, now: float) -> None:
     for host in state.hosts.listed():
         # A stale reading does not show whether the host is over its limit.
         stale = state.hosts.stale_resources(host) if state.hosts.stale[host.column] else ()
+        if host.over_at and state.hosts.condition_of(host) is not HostCondition.UP:
+            stale = tuple(host.over_at)
         names = state.hosts.over_limit(host.column) if host.column in over else []
         names = [name for name in names if name not in stale]
         host.over_at.update({name: now for name in stale if name in host.over_at})
@@ -98,12 +100,13 @@ def _evict(state: MasterState, host: Host, now: float) -> None:
     if any(migration.source_host is host for migration in state.migrations.values()):
         return  # first wait for the effect of the current migration
     for resource, since in list(host.over_since.items()):
-        if now - since >= state.settings.hysteresis:
-            _evict_for_resource(state, host, resource, now)
+        due = now - since >= state.settings.hysteresis
+        if due and _evict_for_resource(state, host, resource, now):
             return
 
 
-def _evict_for_resource(state: MasterState, host: Host, resource: str, now: float) -> None:
+def _evict_for_resource(state: MasterState, host: Host, resource: str, now: float) -> bool:
+    """Begin to move one process; return False, and record why, if none can leave."""
     reasons = []
     for instance in _largest_first(state, host, resource):
         process = state.processes[instance.id.process]
@@ -114,10 +117,11 @@ def _evict_for_resource(state: MasterState, host: Host, resource: str, now: floa
                 headroom=state.settings.headroom,
             )  # fmt: skip
             if rejected is None:
-                return
+                return True
             reason = rejected.reason
         reasons.append((process.name, reason))
     _record_nothing_moves(state, host, resource, reasons, now)
+    return False
 
 
 def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:

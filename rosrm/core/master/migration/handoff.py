@@ -23,7 +23,7 @@ from rosrm.core.master.outcomes import (
 from rosrm.core.master.state.migration import HandoffReports, Migration
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
-from rosrm.model.values import InstanceId, ProcessSpec
+from rosrm.model.values import InstanceId, qualified_name
 
 #: Reports of a destination that follows the source or is in a later phase.
 _READY: Final = frozenset({ReportPhase.READY, ReportPhase.SWITCHING, ReportPhase.ACTIVE})
@@ -57,19 +57,14 @@ _REPORTS: Final[Mapping[ReportPhase, str]] = {
 
 def publish(state: MasterState, migration: Migration, phase: HandoffPhase) -> None:
     """Publish the phase of a handoff to its source and destination."""
-    spec = state.processes[migration.process].spec
+    namespace = state.processes[migration.process].spec.namespace
     state.emit(
         PublishStateConfig(
             migration.process, phase, migration.source.number, migration.destination.number,
-            qualified(spec, migration.source_node), qualified(spec, migration.destination_node),
+            qualified_name(namespace, migration.source_node),
+            qualified_name(namespace, migration.destination_node),
         )
     )  # fmt: skip
-
-
-def qualified(spec: ProcessSpec, node_name: str) -> str:
-    """Return the name of a node with the namespace of its process: "/robot/camera"."""
-    namespace = spec.namespace.strip("/")
-    return f"/{namespace}/{node_name}" if namespace else f"/{node_name}"
 
 
 def close(state: MasterState, migration: Migration) -> None:

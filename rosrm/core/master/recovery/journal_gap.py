@@ -22,8 +22,8 @@ from typing import Any, Final
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
-from rosrm.extensions.contracts import Intent
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent
 from rosrm.wording import counted
 
 _KEY: Final = "unheard"

@@ -13,10 +13,10 @@ from rosrm.core.master.state import migration
 from rosrm.core.master.state import process as processes
 from rosrm.core.master.state.migration import Migration, end_from_dict, undo_steps
 from rosrm.core.master.state.process import DesiredState, Image, LeftBehind, Process, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.codec import fields_from_plain, from_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Plan
+from rosrm.model.records import Intent
 from rosrm.model.values import InstanceId, ProcessSpec
 
 _Table = Mapping[str, Mapping[str, Any]]
