@@ -1,8 +1,7 @@
 """A resource manager for ROS 2: its Python client, and the names for plugins.
 
 rosrm decides on which host each process of a ROS 2 application runs, starts the process there,
-watches it, and moves it with its state. All that a Python program or a plugin needs comes from
-`rosrm` itself::
+watches it, and moves it with its state. Programs and plugins import all names from `rosrm`::
 
     import rosrm
 
@@ -22,7 +21,7 @@ A plugin marks its hooks with `hookimpl` and returns offers::
 
 The public names, by purpose:
 
-Client          Client, load_work, RosSettings; its answers: Listing, ProcessRow, HostRow,
+Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health
@@ -42,12 +41,12 @@ Plugins         hookimpl, NoOptions, SkipPlugin
 Errors          RosrmError, ConfigError, PluginError, Refused, NoMaster
 Version         __version__, PROTOCOL_VERSION
 
-Seconds, bytes and fractions from 0 to 1 are the units everywhere. docs/reference/python.md
-describes the client, docs/reference/plugins.md each hook and offer. Two packages have public names
-of their own: `rosrm.node` for authors of nodes that move with their state, and `rosrm.testing` for
-tests of plugins. All other modules are private and may change.
+All units are seconds, bytes and fractions from 0 to 1. docs/reference/python.md has examples of the
+client, docs/reference/plugins.md each hook and offer. Two packages have their own public names:
+`rosrm.node` for authors of nodes that move with their state, and `rosrm.testing` for tests of
+plugins. All other modules are private and may change.
 
-A name is imported at its first use; `import rosrm` alone loads none of them.
+A name is imported at its first use: `import rosrm` loads none of them.
 """
 
 from typing import TYPE_CHECKING, Any, Final

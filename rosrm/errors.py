@@ -1,11 +1,11 @@
-"""Every error that rosrm raises on purpose."""
+"""Errors of rosrm, with messages for the user."""
 
 from __future__ import annotations
 
 from traceback import walk_tb
 from typing import Final
 
-#: Packages through which a plugin is loaded and called: their frames are never the plugin's own.
+#: Packages that load and call plugins; their frames are never frames of a plugin.
 _LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy"})
 
 
@@ -29,7 +29,7 @@ class Refused(RosrmError):
     """A valid request was refused; nothing was changed.
 
     Args:
-        message: what was refused, where, and what is allowed.
+        message: cause, place, allowed values and remedy.
         code: the reason in one word, as in `rosrm_msgs/Answer`.
     """
 
@@ -47,7 +47,7 @@ class NoMaster(RosrmError):
 class LaunchError(RosrmError):
     """A process cannot be started on this host; the text gives the reason.
 
-    Only the first line is the reason: details such as a whole PATH go into further lines.
+    The first line is the reason; further lines have details, such as the PATH.
     """
 
 
@@ -56,7 +56,7 @@ class JournalError(RosrmError):
 
 
 class JournalBlocked(JournalError):
-    """The journal cannot be written now; nothing was changed, and a retry may succeed."""
+    """The journal cannot be written at the moment; nothing was changed, and a retry is safe."""
 
 
 class RecordError(RosrmError):
@@ -70,11 +70,11 @@ class SupervisorError(RosrmError):
 
 
 class TransferError(RosrmError):
-    """A directory cannot be offered to another host, or fetched from one; no part of it is left."""
+    """A directory cannot be sent to another host or fetched from one; no partial copy remains."""
 
 
 class LabError(RosrmError):
-    """A virtual host or its network cannot be made, changed or found."""
+    """A virtual host or its network cannot be created, changed or found."""
 
 
 class CriuError(RosrmError):
@@ -104,7 +104,7 @@ def describe_fault(fault: BaseException) -> str:
 def describe_plugin_fault(fault: BaseException) -> str:
     """Return an exception in one line with the place in the plugin that raised it.
 
-    The text of a `PluginError` is rosrm's own, and is returned unchanged.
+    The text of a `PluginError` is rosrm's own sentence, and is returned unchanged.
     """
     if isinstance(fault, PluginError):
         return str(fault)

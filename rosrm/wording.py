@@ -1,4 +1,4 @@
-"""Words in messages: near matches ("did you mean ...?"), plurals, states, amounts with units."""
+"""Phrases for messages: near matches ("did you mean ...?"), plurals, states, amounts with units."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 _SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
 _BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
-#: Most names that a misspelt one is compared with, because the master compares in its loop.
+#: Highest number of names with which a misspelt name is compared, because the master's loop waits.
 _MOST_COMPARED: Final = 1000
 #: Commands that list the names of a kind.
 _LISTED_BY: Final = {"process": "rosrm ps --all", "host": "rosrm hosts"}
@@ -31,12 +31,12 @@ def get_close_matches(
 
 
 def no_such(kind: str, names: Sequence[str], known: Iterable[str]) -> str:
-    """Return the refusal of names that do not exist, with similar names or all existing ones.
+    """Return the refusal of unknown names, with the nearest known names or some of the known ones.
 
     Args:
         kind: "process" or "host".
-        names: names that do not exist.
-        known: existing names of that kind, the likeliest first.
+        names: unknown names.
+        known: known names of that kind, the likeliest first.
     """
     there = list(islice(known, _MOST_COMPARED))
     most = 3 if len(names) == 1 else 1

@@ -21,9 +21,8 @@ def load_host(path: str | Path, registry: Registry | None = None) -> HostConfig:
     """Read a slave's settings; raises one `ConfigError` with all problems.
 
     Args:
-        path: of the file.
-        registry: the installed plugins; without it the names and options of plugins are not
-            checked.
+        path: path of the file.
+        registry: the installed plugins; None: names and options of plugins are not checked.
     """
     return checked_host(read(path), path, registry)
 

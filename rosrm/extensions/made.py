@@ -1,4 +1,4 @@
-"""Objects that the offers of plugins made, and the checks of them."""
+"""Objects that the offers of plugins created, and their checks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rosrm.model.rows import PluginKind
 from rosrm.model.values import RESOURCE_SLOTS, Reading, ResourceDescription
 from rosrm.wording import get_close_matches
 
-#: Members that the object of each kind must have.
+#: Members that an object of each kind must have.
 _METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
     "probe": ("resources", "read", "close"),
     "scoring": ("score",),
@@ -29,7 +29,7 @@ _FAILED_PERIOD: Final = 10.0
 
 @dataclass(frozen=True)
 class MadeProbe:
-    """A probe that is present on this host; period and deadline are of its offer, seconds."""
+    """A probe on this host; period and deadline, in seconds, are those of its offer."""
 
     name: str
     probe: Probe
@@ -43,8 +43,8 @@ class Probes:
     """The probes of a host.
 
     Attributes:
-        made: those present, and a `FailedProbe` for each that could not be made.
-        absent: name to the reason, of probes that declare themselves absent here.
+        made: created probes, and a `FailedProbe` for each probe that could not be created.
+        absent: name of each probe that is absent on this host to the reason (`SkipPlugin`).
     """
 
     made: tuple[MadeProbe, ...]
@@ -52,14 +52,14 @@ class Probes:
 
 
 class FailedProbe:
-    """Stands for a chosen probe that could not be made: each read fails with the reason.
+    """Substitute for a chosen probe that could not be created; each read fails with the reason.
 
-    So its resources are stale, and a limit on one of them stops new work, as it does where a probe
-    fails in reading.
+    So its resources are stale, and the host gets no new work if one of them has a limit, as after a
+    failed read of a probe.
 
     Attributes:
-        resources: declared by the offer and read by no other probe, of unknown capacity.
-        reason: why there is no probe, with the plugin and the place.
+        resources: resources that the offer declares and no other probe reads, of unknown capacity.
+        reason: why the probe could not be created, with the plugin and the place.
     """
 
     def __init__(self, resources: Sequence[ResourceDescription], reason: str) -> None:
@@ -87,9 +87,9 @@ class MadeLaunchers:
     """The launchers of a host.
 
     Attributes:
-        made: by name.
-        absent: name to the reason, of those that say that they are absent here.
-        broken: name to the reason, of those that could not be made.
+        made: name to the created launcher.
+        absent: name of each launcher that is absent on this host to the reason (`SkipPlugin`).
+        broken: name of each launcher that could not be created to the reason.
     """
 
     made: Mapping[str, MadeLauncher]
@@ -99,7 +99,7 @@ class MadeLaunchers:
 
 @dataclass(frozen=True)
 class OfferedExecutor:
-    """An executor, and the name of the migration strategy whose offer has it."""
+    """An executor, and the name of the migration strategy that offers it."""
 
     strategy: str
     call: Executor
@@ -109,7 +109,7 @@ class OfferedExecutor:
 
 
 def failed_probe(offer: ProbeOffer, reason: str, others: Sequence[MadeProbe]) -> MadeProbe:
-    """Return a substitute for a probe that could not be made."""
+    """Return a substitute for a probe that could not be created."""
     taken = {resource.name for other in others for resource in other.resources}
     described = [
         ResourceDescription(resource, "1", 1.0, "unknown")
@@ -122,7 +122,7 @@ def failed_probe(offer: ProbeOffer, reason: str, others: Sequence[MadeProbe]) ->
 
 
 def missing_method(kind: PluginKind, thing: object) -> str:
-    """Return the fault of an object that an offer made; "": it has all its methods."""
+    """Return the fault of an object that an offer created; "": it has all its methods."""
     if thing is None:
         wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
         return f"None; an object with {wanted} is required (does it lack a `return`?)"
@@ -138,7 +138,7 @@ def missing_method(kind: PluginKind, thing: object) -> str:
 def fault_of_resources(
     resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
 ) -> str:
-    """Return why a host cannot have these resources, without the subject; "" if it can."""
+    """Return why a host cannot have these resources, as a predicate; "" if it can."""
     taken = {resource.name: other.name for other in before for resource in other.resources}
     if not resources:
         return "describes no resource; raise SkipPlugin in `create` where there is nothing to read"
@@ -152,15 +152,15 @@ def fault_of_resources(
             declared = repr((*offer.resources, resource.name))
             return (
                 f"reads {resource.name!r}, which its offer does not declare: "
-                f"say ProbeOffer(..., resources={declared})"
+                f"write ProbeOffer(..., resources={declared})"
             )
     if len(taken) + len(resources) > RESOURCE_SLOTS:
-        return f"brings the resources of this host to more than {RESOURCE_SLOTS}"
+        return f"exceeds the {RESOURCE_SLOTS} resources that a host may have"
     return ""
 
 
 def close_quietly(probe: Probe) -> None:
-    """Close a probe that is given up; ignore a failure of the close."""
+    """Close a probe that is not used; ignore a failure."""
     try:
         probe.close()
     except FAULTS:

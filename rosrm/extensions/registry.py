@@ -1,7 +1,7 @@
-"""Registry of plugins: selection by name, creation, outcome of each.
+"""Registry of plugins: selection by name, creation of their objects, states for listings.
 
-This module does not import pydantic, because the runtimes of master and slave use it too. They get
-checked options; `rosrm.config.options` checks those of a file against the same offers.
+This module does not import pydantic, because the runtimes of master and slave import it. They get
+checked options; `rosrm.config.options` checks the options in a file against the same offers.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from rosrm.model.values import (
 )
 from rosrm.wording import counted, get_close_matches
 
-#: Distribution with rosrm's own plugins of a kind, for an installation without any.
+#: Distribution with rosrm's own plugins of each kind, for messages if none is installed.
 _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "probe": "rosrm-resources",
     "scoring": "rosrm-scoring",
@@ -71,10 +71,10 @@ _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "checkpoint": "rosrm-checkpoint",
 }
 
-#: Seconds for a `create`, which may load a large library.
+#: Time-out of `create` in seconds; it may load a large library.
 CREATE_LIMIT: Final = 30.0
 
-#: Most broken plugins in a message where it is unclear which one is meant.
+#: Highest number of broken plugins in a message if the intended one is unknown.
 _MOST_BROKEN: Final = 3
 
 _NO_CAPABILITIES: Final = Capabilities()
@@ -84,7 +84,7 @@ T = TypeVar("T")
 
 
 class Registry:
-    """The plugins of this installation; made by `discover`."""
+    """The plugins of this installation; `discover` creates it."""
 
     def __init__(self, loaded: Loaded) -> None:
         self._offers: dict[Plugin, Offered] = {}
@@ -97,7 +97,7 @@ class Registry:
     def discover(cls) -> Registry:
         """Find and load the installed plugins.
 
-        Broken plugins are kept with their reason, and raise nothing.
+        A broken plugin raises nothing and is listed with its reason.
         """
         return cls.load(installed_plugins())
 
@@ -119,7 +119,7 @@ class Registry:
         return tuple(self._broken)
 
     def names(self, kind: PluginKind) -> tuple[str, ...]:
-        """Return the offered names of one kind."""
+        """Return the names of all offers of one kind."""
         return tuple(sorted(name for of_kind, name in self._offers if of_kind == kind))
 
     def offer(self, kind: PluginKind, name: str) -> ChosenOffer:
@@ -149,10 +149,10 @@ class Registry:
         return chosen
 
     def rows(self, *kinds: PluginKind, host: str = "") -> list[PluginRow]:
-        """Return one row for each offer and each fault of these kinds (of all where none is given).
+        """Return one row for each offer and each fault of these kinds (without kinds: of all).
 
-        State and reason depend on the calls below: "available" until the object was made, then
-        "selected", "absent" or "broken".
+        The state is "available" until the object was created, then "selected", "absent" or
+        "broken".
         """
         rows = []
         for (kind, name), offered in sorted(self._offers.items()):
@@ -168,19 +168,19 @@ class Registry:
     # --- creation -----------------------------------------------------------------------------
 
     def scoring(self, name: str, options: Mapping[str, Any] = EMPTY) -> ScoringPolicy:
-        """Make a scoring policy; raises `ConfigError` or `PluginError`."""
+        """Create a scoring policy; raises `ConfigError` or `PluginError`."""
         return cast(ScoringPolicy, self._required("scoring", name, options))
 
     def checkpoint(
         self, name: str | None, options: Mapping[str, Any] = EMPTY
     ) -> CheckpointPolicy | None:
-        """Make a checkpoint policy, None for none; raises `ConfigError` or `PluginError`."""
+        """Create a checkpoint policy, None for none; raises `ConfigError` or `PluginError`."""
         if name is None:
             return None
         return cast(CheckpointPolicy, self._required("checkpoint", name, options))
 
     def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
-        """Make migration strategies by name, in this order; raises as `scoring` does."""
+        """Create migration strategies by name, in this order; raises as `scoring` does."""
         made = {
             name: cast(MigrationStrategy, self._required("migration", name, options))
             for name, options in chosen.items()
@@ -190,7 +190,7 @@ class Registry:
         return made
 
     def _check_executors(self, name: str, strategy: object) -> None:
-        """Refuse a strategy whose `host_check` or `discard` is no executor of its own offer."""
+        """Refuse a strategy with a `host_check` or `discard` that its own offer lacks."""
         own = self._strategy(name).executors
         for kind, named in ((HostChecking, "host_check"), (PeriodicImaging, "discard")):
             fault = ""
@@ -224,7 +224,7 @@ class Registry:
             offer, common = self._strategy(strategy), chosen.get(strategy, EMPTY)
             return merged_options(offer.own_options or offer.options, common, own)
 
-        common = cache(partial(merged, own=EMPTY))  # most processes set no option of their own
+        common = cache(partial(merged, own=EMPTY))  # most processes have no own options
 
         def options(strategy: str, spec: ProcessSpec) -> Any:
             own = spec.migration.options if spec.migration.strategy == strategy else EMPTY
@@ -233,7 +233,7 @@ class Registry:
         return options
 
     def capabilities(self, chosen: NameToOptions = EMPTY) -> dict[str, Capabilities]:
-        """Return what each installed strategy can do for a process without options of its own."""
+        """Return the capabilities of each installed strategy for a process without own options."""
         of = self.capabilities_of(chosen)
         names = self.names("migration")
         return {name: of(ProcessSpec("", migration=MigrationPolicy(name))) for name in names}
@@ -241,9 +241,9 @@ class Registry:
     def capabilities_of(
         self, chosen: NameToOptions = EMPTY
     ) -> Callable[[ProcessSpec], Capabilities]:
-        """Return the function that tells what the strategy of a process can do for it.
+        """Return a function that returns the capabilities of the strategy of a process.
 
-        A strategy that is not installed here, or fails to tell, has no capabilities.
+        A strategy that is not installed here, or that fails, has no capabilities.
 
         Args:
             chosen: strategies with their options for all processes.
@@ -268,7 +268,7 @@ class Registry:
         return cast(MigrationOffer, self.offer("migration", name))
 
     def launchers(self, context: LauncherContext) -> MadeLaunchers:
-        """Make the launchers of a host; one that cannot be made is left out with the reason."""
+        """Create the launchers of a host; list those that cannot be created with the reason."""
         made: dict[str, MadeLauncher] = {}
         absent: dict[str, str] = {}
         broken: dict[str, str] = {}
@@ -285,7 +285,7 @@ class Registry:
         return MadeLaunchers(made, absent, broken)
 
     def executors(self) -> dict[str, OfferedExecutor]:
-        """Return the executors that plans may name on this host, from all migration offers."""
+        """Return the executors that plans may name on this host, of all migration offers."""
         return {
             executor: OfferedExecutor(name, function)
             for name in self.names("migration")
@@ -293,7 +293,7 @@ class Registry:
         }
 
     def broken_strategies(self) -> dict[str, str]:
-        """Return the migration offers that are broken here, name to reason."""
+        """Return the name of each broken migration offer, with the reason."""
         return {
             broken.name or broken.source.plugin: f"{broken.source}: {broken.reason}"
             for broken in self._broken
@@ -301,10 +301,10 @@ class Registry:
         }
 
     def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
-        """Make the probes of a host, the default ones for None.
+        """Create the probes of a host, the default ones for None.
 
-        A probe that declares itself absent here is left out with its reason. One that fails in any
-        other way is replaced by a `FailedProbe`.
+        A probe that raises `SkipPlugin` is absent. A probe that fails in any other way is replaced
+        by a `FailedProbe`.
 
         Raises:
             ConfigError: for an unknown name or option.
@@ -350,7 +350,7 @@ class Registry:
         return MadeProbe(name, probe, resources, offer.period, offer.deadline)
 
     def _required(self, kind: PluginKind, name: str, options: Mapping[str, Any]) -> Any:
-        """Make an object that the master needs: its absence here is an error."""
+        """Create an object that the master needs, so that its absence here is an error."""
         try:
             return self._make(kind, name, options)
         except SkipPlugin as skip:
@@ -379,7 +379,7 @@ class Registry:
 
         try:
             thing = limited(CREATE_LIMIT, partial(create, *given), late)
-        except (SkipPlugin, ConfigError):  # raised on purpose, for this host or these options
+        except (SkipPlugin, ConfigError):  # not a fault of the plugin
             raise
         except FAULTS as fault:
             reason = f"`create` ({definition(create)}) raised {describe_plugin_fault(fault)}"
@@ -399,7 +399,7 @@ class Registry:
     # --- lookup of names ----------------------------------------------------------------------
 
     def _keep_single(self, offers: Sequence[Offered]) -> None:
-        """Keep the offers with a unique name: two plugins with one name would run by chance."""
+        """Keep the offers with a unique name, because a duplicate name is ambiguous."""
         for offered in offers:
             key = (offered.kind, offered.offer.name)
             same = [other for other in offers if (other.kind, other.offer.name) == key]
@@ -411,9 +411,9 @@ class Registry:
                 self._broken.append(Broken(offered.source, reason, *key))
 
     def _refuse_shared_executors(self) -> None:
-        """Mark offers as broken whose executors share a name, because orders hold only the name.
+        """Mark offers with executors of equal names as broken, because orders have only the name.
 
-        Offers that share one function may share its name.
+        Offers with the same function may share its name.
         """
         owners: dict[str, list[str]] = {}
         for name in self.names("migration"):
@@ -442,7 +442,7 @@ class Registry:
         title, names = TITLES[kind], self.names(kind)
         near = get_close_matches(name, names, 1)
         meant = f"; did you mean {near[0]!r}?" if near else "."
-        shipped = f"; {_SHIPPED_IN[kind]} brings rosrm's own" if kind in _SHIPPED_IN else ""
+        shipped = f"; {_SHIPPED_IN[kind]} has rosrm's own" if kind in _SHIPPED_IN else ""
         installed = f"Installed: {', '.join(names)}." if names else f"None is installed{shipped}."
         raise ConfigError(
             f"unknown {title} {name!r}{meant} {installed}{self._broken_note(kind, name)}"
@@ -451,13 +451,13 @@ class Registry:
     def _broken_note(self, kind: PluginKind, name: str = "") -> str:
         """Return the faults of the broken plugin that may be meant, and the number of the others.
 
-        A plugin is matched by the name of its offer or, where that is unknown, by its own.
+        A plugin is matched by the name of its offer or, if that is unknown, by its own name.
         """
         might = [b for b in self._broken if b.kind in ("", kind)]
         meant = [b for b in might if not name or name == b.name]
         if not meant:
             meant = [b for b in might if not b.name and _is_named_like(b.source, name)]
-        if not meant:  # any plugin without a known offer may be the one
+        if not meant:  # any plugin without a known offer may be meant
             meant = [b for b in might if not b.name][:_MOST_BROKEN]
         reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in meant)
         note = " Broken: " + "; ".join(reasons) + "." if reasons else ""
@@ -469,7 +469,7 @@ class Registry:
 
 
 def _is_named_like(source: PluginSource, name: str) -> bool:
-    """Return True if a broken plugin without known offers may have one of this name."""
+    """Return True if a broken plugin without known offers may have an offer of this name."""
     words = {word for text in (source.plugin, source.distribution) for word in _words(text)}
     return bool(words & set(_words(name))) or bool(get_close_matches(name, [source.plugin], 1))
 

@@ -1,4 +1,4 @@
-"""Values that the journal stores, and the contract of a journal: event record and intents."""
+"""Values in the journal, and the protocol of a journal: event record and intents."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from rosrm.model.values import EMPTY
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One line of the event record, and the intent that it changes.
+    """One line of the event record.
 
     Attributes:
-        process: name; "" for none.
-        host: name; "" for none.
+        process: name of the process; "" for none.
+        host: name of the host; "" for none.
         message: one sentence for logs and listings.
-        facts: JSON-able particulars.
+        facts: details by name, valid JSON.
     """
 
     kind: EventKind
@@ -30,7 +30,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class StoredRecord:
-    """A record as the journal keeps it.
+    """A record in the journal.
 
     Attributes:
         sequence: 1, 2, 3, ... without a gap.
@@ -46,12 +46,12 @@ class StoredRecord:
 
 @dataclass(frozen=True, slots=True)
 class Intent:
-    """A desired value, durable: the newest value under a key replaces the older ones.
+    """A durable value of the desired state; the newest value of a key replaces older ones.
 
     Attributes:
-        table: "process", "migration", "host", "learned", "cluster", "removed".
-        key: within the table.
-        value: JSON-able; None: the key is removed.
+        table: "process", "migration", "host", "learned", "cluster" or "removed".
+        key: key within the table.
+        value: valid JSON; None: remove the key.
     """
 
     table: str
@@ -61,7 +61,7 @@ class Intent:
 
 @runtime_checkable
 class Journal(Protocol):
-    """Stores intents and the event record; data survives a SIGKILL once `write` has returned."""
+    """Stores intents and the event record; they survive a SIGKILL once `write` has returned."""
 
     def write(
         self, records: Sequence[Record], intents: Sequence[Intent], now: float
@@ -76,8 +76,8 @@ class Journal(Protocol):
     ) -> Sequence[StoredRecord]:
         """Return the newest matching records after a sequence, oldest first.
 
-        Those of a host include migrations from it: their facts name the host as `from`.
+        The records of a host include migrations from it, whose facts have the host as `from`.
         """
 
     def close(self) -> None:
-        """Flush and release the files."""
+        """Flush and close the files."""

@@ -10,7 +10,7 @@ from typing import Final
 
 from rosrm.errors import ConfigError
 
-#: A higher domain would need ports beyond the range of UDP.
+#: Highest domain id, because higher ones need ports beyond 65535.
 HIGHEST_DOMAIN: Final = 232
 #: An absolute ROS namespace.
 NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -25,7 +25,7 @@ class RosSettings:
         discovery_range: "localhost", "subnet", "off" or "system_default".
         discovery_server: "host:port" of a Fast DDS discovery server, instead of multicast.
         transports: FASTDDS_BUILTIN_TRANSPORTS, for example "UDPv4".
-        namespace: of rosrm's topics and services.
+        namespace: namespace of rosrm's topics and services.
     """
 
     domain: int | None = None
@@ -40,7 +40,7 @@ class RosSettings:
             "ROS_DOMAIN_ID": "" if self.domain is None else str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": self.discovery_range.upper(),
             "ROS_DISCOVERY_SERVER": self.discovery_server,
-            # A plain client gets only its own topics from the server: too little to see nodes.
+            # A plain client gets only its own topics from the server and sees no other nodes.
             "ROS_SUPER_CLIENT": "TRUE" if self.discovery_server else "",
             "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
         }
@@ -49,8 +49,8 @@ class RosSettings:
     def check(self) -> None:
         """Raise `ConfigError` for a setting, or a ROS_DOMAIN_ID in force, that ROS cannot use.
 
-        Otherwise DDS would print a fault of its own or end the process, or rclpy would raise a
-        traceback.
+        Otherwise DDS would print an error without a remedy or end the process, or rclpy would raise
+        a traceback.
         """
         if not NAMESPACE.fullmatch(self.namespace):
             raise ConfigError(
@@ -73,7 +73,7 @@ class RosSettings:
             )
 
     def describe(self) -> str:
-        """Return domain, RMW and discovery in force, for messages."""
+        """Return a text on the domain, RMW and discovery in force."""
         joined = {**os.environ, **self.environment()}
         discovery = joined.get("ROS_DISCOVERY_SERVER") or joined.get(
             "ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET"

@@ -1,4 +1,4 @@
-"""Main loop of the slave: sample, report, ask for work, launch instances, watch them."""
+"""Main loop of the slave: sample, report, request work, launch instances, watch them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Command `rosrm config check`: validation of configuration files before use."""
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig, HostConfig
     from rosrm.extensions.registry import Registry
 
-#: Lowest similarity of a misspelt word; gpu_memory and memory are less similar.
+#: Lowest similarity of a misspelt word; `gpu_memory` and `memory` are less similar.
 _NEAR: Final = 0.8
 
 config = typer.Typer(no_args_is_help=True, help="Check configuration files.")

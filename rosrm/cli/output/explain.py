@@ -20,7 +20,7 @@ _DECIDED: Final = {
     "set_aside": "No host may take {process}",
 }
 _STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "full": "yellow"}
-#: Decimals of a score: more are the rounding errors of a sum, such as 1.4e-17.
+#: Decimals of a score; further ones are rounding errors of a sum, such as 1.4e-17.
 _DECIMALS: Final = 9
 _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 

@@ -43,7 +43,7 @@ class Withdraw:
     """Withdraw an assignment.
 
     An assignment that the slave has not fetched yields `AssignmentWithdrawn`. For a fetched one,
-    `if_fetched` goes to the slave, so that the instance never runs or ends.
+    `if_fetched` is sent to the slave, which then never starts the instance or stops it.
     """
 
     order_id: OrderId
@@ -92,7 +92,7 @@ class PublishStateConfig:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Answer a request that came with an event; `code` is that of a refusal."""
+    """Answer a request that came with an event; `code` is "" unless the request is refused."""
 
     request: int
     accepted: bool = True

@@ -1,4 +1,4 @@
-"""Node names in the ROS graph that several processes share, as far as specs tell."""
+"""Node names that several processes share in the ROS graph, derived from their specs."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def shared_nodes(processes: Iterable[tuple[str, str]]) -> list[str]:
         if node:
             users.setdefault(node, []).append(name)
     return [
-        f"{listed(names)} put {node} into the ROS graph; give each node a name of its own"
+        f"{listed(names)} put {node} into the ROS graph; give each node its own name"
         for node, names in users.items()
         if len(names) > 1
     ]
 
 
 def node_of(spec: ProcessSpec) -> str:
-    """Return the node that a process adds to the graph, in words; "" if its spec does not tell.
+    """Return a phrase for the node that a process adds to the graph; "" if its spec names none.
 
-    rosrm appends its name rule to the arguments of the user, and the first rule counts.
+    rosrm appends its remapping rule to the user's arguments, and ROS applies the first rule.
     """
     words = (*spec.command, *spec.arguments)
     rules = dict(

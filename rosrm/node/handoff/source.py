@@ -179,7 +179,7 @@ class HandoffSource:
         entities, wanted = self._entities, self._finishing
         self._finishing = False
         if self._channel is None or not wanted or self._fault:
-            return  # the handoff was called off
+            return  # the handoff was aborted
         self._timers_due = entities.fall_silent()
         self._silent_since = time.monotonic()
         if not self._show(last=True):

@@ -182,7 +182,7 @@ processes: [{name: a}, {name: b, arguments: [--ros-args, -r, '__node:=a']}]
         ("processes: [{name: a, command: x, needs: {cpus: 1}}]",
          ":1:43: warning: needs: no probe reads 'cpus'; did you mean 'cpu'?"),
         (NAMESAKES,
-         ": warning: a and b put the node /a into the ROS graph; give each node a name of"),
+         ": warning: a and b put the node /a into the ROS graph; give each node its own name"),
     ],
 )  # fmt: skip
 def test_what_may_be_a_mistake_is_a_warning(check, tmp_path, text, warning):

@@ -442,7 +442,7 @@ def test_after_a_start_of_the_master_a_process_waits_for_the_host_of_its_snapsho
     cluster.wait(1.0)
     assert cluster.phase("behind") == "running"
     assert cluster.queue() == ["p"]
-    assert "has not come back yet" in cluster["p"].reason
+    assert "has not rejoined yet" in cluster["p"].reason
     cluster.wait(4.0)  # the lease has expired
     assert cluster.phase("p") == "running"
 
@@ -470,7 +470,7 @@ def test_a_process_whose_replica_is_lost_too_waits_one_lease_for_it(rejoins: boo
     keep(cluster, keeper, ("p", cluster["p"].owner, 4))
     cluster.cut(host, keeper, seconds=4.5)  # the lease has expired, and the next one has begun
     assert cluster.queue() == ["p"]
-    assert "has not come back yet" in cluster["p"].reason
+    assert "has not rejoined yet" in cluster["p"].reason
     if rejoins:
         cluster.reconnect(keeper, seconds=1.0)
         assert assigned(cluster).kept_on == (keeper,)

@@ -104,7 +104,7 @@ def test_a_submission_warns_of_two_nodes_of_one_name() -> None:
     reply = cluster.submit(node("q", arguments=alias))
     assert reply.message == (
         "1 process queued. Warning: q and p put the node /robot/p into the ROS graph; give each "
-        "node a name of its own"
+        "node its own name"
     )
     cluster.cancel("p", "q")
     cluster.settle()

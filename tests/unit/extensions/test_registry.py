@@ -168,7 +168,7 @@ def test_a_probe_reads_only_what_its_offer_declares(context):
     """Names of resources in a file can thus be checked before any probe is made."""
     registry = registry_of(offered("fds", lambda options, context: Probe("files")))
     reason = failed(registry.probes({"fds": {}}, context))["fds"]
-    assert "which its offer does not declare: say ProbeOffer(..., resources=(" in reason
+    assert "which its offer does not declare: write ProbeOffer(..., resources=(" in reason
     assert registry.resources() == ("fds",)
 
 
@@ -318,7 +318,7 @@ UNCLOSABLE = SimpleNamespace(resources=[NOTHING], read=None, close=None)  # None
         (Probe("a"), "reads 'a', as 'first' does already"),
         (Probe("b", capacity=0.0), "gives 'b' a capacity of 0.0; a number above 0"),
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
-        (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
+        (Probe(*(f"r{i}" for i in range(16))), "exceeds the 16 resources"),
         (Probe(), "describes no resource; raise SkipPlugin in `create`"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
         (UNCLOSABLE, "gives 'b' a capacity of 0.0; a number above 0"),
@@ -449,7 +449,7 @@ def test_a_hook_that_hangs_is_named_while_it_does_and_ended(monkeypatch, caplog)
     assert registry.names("probe") == ("fine",)
     (broken,) = registry.broken
     place = f"{__file__}:{register_probes.__code__.co_firstlineno}"
-    said = "failed with TimeoutError: it did not return within 0.3 s; do in `create` what takes "
+    said = "failed with TimeoutError: it did not return within 0.3 s; move slow work into "
     assert broken.reason.startswith(f"register_probes ({place}) {said}")
     assert broken.reason.endswith(f"({__file__}:{register_probes.__code__.co_firstlineno + 2})")
     said = "plugin 'slow' is still being loaded after 0.1 s: register_probes ("

@@ -179,7 +179,7 @@ class Simulation(World[Machine]):
         self.tell(happened.TimePassed())
 
     def _read(self, machines: list[Machine]) -> None:
-        """Deliver readings of hosts to the master; hosts under their limits ask for work."""
+        """Deliver readings of hosts to the master; hosts under their limits request work."""
         # 0: a reading is never ahead of the statuses, which take their time.
         event = self.readings(machines, status_sequence=np.zeros(len(machines), np.uint64))
         self.tell(event)

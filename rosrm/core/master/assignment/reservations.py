@@ -11,7 +11,7 @@ from rosrm.core.master.state.process import Instance
 from rosrm.model.records import Intent
 from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
 
-#: Seconds: a shorter run is mostly start-up, so it does not show the CPU use of a program.
+#: Shortest run, in seconds, that shows the CPU use of a program; before, start-up dominates.
 _TELLING_RUN: Final = 1.0
 
 

@@ -198,7 +198,7 @@ def readings_received(state: MasterState, event: happened.ReadingsReceived, now:
     """Store a batch of readings; refuse and record invalid ones."""
     first = bool(state.set_aside) and bool(state.hosts.without_reading().any())
     refused = take_readings(state.hosts, event, now)
-    if first:  # before the queue is served, which keeps the order
+    if first:  # before placement, so that requeued processes keep their order
         reconsider_set_aside(state, now)
     for row in np.flatnonzero(refused):
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
