@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.errors import CriuError
+from rosrm.errors import CriuError, PortableError
 from rosrm_criu.control.client import await_joined
 from rosrm_criu.engine import dump as dumping
 from rosrm_criu.engine import external_resources, image, paths, process_tree, slots
@@ -126,15 +126,20 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
         pids: leaders of the instances that run here, by `process#number`.
 
     Raises:
-        CriuError: one of them is still being dumped.
+        CriuError, PortableError: one of them is still being dumped, or cannot be called back.
     """
     for instance, pid in pids.items():
         number = artifacts.number_of(instance)
         away = paths.periodic(state, number) / _AWAY
-        if away.exists() and not artifacts.is_busy(number):
+        if not away.exists() or artifacts.is_busy(number):
+            continue
+        try:
             _await_end_of_dump(instance, pid)
             call_back(pid, control_of(pid), away.read_text(encoding="utf-8"))
-            away.unlink()
+        except (CriuError, PortableError):
+            if process_tree.is_alive(pid):
+                raise
+        away.unlink(missing_ok=True)
 
 
 def _await_end_of_dump(instance: str, pid: int) -> None:
