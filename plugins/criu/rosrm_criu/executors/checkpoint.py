@@ -8,7 +8,6 @@ after any failure until the process is restored.
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import signal
 import socket
@@ -74,8 +73,8 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
             )  # fmt: skip
         udp_ports.write(checkpoint_ports(asked.state, asked.source), udp_ports.bound(pids))
     except BaseException:  # any error: the process continues, and nothing is left behind
-        _discard(asked.state, asked.source)
         dump.resume(pid)
+        _discard(asked.state, asked.source)
         raise
     return {"size": manifest.size, "seconds": {"dump": time.monotonic() - began}}
 
@@ -85,10 +84,10 @@ def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     asked = StepArguments.of(arguments)
     turn_back(asked.attempt)
     artifacts.after(KEEP, asked.attempt, asked.timeout)
-    _discard(asked.state, asked.source)
     pid = asked.pid(asked.source)
     if pid:
         dump.resume(pid)
+    _discard(asked.state, asked.source)
     return {}
 
 
@@ -124,19 +123,12 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     artifacts.forget_restored(asked.state, asked.instances)
     try:
         target.mkdir(mode=0o700)
-        shutil.copytree(source, target, copy_function=_link, dirs_exist_ok=True)
+        shutil.copytree(source, target, copy_function=image.link_or_copy, dirs_exist_ok=True)
         artifacts.note_origin(target, asked.source)
     except (OSError, shutil.Error) as error:
         artifacts.discard(target)
         raise CriuError(f"the image {source} cannot be laid out as {target}: {error}") from None
     return {"taken": True}
-
-
-def _link(source: str, target: str) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # a file system without hard links
-        shutil.copy2(source, target)
 
 
 def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:

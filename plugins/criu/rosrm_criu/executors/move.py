@@ -77,8 +77,10 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         offered = time.monotonic()
         offer = _offer(sender, directory, asked)
     except Exception:  # any error: the node rejoins
-        artifacts.withdraw(asked.state, asked.source)
-        call_back(pid, control, asked.attempt)
+        try:
+            call_back(pid, control, asked.attempt)
+        finally:  # afterwards, because the end of the sender takes a while
+            artifacts.withdraw(asked.state, asked.source)
         raise
     return {
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
