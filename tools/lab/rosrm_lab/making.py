@@ -85,11 +85,15 @@ def make(hierarchies: Sequence[Hierarchy], record: LabRecord, between: Callable[
 
 
 def switch_on(hierarchies: Sequence[Hierarchy], record: LabRecord, host: str) -> None:
-    """Connect a host and start its first process; raises `LabError`."""
+    """Connect a host and start its first process, or leave nothing of it; raises `LabError`."""
     switch_off(hierarchies, record, host)  # remains of an earlier, partly killed run of the host
     plan = record.plan
-    network.plug_in(plan, host, record.links[host])
-    record.inits[host] = boot(hierarchies, plan.name, plan.host(host), plan.hosts_file())
+    try:
+        network.plug_in(plan, host, record.links[host])
+        record.inits[host] = boot(hierarchies, plan.name, plan.host(host), plan.hosts_file())
+    except BaseException:
+        switch_off(hierarchies, record, host)
+        raise
 
 
 def switch_off(hierarchies: Sequence[Hierarchy], record: LabRecord, host: str) -> None:
