@@ -28,8 +28,8 @@ from rosrm_criu.engine import (
 )
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
-from rosrm_criu.executors import artifacts
-from rosrm_criu.executors.request import StepArguments, check_wanted, turn_back, without_log_names
+from rosrm_criu.executors import artifacts, attempts
+from rosrm_criu.executors.request import StepArguments, without_log_names
 from rosrm_criu.plans import KEEP, TAKE
 
 #: Sockets that reserve the ports of checkpointed processes, by the number of the instance.
@@ -45,11 +45,11 @@ _LOOK: Final = 0.005
 def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Dump the process into an image; the process stays stopped."""
     asked = StepArguments.of(arguments)
-    return artifacts.once(KEEP, asked.attempt, lambda: _keep(asked))
+    return attempts.once(KEEP, asked.attempt, lambda: _keep(asked))
 
 
 def _keep(asked: StepArguments) -> Mapping[str, Any]:
-    with artifacts.alone(asked.source, asked.timeout):
+    with attempts.alone(asked.source, asked.timeout):
         return _keep_alone(asked)
 
 
@@ -64,7 +64,7 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
         raise CriuError(f"{asked.process} cannot be checkpointed: {trouble}")
     directory, began = checkpoint(asked.state, asked.source), time.monotonic()
     artifacts.discard(directory)
-    check_wanted(asked.attempt)
+    attempts.check_wanted(asked.attempt)
     try:
         with without_log_names():
             manifest = dump.dump(
@@ -82,8 +82,8 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
 def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Undo a failed checkpoint: continue the process, unless it has ended."""
     asked = StepArguments.of(arguments)
-    turn_back(asked.attempt)
-    artifacts.after(KEEP, asked.attempt, asked.timeout)
+    attempts.turn_back(asked.attempt)
+    attempts.after(KEEP, asked.attempt, asked.timeout)
     pid = asked.pid(asked.source)
     if pid:
         dump.resume(pid)

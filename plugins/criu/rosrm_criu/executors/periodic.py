@@ -21,7 +21,7 @@ from rosrm_criu.engine import external_resources, image, paths, process_tree, sl
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.slots import Rejoin
-from rosrm_criu.executors import artifacts
+from rosrm_criu.executors import artifacts, attempts
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
 from rosrm_criu.executors.request import StepArguments, without_log_names
 
@@ -36,7 +36,7 @@ def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Make the node leave, dump it, and make it rejoin."""
     asked = StepArguments.of(arguments)
     parent = paths.periodic(asked.state, asked.source)
-    with artifacts.alone(asked.source, asked.timeout):
+    with attempts.alone(asked.source, asked.timeout):
         try:
             return _dump(asked, parent)
         except OSError as error:
@@ -131,7 +131,7 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
     for instance, pid in pids.items():
         number = artifacts.number_of(instance)
         away = paths.periodic(state, number) / _AWAY
-        if not away.exists() or artifacts.is_busy(number):
+        if not away.exists() or attempts.is_busy(number):
             continue
         try:
             _await_end_of_dump(instance, pid)
