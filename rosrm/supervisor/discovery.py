@@ -38,7 +38,7 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
         problem = _start(state, log, deadline)
         if not problem:
             continue
-        if time.monotonic() > deadline or "another supervisor" not in problem:
+        if time.monotonic() > deadline or endpoint.ANOTHER not in problem:
             raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
         # Another supervisor is about to listen or to end: neither can be awaited from here.
         time.sleep(0.02)

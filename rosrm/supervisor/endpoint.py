@@ -12,6 +12,8 @@ from rosrm.supervisor import paths
 
 #: Bytes of the supervisor's own log beyond which the next start empties it.
 MOST_OWN_LOG: Final = 1 << 20
+#: First words of the error for a state directory that is served already.
+ANOTHER: Final = "another supervisor"
 #: Least seconds for a connection; a limit of 0 would mean none.
 _SHORTEST: Final = 0.001
 
@@ -92,7 +94,7 @@ def _lock(state: str) -> None:
     except BlockingIOError:
         holder = os.read(file, 20).decode().strip() or "unknown"
         raise EndpointError(
-            f"another supervisor (pid {holder}) serves the state directory {state}"
+            f"{ANOTHER} (pid {holder}) serves the state directory {state}"
         ) from None
     os.ftruncate(file, 0)
     os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
