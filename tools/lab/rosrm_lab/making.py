@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from ipaddress import IPv4Network
 
 from rosrm.errors import LabError
+from rosrm.supervisor.procfs import boot_id
 from rosrm_lab import disks, groups, network, store
 from rosrm_lab.groups import Hierarchy
 from rosrm_lab.host import boot, power_off
@@ -35,7 +36,7 @@ def explained(lab: str) -> Iterator[None]:
 def refuse_if_up(lab: str) -> None:
     """Raise `LabError` where a lab of this name is up, and not abandoned."""
     record = store.read(lab)
-    if record is None or not record.complete or record.boot != store.boot_id():
+    if record is None or not record.complete or record.boot != boot_id():
         return
     if record.owner is not None and not record.owner.alive:
         return
