@@ -137,6 +137,25 @@ def test_a_failed_dump_calls_the_node_back_first(tmp_path, process, monkeypatch,
     assert done == ["call_back", "withdraw"]
 
 
+@pytest.mark.parametrize("is_called_back", [True, False])
+def test_a_node_that_was_not_called_back_stays_noted(
+    tmp_path, process, monkeypatch, is_called_back
+):
+    """The request to rejoin cannot be written; the next slave repeats it."""
+
+    def call_back(*_: object) -> None:
+        if not is_called_back:
+            full()
+
+    monkeypatch.setattr(periodic, "control_of", lambda _: tmp_path / "control")
+    monkeypatch.setattr(periodic, "leave", full)
+    monkeypatch.setattr(periodic, "call_back", call_back)
+    with pytest.raises(CriuError, match="No space left"):
+        periodic.dump(here(tmp_path, "p#1", process.pid))
+    away = tmp_path / "images" / "periodic-1" / "away"
+    assert away.exists() is not is_called_back
+
+
 def test_a_process_that_ended_since_costs_no_host_its_capability(tmp_path):
     """A slave calls back the nodes that its predecessor left; one ends at this moment."""
     ended = subprocess.Popen(["true"])

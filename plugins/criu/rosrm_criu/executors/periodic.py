@@ -56,8 +56,8 @@ def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
     for directory in (parent.parent, parent):
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     slots.discard_unfinished(parent)
-    slot, away, began = slots.new_slot(parent), parent / _AWAY, time.monotonic()
-    away.write_text(asked.attempt, encoding="utf-8")
+    slot, began = slots.new_slot(parent), time.monotonic()
+    (parent / _AWAY).write_text(asked.attempt, encoding="utf-8")
     try:
         manifest, left = _dump_away(asked, pid, control, slot)
         dumped = time.monotonic()
@@ -69,8 +69,6 @@ def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
         if has_failed(control):  # its restart policy starts it from the previous image
             dumping.kill(pid)
         raise
-    finally:
-        away.unlink(missing_ok=True)
     slots.complete(slot, Rejoin(str(control), asked.attempt, owner_of(pid)))
     return {
         "size": manifest.size, "missing": list(status.missing),
@@ -92,6 +90,7 @@ def _dump_away(asked: StepArguments, pid: int, control: Path, slot: Path) -> tup
             )  # fmt: skip
     finally:
         call_back(pid, control, asked.attempt)
+        (slot.parent / _AWAY).unlink(missing_ok=True)
     return manifest, left
 
 
