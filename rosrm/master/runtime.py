@@ -12,7 +12,7 @@ import socket
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master import events as happened
@@ -69,6 +69,20 @@ _BLOCKED: Final = 0.5
 #: Seconds between two attempts to write the journal during a stall.
 _TRY_AGAIN: Final = 0.5
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+
+
+class _LastRun(NamedTuple):
+    """The previous run of this master, by its journal.
+
+    Attributes:
+        newest: sequence of the newest record.
+        machine_rebooted: the machine has rebooted since, and the run recorded no end.
+        epoch: of that run; 0: there was none.
+    """
+
+    newest: int
+    machine_rebooted: bool
+    epoch: int
 
 
 class MasterRuntime:
@@ -143,8 +157,8 @@ class MasterRuntime:
     def _restored(
         self, policy: ScoringPolicy, strategies: dict[str, MigrationStrategy]
     ) -> MasterState:
-        newest, fell, epoch = self._last_run()
-        epoch += 1
+        last = self._last_run()
+        epoch = last.epoch + 1
         state = MasterState(
             self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
             self._fallback, declared=self._declared,
@@ -158,7 +172,7 @@ class MasterRuntime:
             restore.restore(state, self._journal.intents, now)
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
-        journal_gap.begin(state, newest, now, machine_rebooted=fell)
+        journal_gap.begin(state, last.newest, now, machine_rebooted=last.machine_rebooted)
         started = f"master {self._config.name} started, epoch {epoch}"
         self._journal.write(
             [Record(EventKind.MASTER_STARTED, message=started)],
@@ -173,13 +187,12 @@ class MasterRuntime:
         self._record_from(state, now)
         return state
 
-    def _last_run(self) -> tuple[int, bool, int]:
-        """Return the newest sequence, True if the machine crashed since, and the last epoch."""
+    def _last_run(self) -> _LastRun:
         known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
         last = self._journal.records(newest=1)
         stopped = not last or last[0].record.kind is EventKind.MASTER_STOPPED
-        fell = not stopped and known.get("boot", _boot()) != _boot()
-        return self._journal.last_sequence, fell, int(known["epoch"])
+        rebooted = not stopped and known.get("boot", _boot()) != _boot()
+        return _LastRun(self._journal.last_sequence, rebooted, int(known["epoch"]))
 
     def _record_from(self, state: MasterState, now: float) -> None:
         """Begin the recording of this run, if configured, with the intents that were restored."""

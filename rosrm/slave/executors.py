@@ -82,7 +82,7 @@ class Executors:
             min(timeout, threading.TIMEOUT_MAX), self._post, [partial(self._fail, strategy, late)]
         )
         timer.daemon = True
-        given = {**arguments, "here": here}
+        complete = {**arguments, "here": here}
 
         def settle(outcome: ExecutorOutcome) -> None:
             if outcome.code in ("", "unable"):
@@ -93,7 +93,7 @@ class Executors:
             done(outcome)
 
         def work() -> None:
-            outcome = _outcome(name, function, given)
+            outcome = _outcome(name, function, complete)
             timer.cancel()
             self._post(partial(settle, outcome))
 

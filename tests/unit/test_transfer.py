@@ -352,3 +352,11 @@ def test_who_starts_a_transfer_loads_nothing_of_its_libraries():
 def test_a_python_that_cannot_check_archives_is_refused(monkeypatch):
     monkeypatch.delattr(tarfile, "data_filter")
     assert "needs 3.10.12" in starting.missing()
+
+
+def test_a_transfer_killed_within_its_answer_is_reported():
+    """Half a line is no answer."""
+    end = starting._End.__new__(starting._End)
+    end._process = subprocess.Popen(["printf", '{"error": "the'], stdout=subprocess.PIPE)
+    with end._process, pytest.raises(TransferError, match="no answer"):
+        end._answer(5.0)

@@ -177,10 +177,9 @@ class Destination:
         differing = differing_part(self._parts, mark)
         if differing is None:
             return ""
-        topic, ours, theirs = differing
         return (
-            f"the state on {topic} is {theirs} at the source, and {ours} here: both must be the "
-            f"same program"
+            f"the state on {differing.topic} is {differing.theirs} at the source, and "
+            f"{differing.ours} here: both must be the same program"
         )
 
     # --- following -------------------------------------------------------------------------

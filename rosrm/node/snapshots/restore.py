@@ -105,10 +105,9 @@ class SnapshotRestore:
         differing = differing_part(self._parts, mark)
         if differing is None:
             return ""
-        topic, ours, theirs = differing
         return (
-            f"its part on {topic} is {theirs}, and this program's {ours}: it is of another version "
-            f"of the program"
+            f"its part on {differing.topic} is {differing.theirs}, and this program's "
+            f"{differing.ours}: it is of another version of the program"
         )
 
     def _start(self, mark: StateMark) -> None:

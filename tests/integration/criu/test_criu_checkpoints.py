@@ -15,7 +15,7 @@ import pytest
 from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
-from rosrm_criu.executors import artifacts, request
+from rosrm_criu.executors import artifacts, attempts
 from rosrm_criu.executors import checkpoint as steps
 from tests.criu_kit import TIMEOUT, eventually
 
@@ -77,8 +77,8 @@ class Slave:
 @pytest.fixture
 def slave(theatre, tmp_path):
     """Return a slave that was just started and remembers no attempt."""
-    artifacts._flights.clear()
-    request._turned_back.clear()
+    attempts._flights.clear()
+    attempts._turned_back.clear()
     return Slave(theatre, tmp_path / "state")
 
 
