@@ -189,6 +189,14 @@ def _advice(state: MasterState, process: Process) -> str:
     if process.phase is ProcessPhase.BACKOFF:
         return logs
     if process.phase is ProcessPhase.FAILED:
-        again = f"`rosrm restart {process.name}` starts it again"
+        again = (
+            f"`rosrm restart {process.name}` starts it again, `rosrm submit FILE` replaces it by a "
+            f"corrected one"
+        )
         return f"{logs}, {again}" if process.ended_on else again
+    if process.phase is ProcessPhase.SET_ASIDE:
+        return (
+            f"it is queued again when such a host registers; to change what it needs, run "
+            f"`rosrm cancel {process.name}` and submit it again"
+        )
     return ""

@@ -15,7 +15,7 @@ from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
-from rosrm.core.master.migration.start import why_busy
+from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
@@ -117,14 +117,10 @@ def _still_stopping(state: MasterState, name: str) -> str:
 
 
 def _submission_fault(state: MasterState, event: happened.SubmissionReceived) -> str:
-    known = set(state.strategies)
     for spec in event.specs:
         strategy = spec.migration.strategy
-        if strategy is not None and strategy not in known:
-            return (
-                f"{spec.name}: unknown migration strategy {strategy!r}; selected here: "
-                f"{listed(sorted(known))}. Nothing was queued"
-            )
+        if strategy is not None and strategy not in state.strategies:
+            return f"{spec.name}: {why_not_selected(state, strategy)}. Nothing was queued"
         fault = _strategy_fault(state, spec)
         if fault:
             return f"{spec.name}: migration by {strategy!r}: {fault}. Nothing was queued"
@@ -325,7 +321,7 @@ def _begin(
 
 def _cause(by: str) -> str:
     """Return the cause, for records, of a change that a client requested."""
-    return f"asked for by {by}" if by else "asked for"
+    return f"requested by {by}" if by else "requested"
 
 
 def known_host(state: MasterState, name: str) -> Host:

@@ -340,7 +340,7 @@ def test_the_record_of_a_checkpoint_names_its_requester() -> None:
     _, cluster = playing()
     cluster.ask(happened.CheckpointRequested, "p", "anna@desk:42")
     (message,) = cluster.recorded("checkpoint_begun")
-    assert message.endswith("; asked for by anna@desk:42")
+    assert message.endswith("; requested by anna@desk:42")
 
 
 @POLICIES

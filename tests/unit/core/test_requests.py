@@ -36,7 +36,7 @@ def test_a_reply_has_the_number_of_queued_processes() -> None:
         (
             process("r", migration=MigrationPolicy("teleport")),
             "invalid",
-            "unknown migration strategy 'teleport'; selected here: handoff",
+            "the migration strategy 'teleport' is not selected here (selected: handoff",
         ),
     ],
     ids=["name given twice", "unknown strategy"],
@@ -469,7 +469,7 @@ def test_the_record_of_a_request_names_its_requester() -> None:
         record = next(record for record in cluster.records if record.kind == kind)
         assert record.message.endswith(f" (by {by})"), kind
         assert record.facts["by"] == by
-    assert cluster.recorded("migration_begun")[0].endswith(f"asked for by {by}")
+    assert cluster.recorded("migration_begun")[0].endswith(f"requested by {by}")
 
 
 def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ended() -> None:
@@ -515,7 +515,8 @@ def test_an_explanation_has_the_next_command() -> None:
     cluster.submit(process("p", restart=RestartPolicy("never")), process("q"))
     cluster.finish("p", code=2)
     assert cluster.explain("p")["reason"] == (
-        "exit code 2; `rosrm logs p` shows its output, `rosrm restart p` starts it again"
+        "exit code 2; `rosrm logs p` shows its output, `rosrm restart p` starts it again, "
+        "`rosrm submit FILE` replaces it by a corrected one"
     )
     cluster.detach("a")
     assert cluster.explain("q")["reason"].endswith("; start the slave of a again")

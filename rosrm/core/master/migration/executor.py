@@ -51,9 +51,9 @@ from rosrm.model.values import InstanceId, InstanceState
 
 #: Message of the record of a commit.
 _COMMITTED: Final = {
-    Aim.MOVE: "the process is now the one at the destination: the move cannot be undone any more",
-    Aim.CHECKPOINT: "the process is now in its image: the checkpoint cannot be undone any more",
-    Aim.RESTORE: "the process is now the restored one: the restore cannot be undone any more",
+    Aim.MOVE: "committed: the process now runs at the destination; the move can no longer be undone",
+    Aim.CHECKPOINT: "committed: the process is now in its image; the checkpoint can no longer be undone",
+    Aim.RESTORE: "committed: the process now runs from its image; the restore can no longer be undone",
 }
 
 # --- steps ------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
 from rosrm.model.values import InstanceId
-from rosrm.wording import listed, standing
+from rosrm.wording import get_close_matches, listed, standing
 
 #: Method of a strategy that plans for each aim.
 _HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE: "restore"}
@@ -123,11 +123,19 @@ def why_never_movable(state: MasterState, process: Process) -> str:
     if strategy is None:
         return f"{process.name} has no migration strategy; give it `migration:` in its file"
     if strategy not in state.strategies:
-        return (
-            f"{process.name} wants the migration strategy {strategy!r}, which is not selected "
-            f"here; there are {', '.join(sorted(state.strategies)) or 'none'}"
-        )
+        return f"{process.name}: {why_not_selected(state, strategy)}"
     return ""
+
+
+def why_not_selected(state: MasterState, strategy: str) -> str:
+    """Return a sentence: the cluster's configuration does not select a strategy; what may help."""
+    near = get_close_matches(strategy, state.strategies, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return (
+        f"the migration strategy {strategy!r} is not selected here{hint} (selected: "
+        f"{listed(sorted(state.strategies)) or 'none'}). Add it to `migration:` in cluster.yaml, if "
+        f"`rosrm plugins` lists it, or choose one of these"
+    )
 
 
 def why_no_executor(state: MasterState, migration: Migration) -> str:
