@@ -8,8 +8,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from rosrm.snapshots.format import Block, Damaged, Head, checked, decoded_head, encoded_head
-from rosrm.snapshots.reader import COPY, HEAD_ROOM, OPEN, SLOTS, content_of, paths_of, peek
+from rosrm.snapshots.format import Block, Damaged, checked, decoded_head, encoded_head
+from rosrm.snapshots.reader import (
+    COPY,
+    HEAD_ROOM,
+    OPEN,
+    SLOTS,
+    checked_replica,
+    content_of,
+    paths_of,
+    peek,
+)
 
 
 class SlotWriter:
@@ -123,21 +132,22 @@ class CopyWriter:
         _write_all(self._file, [data], self.size)
         self.size += len(data)
 
-    def finish(self) -> Head:
+    def finish(self, process: str, age: tuple[int, int]) -> None:
         """Check the replica, and replace the earlier one by it.
 
         Raises:
-            Damaged: the replica is not complete; it is deleted.
+            Damaged: the replica is not complete, or of another process or age; it is deleted.
             OSError: the replica cannot be stored.
         """
         try:
-            head, _ = checked(content_of(self._begun))
+            head = checked_replica(self._begun)
+            if (head.process, head.age) != (process, age):
+                raise Damaged(f"it is a state of {head.process}#{head.instance}")
             self._begun.replace(self._directory / COPY)
         except (Damaged, OSError):
             self.abandon()
             raise
         self._close()
-        return head
 
     def abandon(self) -> None:
         """Delete the unfinished replica."""
