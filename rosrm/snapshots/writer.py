@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from rosrm.snapshots.format import Block, Damaged, checked, decoded_head, encoded_head
+from rosrm.snapshots.format import Block, Damaged, Head, checked, decoded_head, encoded_head
 from rosrm.snapshots.reader import (
     COPY,
     HEAD_ROOM,
@@ -140,9 +140,7 @@ class CopyWriter:
             OSError: the replica cannot be stored.
         """
         try:
-            head = checked_replica(self._begun)
-            if (head.process, head.age) != (process, age):
-                raise Damaged(f"it is a state of {head.process}#{head.instance}")
+            _check_origin(checked_replica(self._begun), process, age)
             self._begun.replace(self._directory / COPY)
         except (Damaged, OSError):
             self.abandon()
@@ -161,6 +159,11 @@ class CopyWriter:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def _check_origin(head: Head, process: str, age: tuple[int, int]) -> None:
+    if (head.process, head.age) != (process, age):
+        raise Damaged(f"it is a state of {head.process}#{head.instance}")
 
 
 def drop_snapshots(directory: Path, up_to: int) -> bool:

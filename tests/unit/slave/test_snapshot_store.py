@@ -1,12 +1,9 @@
-"""Snapshots from other hosts: forged, unfinished and too many ones cost an honest sender nothing."""
+"""Snapshots from other hosts: forged, unfinished or too many, they harm no honest sender."""
 
 from __future__ import annotations
 
-import contextlib
 import os
-import resource
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,6 +17,7 @@ from rosrm.slave.replication.store import SnapshotStore
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, TransferPart, encoded_head
 from rosrm.snapshots.writer import SlotWriter
+from tests.limits import no_more_files
 
 #: The name that release 0.1.0 gave the directory of the process "map-server".
 OLD_NAME = "map_server_651ecfc8"
@@ -77,7 +75,9 @@ def shelf(tmp_path) -> Shelf:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"total": 10_000_000}, {"total": 1}, {"data": b"x" * 100_000}, {"data": b""}], ids=str
+    "changes",
+    [{"total": 10_000_000}, {"total": 1}, {"data": b"x" * 100_000}, {"data": b""}],
+    ids=["larger", "smaller", "too much", "nothing"],
 )
 def test_a_later_part_is_held_to_the_size_that_the_first_one_named(shelf, changes):
     """Nothing is written beyond that size, and the right part still completes the transfer."""
@@ -188,7 +188,9 @@ def test_no_sequence_of_parts_harms_the_transfer_of_another_process(tmp_path_fac
     forged = st.builds(
         TransferPart, st.sampled_from(["a", "b", "p", "", "../x", "\0", "x" * 300]),
         numbers, numbers, numbers, numbers, st.integers(0, 2**32 - 1), st.binary(max_size=50),
-    ) | st.sampled_from([*parts("a", 7), *parts("b", 2**52), *parts("a", 8, content=b"x" * 99)])
+    )  # fmt: skip
+    honest = [*parts("a", 7), *parts("b", 2**52), *parts("a", 8, content=b"x" * 99)]
+    forged |= st.sampled_from(honest)
     for part in data.draw(st.lists(forged, max_size=30)):
         shelf.now += data.draw(st.sampled_from([0.0, 1.0, 29.0, 31.0]))
         shelf.take(part)
@@ -227,23 +229,6 @@ def test_a_read_beyond_the_end_is_empty(shelf, offset):
 
 
 # --- a host without descriptors ---------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def no_more_files() -> Iterator[None]:
-    """Let no further file be opened in this process."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    held: list[int] = []
-    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
-    try:
-        with contextlib.suppress(OSError):
-            while True:
-                held.append(os.dup(0))
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        for file in held:
-            os.close(file)
 
 
 def test_without_descriptors_replicas_are_refused_and_none_is_reported_as_lost(shelf):
