@@ -20,7 +20,9 @@ from rosrm.core.master.recovery.journal_stall import note_readings
 #: Most status batches kept for later; slaves are asked again for the rest.
 _MOST_STATUSES: Final = 10_000
 #: Events that are dropped, because they recur.
-_DROPPED: Final = (happened.TimePassed, happened.UsagesReceived, happened.PeerRefused)
+_DROPPED: Final = (
+    happened.TimePassed, happened.UsagesReceived, happened.PeerRefused, happened.SourceStranded,
+)  # fmt: skip
 
 
 @dataclass(slots=True)

@@ -149,9 +149,9 @@ class TimerOf:
         return bool(getattr(self.timer.clock, "ros_time_is_active", False))
 
     def start_in(self, seconds: float) -> None:
-        """Run first after `seconds`, and in the author's period from then on."""
+        """Run first after `seconds`, at most a period, and in the author's period from then on."""
         self.period_ns = self.timer.timer_period_ns
-        self.timer.timer_period_ns = max(1, int(seconds * 1e9))
+        self.timer.timer_period_ns = min(max(1, int(seconds * 1e9)), self.period_ns)
         self.timer.reset()
 
     def back_in_step(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from dataclasses import dataclass
@@ -26,6 +25,8 @@ def token(name: str) -> str:
     """
     if _FIT.fullmatch(name) and len(name) <= _LONGEST and not _ENDS_WITH_DIGEST.fullmatch(name):
         return name
+    import hashlib  # noqa: PLC0415 - half a MiB, which plain names and nodes do not need
+
     digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:_DIGITS]
     fit = _UNFIT.sub("_", name)[:_LONGEST].strip("_")
     return f"{fit}_{digest}" if fit[:1].isalpha() else f"host_{fit}_{digest}".replace("__", "_")
@@ -53,6 +54,11 @@ class Names:
     def of_handoff(self, process: str, destination: int) -> str:
         """Return the channel of one handoff, named by its destination's instance number."""
         return f"{self.namespace}/handoff/{token(process)}_{destination}"
+
+    @property
+    def stranded_sources(self) -> str:
+        """Topic on which silent sources ask the master if they may resume."""
+        return f"{self.namespace}/handoff/stranded"
 
 
 HANDSHAKE: Final = "handshake"

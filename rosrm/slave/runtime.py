@@ -44,6 +44,7 @@ from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
+from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.launch.launchers import Launchers
@@ -144,6 +145,7 @@ class SlaveRuntime:
                 self._endpoint.failing["launcher", name] = reason
             for strategy, reason in self._executors.failing.items():
                 _log.info("migration strategy %s is broken: %s", strategy, reason)
+            self._epoch_note = EpochNote(config.state / EPOCH_NOTE)
             kept = config.state / "kept"
             self._replication = ReplicationService(
                 kept, config.host, config.keep,
@@ -282,6 +284,7 @@ class SlaveRuntime:
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
         self._endpoint.advance(now)
+        self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
         sample = self._sampler.latest(now)
         if sample.reports:

@@ -292,6 +292,18 @@ class HandoffReported:
 
 
 @dataclass(frozen=True, slots=True)
+class SourceStranded:
+    """The source of a handoff is silent, and asks if it may resume.
+
+    Attributes:
+        source, destination: instance numbers.
+    """
+
+    source: int
+    destination: int
+
+
+@dataclass(frozen=True, slots=True)
 class PeerRefused:
     """A message was refused at the network edge: another version, or malformed."""
 
@@ -325,6 +337,7 @@ Event = (
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported
+    | SourceStranded
     | PeerRefused
     | TimePassed
 )

@@ -21,6 +21,7 @@ HostStateRequested      cordons, uncordons, drains
 PruneRequested          removes ended processes and departed hosts from the listings
 OrderAnswered           notes that a slave has accepted or refused an order
 HandoffReported         notes the reported phase of a handoff's source or destination
+SourceStranded          lets a silent source resume whose handoff is not under way
 AssignmentWithdrawn     queues the process again at its old place
 PeerRefused             records the refusal
 TimePassed              checks every deadline: silence, delivery, steps, hysteresis
@@ -67,6 +68,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.PruneRequested: pruning.prune_requested,
         happened.OrderAnswered: answers.order_answered,
         happened.HandoffReported: handoff.handoff_reported,
+        happened.SourceStranded: handoff.source_stranded,
         happened.TimePassed: tick.time_passed,
     }
 )

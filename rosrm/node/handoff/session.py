@@ -17,6 +17,11 @@ from rosrm_msgs.msg import StateConfig
 
 _MARK: Final = "_rosrm/mark"
 _PARAMETERS: Final = "_rosrm/parameters"
+#: Most reasons for refusals that are logged, each once, and the most letters of a name in one.
+_MOST_REASONS: Final = 16
+_LONGEST_NAME: Final = 64
+#: Epochs by which one message may be ahead, where the slave does not say which is the newest.
+_EPOCH_STEP: Final = 1000
 
 
 class HandoffSession:
@@ -96,7 +101,9 @@ class HandoffSession:
                 role.configure(config)
             except Exception as error:  # noqa: BLE001 - no message of the master ends the node
                 what = f"{type(error).__name__}: {error}"
-                self.entities.node.get_logger().error(f"a state_config cannot be followed: {what}")
+                self.entities.node.get_logger().error(
+                    f"a state_config cannot be followed: {what}", throttle_duration_sec=10.0
+                )
 
     def _fault_of(self, config: StateConfig) -> str:
         """Return a reason to ignore this message; "": it comes from this node's master."""
@@ -105,15 +112,28 @@ class HandoffSession:
                 f"its protocol version is {config.protocol_version}, this node's {PROTOCOL_VERSION}"
             )
         if config.cluster != self.identity.cluster:
-            return f"it is of {config.cluster!r}, and {self.identity.cluster!r} started this node"
+            theirs = config.cluster[:_LONGEST_NAME]
+            return f"it is of {theirs!r}, and {self.identity.cluster!r} started this node"
         if config.epoch < self._epoch:
             return f"it is of epoch {config.epoch}, and this is epoch {self._epoch}"
         if not config.channel:
             return "it names no channel"
+        if not config.channel.startswith(f"{self.identity.namespace}/handoff/"):
+            return "its channel is no topic of a handoff"
+        if config.epoch > self._epoch and config.epoch > self._newest_epoch():
+            return f"it is of epoch {config.epoch}, which the slave of this host does not know"
         return ""
 
+    def _newest_epoch(self) -> int:
+        """Return the newest epoch that a message of the master may have.
+
+        A forged one that is far ahead would make this node deaf to its master for ever.
+        """
+        registered = self.identity.registered_epoch()
+        return self._epoch + _EPOCH_STEP if registered is None else registered
+
     def _refuse(self, fault: str) -> None:
-        if fault not in self._refused:
+        if fault not in self._refused and len(self._refused) < _MOST_REASONS:
             self._refused.add(fault)
             self.entities.node.get_logger().warning(f"a state_config is left alone: {fault}")
 
