@@ -10,7 +10,7 @@ from typing import Final
 _FIT: Final = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 _UNFIT: Final = re.compile(r"[^A-Za-z0-9]+")
 _LONGEST: Final = 64
-#: Hex digits of a digest: 128 bits, so that nobody can find a second name with the same one.
+#: Hex digits of a digest: 128 bits, so that no second name with the same digest can be found.
 _DIGITS: Final = 32
 _ENDS_WITH_DIGEST: Final = re.compile(rf".*_[0-9a-f]{{{_DIGITS}}}")
 

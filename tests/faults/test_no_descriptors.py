@@ -23,12 +23,12 @@ def test_a_slave_survives_a_time_without_descriptors(cluster) -> None:
     slave = cluster.slaves["h0"].process
     _, hard = before = resource.prlimit(slave.pid, resource.RLIMIT_NOFILE)
     resource.prlimit(slave.pid, resource.RLIMIT_NOFILE, (3, hard))
-    cluster.submit(job("meanwhile", "true"))
+    cluster.submit(job("without", "true"))
     holds_for(4.0, lambda: slave.poll() is None, "the slave")
     resource.prlimit(slave.pid, resource.RLIMIT_NOFILE, before)
     cluster.submit(job("later", "true"))
     assert cluster.ended("later").state == "finished"
-    row = cluster.ended("meanwhile")
+    row = cluster.ended("without")
     assert row.state == "finished" or "Too many open files" in row.reason
     assert cluster.process("runs").pid == pid
     assert slave.poll() is None

@@ -726,7 +726,7 @@ def forge_silence(stage, destination=99):
 
 
 def test_a_silent_source_asks_the_master_until_it_may_resume(stage, monkeypatch):
-    """The answer is RESUME and DONE; nothing is lost that came meanwhile."""
+    """The answer is RESUME and DONE; inputs that came during the silence are served."""
     monkeypatch.setattr(stranded, "ASK_EVERY", 0.3)
     counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")
     first = stage.instance(Counter, 1)

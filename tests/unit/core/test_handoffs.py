@@ -580,7 +580,7 @@ def test_a_source_is_not_resumed_while_its_process_moves(until, destination) -> 
 
 
 def test_a_source_that_has_a_successor_is_not_resumed() -> None:
-    """It is about to be stopped."""
+    """The plan is about to stop the source."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SWITCH)
     while not cluster["p"].migrations:

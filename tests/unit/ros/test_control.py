@@ -138,7 +138,7 @@ def test_the_memory_of_the_gate_is_bounded() -> None:
 
 
 def test_the_repetitions_that_wait_are_bounded() -> None:
-    """The newest repetitions get the answer; nobody waits for the answers to the others."""
+    """The newest repetitions get the answer, and older ones get none."""
     judge = gate()
     assert not judge.repeated(envelope(1), Requested())
     waiting = [Requested() for _ in range(1000)]

@@ -134,9 +134,9 @@ def handoff_reported(state: MasterState, event: happened.HandoffReported, now: f
 def source_stranded(state: MasterState, event: happened.SourceStranded, now: float) -> None:
     """Let a silent source resume whose handoff is not under way.
 
-    Messages of a stranger can silence a node. The source never resumes by itself, because it cannot
-    know if the destination is active. The master knows that it is not: the source owns the name, no
-    migration of the process is under way, and the destination never existed or has ended.
+    Forged messages can silence a node, and the source cannot know if its destination is active. The
+    master knows that it is not: the source owns the name, no migration of the process is under way,
+    and the destination never existed or has ended.
     """
     source = state.instances.get(event.source)
     process = None if source is None else state.owned_by(source)
