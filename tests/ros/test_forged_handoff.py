@@ -61,7 +61,7 @@ def test_a_node_that_a_stranger_silenced_counts_on_and_can_be_moved(cluster, sta
     counts_on(stage, heard)
     numbers = [one.data for one in heard]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-    before, event = migrate(cluster, "victim")
+    _, event = migrate(cluster, "victim")
     assert event.kind == "migrated", event.message
     counts_on(stage, heard)
     numbers = [one.data for one in heard]

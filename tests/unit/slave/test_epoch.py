@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import stat
 
 from rosrm.node.identity import identity_from
@@ -41,6 +40,6 @@ def test_a_failure_is_retried(tmp_path):
 def test_a_link_is_not_followed(tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("precious")
-    os.symlink(victim, tmp_path / "epoch")
+    (tmp_path / "epoch").symlink_to(victim)
     EpochNote(tmp_path / "epoch").note(4)
     assert victim.read_text() == "precious"
