@@ -126,6 +126,8 @@ class SnapshotStore:
             paths = sorted(self._root.iterdir())
         except FileNotFoundError:
             return []
+        for link in [path for path in paths if path.is_symlink() and not path.exists()]:
+            link.unlink(missing_ok=True)  # an old name of a directory whose snapshots were dropped
         return [path for path in paths if path.is_dir() and not path.is_symlink()]
 
     def _rename(self, directory: Path, process: str) -> None:

@@ -261,6 +261,9 @@ def test_snapshots_of_an_earlier_release_are_found_under_the_new_name(shelf):
     restarted.close()
     assert [(one.instance.number, one.sequence) for one in shelf.store.scan()] == [(7, 9)]
     assert reader.newest(old, 7)[0] is not None
+    shelf.store.drop("map-server", 7)
+    assert shelf.store.scan() == ()
+    assert list(shelf.root.iterdir()) == []
 
 
 def test_two_processes_of_one_token_have_directories_of_their_own(shelf):
