@@ -335,6 +335,7 @@ class SlaveRuntime:
         """Queue an event for the core."""
         self._events.append(event)
         if isinstance(event, Registered):
+            self._epoch_note.note(event.epoch)  # the master's next message may reach a node first
             self._replication.report_again()
             if self._endpoint.failing:
                 self._endpoint.publish_statuses((), complete=False)

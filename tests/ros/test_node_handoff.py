@@ -16,7 +16,7 @@ from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
 
 from rosrm.node import Migratable
-from rosrm.node.handoff import state_parts, stranded
+from rosrm.node.handoff import session, state_parts, stranded
 from rosrm.node.handoff.channel import MARK
 from rosrm.node.managed_node import Mode
 from rosrm.ros.qos import HANDOFF
@@ -623,8 +623,6 @@ def test_more_input_than_can_be_kept(stage, pair, monkeypatch):
         ({"channel": ""}, "it names no channel"),
         ({"channel": "/cmd_vel"}, "its channel is no topic of a handoff"),
         ({"channel": "/rosrm/handoff"}, "its channel is no topic of a handoff"),
-        ({"epoch": 2**64 - 1}, f"it is of epoch {2**64 - 1}, which the slave of this host does"),
-        ({"epoch": EPOCH + 1001}, "which the slave of this host does not know"),
     ],
 )
 def test_a_state_config_of_a_stranger_is_left_alone(stage, pair, wrong, text, capfd):
@@ -664,14 +662,35 @@ def test_an_epoch_that_the_slave_does_not_know_leaves_the_node_open_to_its_maste
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROSRM_EPOCH_FILE", str(epoch))
         pair = pair_of(stage, Counter)
+    counts = stage.listen(Int64, "count")
     pair.conductor.say(C.SHADOW, epoch=EPOCH + 3)
     pair.conductor.say(C.SHADOW, epoch=EPOCH + 1)
     pair.conductor.wait(2, R.READY)
     assert pair.first._rosrm._epoch == EPOCH + 1
-    pair.conductor.say(C.SHADOW, epoch=EPOCH + 3)
-    epoch.write_text(f"{EPOCH + 3:020d}\n")
     pair.conductor.say(C.SWITCH, epoch=EPOCH + 3)
+    goes_on(stage, counts, 20)
+    assert R.SILENT not in pair.conductor.of(1)
+    epoch.write_text(f"{EPOCH + 3:020d}\n")  # the slave was slower than the message
     pair.conductor.wait(2, R.ACTIVE)
+    assert pair.first._rosrm._epoch == EPOCH + 3
+    assert pair.first._rosrm._early_timer is None
+
+
+@pytest.mark.parametrize("epoch", [2**64 - 1, EPOCH + 1001])
+def test_a_message_of_an_epoch_that_stays_unknown_is_dropped(
+    stage, pair, epoch, monkeypatch, capfd
+):
+    """The message is held for some seconds, and the flood of a stranger is bounded."""
+    monkeypatch.setattr(session, "_EARLY_FOR", 0.3)
+    for _ in range(100):
+        pair.conductor.say(C.SHADOW, epoch=epoch)
+    stage.spin_until(lambda: pair.first._rosrm._early, "a held message")
+    assert len(pair.first._rosrm._early) <= 16
+    stage.spin_until(lambda: pair.first._rosrm._early_timer is None, "the end of the patience")
+    goes_on(stage, pair.counts)
+    assert pair.conductor.reports == []
+    assert f"it is of epoch {epoch}, which the slave" in capfd.readouterr().err
+    pair.conductor.prepare()
 
 
 def test_the_memory_for_refused_messages_is_bounded(stage, pair):
