@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Union, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
 from rosrm.client.connecting import connect, ros_settings, row_of
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 Work = Union[str, "os.PathLike[str]", Mapping[str, Any], ProcessSpec]
 #: One name or several.
 Names = str | Iterable[str]
+#: Number of events in one listing that leaves out none, as in `List.srv`.
+_ALL_NEW: Final = 2**32 - 1
 
 
 def _warn(text: str) -> None:
@@ -58,6 +60,7 @@ class Client:
     Raises:
         NoMaster: no master answered in time.
         Refused: the master is of another version.
+        ConfigError: ROS cannot use a setting, or `cluster` is wrong.
         RosrmError: ROS 2 cannot be imported.
     """
 
@@ -212,7 +215,7 @@ class Client:
             yield from view.events
             if not follow or time.monotonic() >= deadline:
                 return
-            after, newest = view.last_sequence, 0
+            after, newest = view.last_sequence, _ALL_NEW
             time.sleep(PERIOD)
 
     def logs(

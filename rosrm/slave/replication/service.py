@@ -101,7 +101,7 @@ class ReplicationService:
         self._endpoint = endpoint
         self._post, self._publish = post, publish
         self._store = SnapshotStore(root, settings.max_bytes)
-        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._shipments: dict[str, _Shipment] = {}
         self._transfers: dict[str, _Transfer] = {}
         #: Instances that wait for a snapshot; None: the local search is running.
@@ -119,8 +119,8 @@ class ReplicationService:
     # --- the thread ----------------------------------------------------------------------
 
     def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            job()
+        while True:
+            self._jobs.get()()
 
     def _in_thread(
         self, work: Callable[[], Any], then: Callable[[Any], None], otherwise: Any = None
@@ -180,7 +180,7 @@ class ReplicationService:
         if now >= self._next_scan:
             self._next_scan = now + _SCAN_EVERY
             if self._snapshots or self._store.is_used():
-                self._in_thread(self._store.scan, self._scanned)
+                self._in_thread(partial(self._scan, now), self._scanned)
         for shipment in list(self._shipments.values()):
             self._begin_due(shipment, now)
         for transfer in list(self._transfers.values()):
@@ -192,6 +192,10 @@ class ReplicationService:
     def states(self) -> tuple[SnapshotReport, ...]:
         """Return the snapshots on this host, as of the last scan."""
         return self._snapshots
+
+    def _scan(self, now: float) -> tuple[SnapshotReport, ...]:
+        self._store.abandon_interrupted(now)
+        return self._store.scan()
 
     def _scanned(self, states: tuple[SnapshotReport, ...] | None) -> None:
         if states is not None:

@@ -21,10 +21,10 @@ from rosrm.snapshots.writer import CopyWriter, drop_snapshots
 #: all snapshots in memory before older ones are dropped sooner.
 _READ_FOR: Final = 10.0
 _MOST_READ: Final = 512 << 20
-#: Most transfers of replicas to this host at a time, and the seconds after its last part after
-#: which a transfer is given up.
+#: Seconds without a part after which a transfer to this host counts as interrupted, and the most
+#: transfers of replicas to this host at a time.
+INTERRUPTED: Final = 30.0
 MOST_INCOMING: Final = 16
-INCOMING_PATIENCE: Final = 30.0
 #: Most processes of other hosts with a replica here, and the bytes that even a small one counts.
 MOST_REPLICAS: Final = 1000
 _LEAST_COUNTED: Final = 4096
@@ -103,12 +103,11 @@ class SnapshotStore:
         return self._root.exists()
 
     def scan(self) -> tuple[SnapshotReport, ...]:
-        """Return the newest snapshot of each process; give up transfers that have stopped.
+        """Return the newest snapshot of each process.
 
         Raises:
             OSError: the files cannot be read now.
         """
-        self._give_up_stopped()
         heads = []
         for directory in self._directories():
             head = newest_head(directory)
@@ -172,7 +171,7 @@ class SnapshotStore:
             return NotStored("damaged", str(fault))
 
     def _take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
-        self._give_up_stopped()
+        self.abandon_interrupted(self._clock())
         if part.offset == 0:
             refusal = self._refusal(part, bounded=bounded)
             if refusal is not None:
@@ -181,7 +180,7 @@ class SnapshotStore:
         coming = self._incoming.get(part.process)
         if coming is None or not coming.is_followed_by(part, bounded=bounded):
             return NotStored("order", "it does not follow the part before it: send all parts again")
-        coming.until = self._clock() + INCOMING_PATIENCE
+        coming.until = self._clock() + INTERRUPTED
         coming.writer.append(part.data)
         coming.digest = zlib.crc32(part.data, coming.digest)
         if coming.writer.size == coming.total:
@@ -238,7 +237,7 @@ class SnapshotStore:
     def _begin(self, part: TransferPart, *, bounded: bool) -> None:
         self._abandon(part.process)
         self.make()
-        until = self._clock() + INCOMING_PATIENCE
+        until = self._clock() + INTERRUPTED
         writer = CopyWriter(self.directory(part.process))
         self._incoming[part.process] = _Incoming(part.age, part.total, bounded, writer, until)
 
@@ -250,9 +249,8 @@ class SnapshotStore:
         coming.writer.finish(part.process, part.age)
         self._refreshed[part.process] = self._clock()
 
-    def _give_up_stopped(self) -> None:
-        """Close the files of transfers whose next part has not come in time."""
-        now = self._clock()
+    def abandon_interrupted(self, now: float) -> None:
+        """Delete the unfinished replicas whose senders send no more; they take room."""
         for process in [name for name, one in self._incoming.items() if now >= one.until]:
             self._abandon(process)
 

@@ -96,15 +96,15 @@ def test_a_first_part_beyond_its_own_size_is_refused(shelf):
 
 
 def test_a_transfer_that_stops_is_given_up_and_its_file_closed(shelf):
-    """The sender may begin again; a scan gives it up too, where no other part arrives."""
+    """The sender may begin again."""
     before = open_files()
     first, second = parts("p", 7)
     assert shelf.take(first) == ""
-    shelf.now += stores.INCOMING_PATIENCE - 1.0
-    assert shelf.store.scan() == ()
+    shelf.now += stores.INTERRUPTED - 1.0
+    shelf.store.abandon_interrupted(shelf.now)
     assert open_files() == before + 1
     shelf.now += 1.0
-    assert shelf.store.scan() == ()
+    shelf.store.abandon_interrupted(shelf.now)
     assert open_files() == before
     assert not (shelf.root / "p").exists()
     assert shelf.take(second) == "order"
@@ -195,8 +195,7 @@ def test_no_sequence_of_parts_harms_the_transfer_of_another_process(tmp_path_fac
         shelf.now += data.draw(st.sampled_from([0.0, 1.0, 29.0, 31.0]))
         shelf.take(part)
         assert open_files() <= before + stores.MOST_INCOMING
-    shelf.now += 100.0
-    shelf.store.scan()
+    shelf.store.abandon_interrupted(shelf.now + 100.0)
     assert open_files() == before
     assert shelf.send("honest", 7) == ""
     assert {path.parent for path in shelf.root.parent.iterdir()} == {shelf.root.parent}
