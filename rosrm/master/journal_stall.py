@@ -20,7 +20,9 @@ from rosrm.core.master.recovery.journal_stall import note_readings
 #: Most queued status batches; the master requests the rest again from the slaves.
 _MOST_STATUSES: Final = 10_000
 #: Events that are dropped, because they recur.
-_DROPPED: Final = (happened.TimePassed, happened.UsagesReceived, happened.PeerRefused)
+_DROPPED: Final = (
+    happened.TimePassed, happened.UsagesReceived, happened.PeerRefused, happened.SourceStranded,
+)  # fmt: skip
 
 
 @dataclass(slots=True)

@@ -100,6 +100,10 @@ class EventKind(str, Enum):
         "destination_unheard",
         "the destination does not confirm the abort of the handoff: it is stopped",
     )
+    SOURCE_STRANDED = (
+        "source_stranded",
+        "a source is silent for a handoff that is not under way: it resumes",
+    )
 
     # --- snapshots and standbys ----------------------------------------------------------
 

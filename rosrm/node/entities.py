@@ -149,9 +149,9 @@ class TimerOf:
         return bool(getattr(self.timer.clock, "ros_time_is_active", False))
 
     def start_in(self, seconds: float) -> None:
-        """Start the timer: first run after `seconds`, then with the author's period."""
+        """Start the timer: first run after `seconds`, at most a period, then with that period."""
         self.period_ns = self.timer.timer_period_ns
-        self.timer.timer_period_ns = max(1, int(seconds * 1e9))
+        self.timer.timer_period_ns = min(max(1, int(seconds * 1e9)), self.period_ns)
         self.timer.reset()
 
     def back_in_step(self) -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
+from pathlib import Path
 from typing import Final
 
 #: Default bound in seconds on the age of a snapshot.
 KEEP_EVERY: Final = 1.0
+#: Most digits of an epoch.
+_EPOCH_DIGITS: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +25,7 @@ class NodeIdentity:
         state_config: topic of the master's messages.
         cluster: name of the master that started it.
         epoch: of that master.
+        epoch_file: where the slave writes the newest epoch of the master; "": nowhere.
         shadow: it starts as the destination of a handoff.
         keep: directory of its snapshots; "" if none are written.
         keep_every: greatest age of a snapshot, seconds.
@@ -36,6 +40,20 @@ class NodeIdentity:
     shadow: bool
     keep: str = ""
     keep_every: float = KEEP_EVERY
+    epoch_file: str = ""
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of rosrm's topics."""
+        return self.state_config.rpartition("/")[0]
+
+    def registered_epoch(self) -> int | None:
+        """Return the newest epoch of the master that the slave knows; None: not known."""
+        try:
+            with Path(self.epoch_file).open("rb") as file:
+                return int(file.read(_EPOCH_DIGITS))
+        except (OSError, ValueError):
+            return None
 
 
 def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
@@ -55,6 +73,7 @@ def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
         shadow=environment.get("ROSRM_SHADOW", "") == "1",
         keep=environment.get("ROSRM_KEEP", ""),
         keep_every=_seconds(environment.get("ROSRM_KEEP_EVERY", "")),
+        epoch_file=environment.get("ROSRM_EPOCH_FILE", ""),
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -20,8 +20,14 @@ from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import Answer, Envelope
 
-#: Remembered ids: more than can arrive within the greatest age of a request.
+#: Ids that are remembered at least, for late repetitions, and at most. An id is never forgotten
+#: while a copy of its request is young enough to be admitted.
 _REMEMBERED: Final = 10_000
+_MOST_REMEMBERED: Final = 50_000
+#: Most repetitions of one request that wait for its answer.
+_MOST_WAITING: Final = 16
+#: Most letters of an id.
+_LONGEST_ID: Final = 64
 _NS: Final = 1e-9
 
 
@@ -68,7 +74,8 @@ class RequestGate:
         self._beat = beat
         self._max_age = max_age
         self._answers: OrderedDict[str, Any] = OrderedDict()
-        self._waiting: dict[str, list[OpenRequest]] = {}
+        self._admitted: dict[str, int] = {}
+        self._waiting: dict[str, deque[OpenRequest]] = {}
 
     def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
         """Return the refusal of a request, or None.
@@ -80,6 +87,11 @@ class RequestGate:
             return refused("version", fault)
         if not envelope.request_id:
             return refused("invalid", f"the request of {envelope.sender} has no id")
+        if len(envelope.request_id) > _LONGEST_ID:
+            return refused(
+                "invalid",
+                f"the id of the request of {envelope.sender} has more than {_LONGEST_ID} letters",
+            )
         age = (self._beat() - envelope.receiver_beat) * _NS
         if envelope.receiver_beat == 0 or not 0.0 <= age <= self._max_age:
             return refused(
@@ -91,7 +103,23 @@ class RequestGate:
             return refused(
                 "stale", f"the request comes from epoch {envelope.epoch}, this is epoch {epoch}"
             )
+        if not self._has_room():
+            return refused(
+                "stale",  # a sender of every version knows that it may send a new request
+                f"more than {_MOST_REMEMBERED} requests came within {self._max_age:g} s; nothing "
+                f"was done: send the request again later",
+            )
         return None
+
+    def _has_room(self) -> bool:
+        """Return True if another id can be remembered; forget ids that are too old to be used."""
+        while len(self._answers) >= _REMEMBERED:
+            oldest = next(iter(self._answers))
+            if (self._beat() - self._admitted[oldest]) * _NS <= self._max_age:
+                return len(self._answers) < _MOST_REMEMBERED
+            del self._answers[oldest], self._admitted[oldest]
+            self._waiting.pop(oldest, None)
+        return True
 
     def knows(self, envelope: Envelope) -> bool:
         """Return True if a request of this id was admitted before; its age then does not matter."""
@@ -102,19 +130,19 @@ class RequestGate:
         known = self._answers.get(envelope.request_id)
         if known is None:
             self._answers[envelope.request_id] = _PENDING
-            if len(self._answers) > _REMEMBERED:
-                oldest, _ = self._answers.popitem(last=False)
-                self._waiting.pop(oldest, None)
+            self._admitted[envelope.request_id] = self._beat()
             return False
         if known is _PENDING:
-            self._waiting.setdefault(envelope.request_id, []).append(request)
+            waiting = self._waiting.setdefault(envelope.request_id, deque(maxlen=_MOST_WAITING))
+            waiting.append(request)
         else:
             request.answer(known)
         return True
 
     def remember(self, envelope: Envelope, response: Any) -> None:
         """Store an answer, and send it to the repetitions of its request that already wait."""
-        self._answers[envelope.request_id] = response
+        if envelope.request_id in self._answers:
+            self._answers[envelope.request_id] = response
         for request in self._waiting.pop(envelope.request_id, ()):
             request.answer(response)
 

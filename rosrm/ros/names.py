@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import os
 import re
-import zlib
 from dataclasses import dataclass
 from typing import Final
 
 _FIT: Final = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 _UNFIT: Final = re.compile(r"[^A-Za-z0-9]+")
 _LONGEST: Final = 64
+#: Hex digits of a digest: 128 bits, so that no second name with the same digest can be found.
+_DIGITS: Final = 32
+_ENDS_WITH_DIGEST: Final = re.compile(rf".*_[0-9a-f]{{{_DIGITS}}}")
 
 
 def token(name: str) -> str:
-    """Return a host's or process's name as a ROS name token: "robot-1" -> "robot_1_bd82fad2".
+    """Return a host's or process's name as a ROS name token; different names never share one.
 
-    A changed name gets a digest, so that different names stay different. In DDS all servers of a
-    name execute a request, so otherwise robot-1 would execute the orders for robot_1.
+    A name that is valid as it is stays: "robot_1". Any other name gets a digest: "robot-1" becomes
+    "robot_1_" and 32 hex digits. A name that ends like a digest gets one too; otherwise it would be
+    the token of another name. In DDS all servers of a name execute a request, so hosts with the
+    same token would execute each other's orders.
     """
-    if _FIT.fullmatch(name) and len(name) <= _LONGEST:
+    if _FIT.fullmatch(name) and len(name) <= _LONGEST and not _ENDS_WITH_DIGEST.fullmatch(name):
         return name
-    digest = f"{zlib.crc32(name.encode('utf-8', 'surrogatepass')):08x}"
+    import hashlib  # noqa: PLC0415 - half a MiB, which plain names and nodes do not need
+
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:_DIGITS]
     fit = _UNFIT.sub("_", name)[:_LONGEST].strip("_")
     return f"{fit}_{digest}" if fit[:1].isalpha() else f"host_{fit}_{digest}".replace("__", "_")
 
@@ -48,6 +54,11 @@ class Names:
     def of_handoff(self, process: str, destination: int) -> str:
         """Return the channel of one handoff, named by its destination's instance number."""
         return f"{self.namespace}/handoff/{token(process)}_{destination}"
+
+    @property
+    def stranded_sources(self) -> str:
+        """Topic on which silent sources ask the master if they may resume."""
+        return f"{self.namespace}/handoff/stranded"
 
 
 HANDSHAKE: Final = "handshake"

@@ -45,6 +45,7 @@ from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
+from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.launch.launchers import Launchers
@@ -182,6 +183,7 @@ class SlaveRuntime:
     def _serve_master(self, max_age: float) -> None:
         """Offer the services of this slave, with those of snapshot replication."""
         config = self._config
+        self._epoch_note = EpochNote(config.state / EPOCH_NOTE)
         self._replication = ReplicationService(
             self._kept, config.host, config.keep,
             ReplicationEndpoint(self._participant, config.host),
@@ -312,6 +314,7 @@ class SlaveRuntime:
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
         self._endpoint.advance(now)
+        self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
         sample = self._sampler.latest(now)
         if sample.reports:
@@ -362,6 +365,7 @@ class SlaveRuntime:
         """Queue an event for the core."""
         self._events.append(event)
         if isinstance(event, Registered):
+            self._epoch_note.note(event.epoch)  # the master's next message may reach a node first
             self._replication.report_again()
             if self._endpoint.failing:
                 self._endpoint.publish_statuses((), complete=False)

@@ -9,6 +9,7 @@ a launcher's program leads the session, the launcher knows the members.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from rosrm.supervisor.procfs import inner_pid
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
+#: Errors after which a process may be there although its file cannot be opened now.
+_NOT_NOW: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +115,19 @@ class SessionTable:
         return self._usage
 
     def refresh(self, now: float) -> None:
-        """Find the processes of all sessions and read their usage; call this once a second."""
+        """Find the processes of all sessions and read their usage; call this once a second.
+
+        Without a file descriptor for it, the last usage stays.
+        """
+        try:
+            self._find_members()
+            read = {leader: self._read(members) for leader, members in self._members.items()}
+        except OSError:
+            return
         elapsed = 0.0 if self._walked is None else now - self._walked
         self._walked = now
-        if not self._members:
-            return
-        self._find_members()
         usage: dict[int, SessionUsage] = {}
-        for leader, members in self._members.items():
-            cpu_time, memory = self._read(members)
+        for leader, (cpu_time, memory) in read.items():
             before = self._cpu_time.get(leader)
             self._cpu_time[leader] = cpu_time
             cores = 0.0
@@ -130,6 +137,8 @@ class SessionTable:
         self._usage = usage
 
     def _find_members(self) -> None:
+        if not self._members:
+            return
         found: dict[int, list[int]] = {leader: [leader] for leader in self._members}
         for entry in os.listdir(self._proc):  # noqa: PTH208 - a Path for each process costs 2 us
             if not entry.isdigit():
@@ -154,13 +163,19 @@ class SessionTable:
         self._pids = tuple(pid for pids in self._members.values() for pid in pids)
 
     def _read(self, members: tuple[int, ...]) -> tuple[float, int]:
-        """Return the CPU seconds (with those of reaped children) and resident bytes of pids."""
+        """Return the CPU seconds (with those of reaped children) and resident bytes of pids.
+
+        Raises:
+            OSError: no file can be opened now.
+        """
         ticks = pages = 0
         for pid in members:
             try:
                 descriptor = os.open(f"{self._proc}/{pid}/stat", os.O_RDONLY)
-            except OSError:  # it has ended
-                continue
+            except OSError as error:
+                if error.errno in _NOT_NOW:
+                    raise
+                continue  # it has ended
             try:
                 line = os.read(descriptor, 1024)
             except OSError:

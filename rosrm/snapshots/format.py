@@ -6,12 +6,15 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
 from typing import Final, NamedTuple
 
 #: Most bytes of a file, and most blocks; a larger file is no snapshot.
 LARGEST: Final = 2 << 30
 _MOST_BLOCKS: Final = 1000
+#: Numbers of instances and cycles are smaller; greater ones would overflow when they grow.
+MOST_CYCLES: Final = 1 << 62
 
 _MAGIC: Final = b"rosrmKS1"
 #: Magic, instance, sequence, bytes of the name, blocks.
@@ -112,7 +115,7 @@ def encoded_head(process: str, instance: int, sequence: int, blocks: Sequence[Bl
     return head + _CRC.pack(zlib.crc32(head))
 
 
-def decoded_head(data: bytes) -> tuple[Head, int]:
+def decoded_head(data: bytes | mmap) -> tuple[Head, int]:
     """Return the header of a file, and the offset of its first block.
 
     Raises:
@@ -123,6 +126,8 @@ def decoded_head(data: bytes) -> tuple[Head, int]:
         end = _FIXED.size + name_size + count * _BLOCK.size
         if magic != _MAGIC or count > _MOST_BLOCKS or end + _CRC.size > len(data):
             raise Damaged("it is no snapshot")
+        if max(instance, sequence) >= MOST_CYCLES:
+            raise Damaged("no instance has such a number, or so many cycles")
         if _CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
             raise Damaged("its head is damaged")
         name = data[_FIXED.size : _FIXED.size + name_size].decode()
@@ -137,7 +142,7 @@ def decoded_head(data: bytes) -> tuple[Head, int]:
     return Head(name, instance, sequence, blocks, size), start
 
 
-def checked(data: bytes) -> tuple[Head, int]:
+def checked(data: bytes | mmap) -> tuple[Head, int]:
     """Return the result of `decoded_head` for a complete file; raise `Damaged` for any other."""
     head, start = decoded_head(data)
     if len(data) < head.size:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import mmap
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,15 +18,22 @@ SLOTS: Final = ("state.0", "state.1")
 COPY: Final = "copy"
 #: Flags of every file that is opened.
 OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
+_TOO_MANY_OPEN: Final = (errno.EMFILE, errno.ENFILE)
 #: Bytes that are read for a header; no header is larger.
 HEAD_ROOM: Final = 64 << 10
 
 
 def peek(path: Path) -> Head | None:
-    """Return the header of a file without reading its content; None: no such file, or no header."""
+    """Return the header of a file without reading its content; None: no such file, or no header.
+
+    Raises:
+        OSError: too many files are open; the snapshot may be there.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
-    except OSError:
+    except OSError as error:
+        if error.errno in _TOO_MANY_OPEN:
+            raise
         return None
     try:
         return decoded_head(os.read(descriptor, HEAD_ROOM))[0]
@@ -54,6 +63,25 @@ def newest_head(directory: Path) -> Head | None:
 def read(path: Path) -> Listing:
     """Return the snapshot in a file; raises `Damaged`."""
     return decoded(content_of(path), path)
+
+
+def checked_replica(path: Path) -> Head:
+    """Return the header of a complete replica without holding its content.
+
+    Only for a file that no other process writes: a mapped file that is cut ends its reader.
+
+    Raises:
+        Damaged: the file is no complete snapshot.
+        OSError: the file cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | OPEN)
+    try:
+        mapped = mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
+    except ValueError:
+        raise Damaged("it is empty") from None
+    finally:
+        os.close(descriptor)
+    return checked(mapped)[0]
 
 
 def content_of(path: Path) -> bytes:

@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.snapshots.format import Block, Damaged, Head, checked, decoded_head, encoded_head
-from rosrm.snapshots.reader import COPY, HEAD_ROOM, OPEN, SLOTS, content_of, paths_of, peek
+from rosrm.snapshots.reader import (
+    COPY,
+    HEAD_ROOM,
+    OPEN,
+    SLOTS,
+    checked_replica,
+    content_of,
+    paths_of,
+    peek,
+)
 
 
 class SlotWriter:
@@ -123,21 +132,20 @@ class CopyWriter:
         _write_all(self._file, [data], self.size)
         self.size += len(data)
 
-    def finish(self) -> Head:
+    def finish(self, process: str, age: tuple[int, int]) -> None:
         """Check the replica, and replace the earlier one by it.
 
         Raises:
-            Damaged: the replica is not complete; it is deleted.
+            Damaged: the replica is not complete, or of another process or age; it is deleted.
             OSError: the replica cannot be stored.
         """
         try:
-            head, _ = checked(content_of(self._begun))
+            _check_origin(checked_replica(self._begun), process, age)
             self._begun.replace(self._directory / COPY)
         except (Damaged, OSError):
             self.abandon()
             raise
         self._close()
-        return head
 
     def abandon(self) -> None:
         """Delete the unfinished replica."""
@@ -151,6 +159,11 @@ class CopyWriter:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def _check_origin(head: Head, process: str, age: tuple[int, int]) -> None:
+    if (head.process, head.age) != (process, age):
+        raise Damaged(f"it is a state of {head.process}#{head.instance}")
 
 
 def drop_snapshots(directory: Path, up_to: int) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core.master.commands import PublishStateConfig
-from rosrm.core.master.events import HandoffReported
+from rosrm.core.master.events import HandoffReported, SourceStranded
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
@@ -115,3 +115,19 @@ def test_after_done_the_master_does_not_listen(stage):
     stage.wait(lambda: stage.channel.get_subscription_count() == 0, "no reader")
     stage.report(12)
     holds_for(0.5, lambda: not stage.events, "no event", pause=stage.spin)
+
+
+def test_the_question_of_a_silent_source_reaches_the_master(stage):
+    """A question that came before the master started arrives too, and a flood is bounded."""
+    asks = stage.nodes.node.create_publisher(HandoffReport, "/rosrm/handoff/stranded", qos.HANDOFF)
+    question = {"protocol_version": PROTOCOL_VERSION, "destination": 9, "phase": 2}
+    asks.publish(HandoffReport(instance=1, **question))
+    stage.wait(lambda: stage.events == [SourceStranded(1, 9)], "the question")
+    asks.publish(HandoffReport(instance=2, **{**question, "phase": 14}))
+    asks.publish(HandoffReport(instance=3, **{**question, "protocol_version": 99}))
+    for number in range(2000):
+        asks.publish(HandoffReport(instance=number, **question))
+        stage.spin(0.0)
+    stage.wait(lambda: len(stage.events) > 10, "some of the flood")
+    assert len(stage.events) < 100
+    assert {2, 3}.isdisjoint({one.source for one in stage.events[:2]})

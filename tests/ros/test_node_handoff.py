@@ -16,8 +16,12 @@ from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
 
 from rosrm.node import Migratable
-from rosrm.node.handoff import state_parts
-from rosrm_msgs.msg import HandoffReport, StateConfig
+from rosrm.node.handoff import session, state_parts, stranded
+from rosrm.node.handoff.channel import MARK
+from rosrm.node.managed_node import Mode
+from rosrm.ros.qos import HANDOFF
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark, StatePart
 from tests.ros.nodes import (
     ALIAS,
     EPOCH,
@@ -617,6 +621,8 @@ def test_more_input_than_can_be_kept(stage, pair, monkeypatch):
         ({"epoch": EPOCH - 1}, f"it is of epoch {EPOCH - 1}, and this is epoch {EPOCH}"),
         ({"protocol_version": 1}, "its protocol version is 1"),
         ({"channel": ""}, "it names no channel"),
+        ({"channel": "/cmd_vel"}, "its channel is no topic of a handoff"),
+        ({"channel": "/rosrm/handoff"}, "its channel is no topic of a handoff"),
     ],
 )
 def test_a_state_config_of_a_stranger_is_left_alone(stage, pair, wrong, text, capfd):
@@ -643,6 +649,156 @@ def test_a_newer_epoch_fences_an_older_one(stage, pair):
     pair.conductor.wait(2, R.READY)
     pair.conductor.say(C.SWITCH, epoch=EPOCH + 1)
     goes_on(stage, pair.counts, 20)
+    assert R.SILENT not in pair.conductor.of(1)
+
+
+def test_an_epoch_that_the_slave_does_not_know_leaves_the_node_open_to_its_master(stage, tmp_path):
+    """The slave notes the epoch of the master with which it is registered; a node goes no further.
+
+    A node that believed a forged epoch would refuse all later messages of its master.
+    """
+    epoch = tmp_path / "epoch"
+    epoch.write_text(f"{EPOCH + 2:020d}\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROSRM_EPOCH_FILE", str(epoch))
+        pair = pair_of(stage, Counter)
+    counts = stage.listen(Int64, "count")
+    pair.conductor.say(C.SHADOW, epoch=EPOCH + 3)
+    pair.conductor.say(C.SHADOW, epoch=EPOCH + 1)
+    pair.conductor.wait(2, R.READY)
+    assert pair.first._rosrm._epoch == EPOCH + 1
+    pair.conductor.say(C.SWITCH, epoch=EPOCH + 3)
+    goes_on(stage, counts, 20)
+    assert R.SILENT not in pair.conductor.of(1)
+    epoch.write_text(f"{EPOCH + 3:020d}\n")  # the slave was slower than the message
+    pair.conductor.wait(2, R.ACTIVE)
+    assert pair.first._rosrm._epoch == EPOCH + 3
+    assert pair.first._rosrm._early_timer is None
+
+
+@pytest.mark.parametrize("epoch", [2**64 - 1, EPOCH + 1001])
+def test_a_message_of_an_epoch_that_stays_unknown_is_dropped(
+    stage, pair, epoch, monkeypatch, capfd
+):
+    """The message is held for some seconds, and the flood of a stranger is bounded."""
+    monkeypatch.setattr(session, "_EARLY_FOR", 0.3)
+    for _ in range(100):
+        pair.conductor.say(C.SHADOW, epoch=epoch)
+    stage.spin_until(lambda: pair.first._rosrm._early, "a held message")
+    assert len(pair.first._rosrm._early) <= 16
+    stage.spin_until(lambda: pair.first._rosrm._early_timer is None, "the end of the patience")
+    goes_on(stage, pair.counts)
+    assert pair.conductor.reports == []
+    assert f"it is of epoch {epoch}, which the slave" in capfd.readouterr().err
+    pair.conductor.prepare()
+
+
+def test_the_memory_for_refused_messages_is_bounded(stage, pair):
+    """A stranger may send names of any length, each another one."""
+    for number in range(100):
+        pair.conductor.say(C.SHADOW, cluster=f"{number}" * 10_000)
+    goes_on(stage, pair.counts, 20)
+    for node in (pair.first, pair.second):
+        refused = node._rosrm._refused
+        assert len(refused) <= 16
+        assert max(map(len, refused)) < 300
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"sequence": 2**64 - 1}, "the impossible number 18446744073709551615"),
+        ({"sequence": 2**62}, "the impossible number"),
+        ({"parts": [StatePart(topic="/counter/state", size=2**64 - 1)]}, "claims to have"),
+    ],
+    ids=["cycles", "many cycles", "a size"],
+)
+def test_a_mark_with_an_impossible_number_ends_the_handoff(stage, pair, change, text):
+    """A node that took it over would fail at its next cycle; the source continues."""
+    pair.conductor.prepare()
+    run = pair.first._rosrm._source._run
+    forger = stage.plain.create_publisher(StateMark, "/counter/_rosrm/mark", MARK)
+    stage.spin_until(forger.get_subscription_count, "the shadow")
+    forger.publish(StateMark(protocol_version=PROTOCOL_VERSION, run=run, **change))
+    assert text in pair.conductor.wait(2, R.FAILED).message
+    goes_on(stage, pair.counts)
+
+
+# --- a source that messages of a stranger have silenced ---------------------------------------
+
+
+def forge_silence(stage, destination=99):
+    """Send the messages of a handoff that does not exist, as its master and its destination."""
+    forged = Conductor(stage, source=1, destination=destination)
+    reports = stage.plain.create_publisher(HandoffReport, forged.config.channel, HANDOFF)
+    for phase in (C.SHADOW, C.SWITCH):
+        forged.say(phase)
+    for phase in (R.SHADOWING, R.SWITCHING):
+        reports.publish(
+            HandoffReport(
+                protocol_version=PROTOCOL_VERSION, destination=destination, instance=destination,
+                phase=phase,
+            )
+        )  # fmt: skip
+    forged.wait(1, R.RELEASED)
+    return forged
+
+
+def test_a_silent_source_asks_the_master_until_it_may_resume(stage, monkeypatch):
+    """The answer is RESUME and DONE; inputs that came during the silence are served."""
+    monkeypatch.setattr(stranded, "ASK_EVERY", 0.3)
+    counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")
+    first = stage.instance(Counter, 1)
+    stage.spin_until(lambda: counts, "the first count")
+    forged = forge_silence(stage)
+    questions = []
+    stage.plain.create_subscription(
+        HandoffReport, "/rosrm/handoff/stranded", questions.append, HANDOFF
+    )
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    stage.spin_until(talker.get_subscription_count, "the input")
+    talker.publish(Int64(data=1))
+    stage.spin_until(lambda: len(questions) >= 3, "questions")
+    question = questions[0]
+    assert (question.instance, question.destination, question.phase) == (1, 99, R.SILENT)
+    assert first._rosrm.entities.mode is Mode.SILENT
+    for phase in (C.RESUME, C.DONE):
+        forged.say(phase, channel="/rosrm/handoff/as_the_master_names_it_99")
+    goes_on(stage, counts)
+    stage.spin_until(lambda: numbers(sums) == [1], "the sum")
+    assert is_gapless(counts)
+    asked = len(questions)
+    goes_on(stage, counts, 50)
+    assert len(questions) == asked
+    assert stage.plain.count_publishers("/rosrm/handoff/stranded") == 0
+
+
+def test_a_forged_end_of_the_handoff_does_not_stop_the_questions(stage, monkeypatch):
+    monkeypatch.setattr(stranded, "ASK_EVERY", 0.3)
+    stage.instance(Counter, 1)
+    forged = forge_silence(stage)
+    forged.say(C.DONE)
+    questions = []
+    stage.plain.create_subscription(
+        HandoffReport, "/rosrm/handoff/stranded", questions.append, HANDOFF
+    )
+    stage.spin_until(lambda: len(questions) >= 2, "questions")
+
+
+def test_reports_of_instances_that_are_not_part_of_the_handoff_have_no_effect(stage, pair):
+    """Only the destination that the master names can ask the source for silence."""
+    pair.second._rosrm._destination._review = lambda: None  # does not ask
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.say(C.SWITCH)
+    reports = stage.plain.create_publisher(HandoffReport, pair.conductor.config.channel, HANDOFF)
+    for instance, destination in ((7, 2), (2, 7), (1, 2), (0, 2), (2**64 - 1, 2)):
+        reports.publish(
+            HandoffReport(
+                protocol_version=PROTOCOL_VERSION, destination=destination, instance=instance,
+                phase=R.SWITCHING,
+            )
+        )  # fmt: skip
+    goes_on(stage, pair.counts, 30)
     assert R.SILENT not in pair.conductor.of(1)
 
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import time
+import zlib
 
 import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rosrm.node.handoff.channel import MARK
+from rosrm.node.handoff.state_parts import StateError
 from rosrm.snapshots import reader
+from rosrm.snapshots.format import Block, encoded_head
+from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateMark
 from tests.ros.nodes import RELIABLE, Conductor, Counter
 
@@ -152,6 +157,49 @@ def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
     third = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: third.count > 0, "a count")
     assert third.count <= 2
+
+
+def rewrite(directory, **changes) -> None:
+    """Change the mark in the newest snapshot, as another release or a stranger would write it."""
+    ((newest, head), *_) = reader.snapshot_files(directory)
+    mark, *parts = reader.read(newest).blocks
+    changed = deserialize_message(mark, StateMark)
+    for name, value in changes.items():
+        setattr(changed, name, value)
+    contents = [bytes(serialize_message(changed)), *parts]
+    blocks = [Block(data, zlib.crc32(data)) for data in contents]
+    header = encoded_head(head.process, head.instance, head.sequence + 1, blocks)
+    newest.write_bytes(header + b"".join(contents))
+
+
+def test_a_snapshot_of_an_earlier_release_is_restored(stage, tmp_path):
+    """Release 0.1.0 spoke protocol 5, and its snapshots have the same content."""
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.count >= 10, "ten counts")
+    stage.remove(first)
+    rewrite(tmp_path, protocol_version=5)
+    second = stage.instance(Counter, 2, keep=tmp_path)
+    stage.spin_until(lambda: second.count > first.count, "the next count")
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"protocol_version": 4}, "it is of protocol version 4"),
+        ({"protocol_version": PROTOCOL_VERSION + 1}, "it is of protocol version"),
+        ({"sequence": 2**64 - 1}, "the impossible number"),
+        ({"sequence": 2**62}, "the impossible number"),
+    ],
+    ids=str,
+)
+def test_a_snapshot_that_would_fail_later_is_not_restored(stage, tmp_path, changes, text):
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.count >= 2, "two counts")
+    stage.remove(first)
+    rewrite(tmp_path, **changes)
+    stage.instance(Counter, 2, keep=tmp_path)
+    with pytest.raises(StateError, match=text):
+        stage.spin_until(lambda: False, "an error")
 
 
 class Slow(Counter):

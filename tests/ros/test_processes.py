@@ -7,6 +7,7 @@ import os
 import stat
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -126,6 +127,7 @@ def test_the_environment(cluster) -> None:
         "ROSRM_MASTER": cluster.cluster.name, "ROSRM_EPOCH": "1",
     }  # fmt: skip
     assert environment.items() >= expected.items()
+    assert int(Path(environment["ROSRM_EPOCH_FILE"]).read_text()) == 1
 
 
 def test_ready_is_this_instance_not_a_namesake(cluster, tmp_path) -> None:

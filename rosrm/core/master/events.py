@@ -295,6 +295,18 @@ class HandoffReported:
 
 
 @dataclass(frozen=True, slots=True)
+class SourceStranded:
+    """The source of a handoff is silent, and asks if it may resume.
+
+    Attributes:
+        source, destination: instance numbers.
+    """
+
+    source: int
+    destination: int
+
+
+@dataclass(frozen=True, slots=True)
 class PeerRefused:
     """The network layer refused a message: another protocol version, or malformed."""
 
@@ -328,6 +340,7 @@ Event = (
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported
+    | SourceStranded
     | PeerRefused
     | TimePassed
 )

@@ -21,6 +21,7 @@ HostStateRequested      cordons, uncordons, drains
 PruneRequested          removes ended processes and departed hosts from the listings
 OrderAnswered           notes whether the slave accepted the order, and the result of an executor
 HandoffReported         notes the reported phase of a handoff's source or destination
+SourceStranded          lets a silent source resume whose handoff is not under way
 AssignmentWithdrawn     returns the process to its place in the queue
 PeerRefused             records the refusal
 TimePassed              checks every deadline: silence, delivery, steps, hysteresis
@@ -67,6 +68,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.PruneRequested: pruning.prune_requested,
         happened.OrderAnswered: answers.order_answered,
         happened.HandoffReported: handoff.handoff_reported,
+        happened.SourceStranded: handoff.source_stranded,
         happened.TimePassed: tick.time_passed,
     }
 )

@@ -34,6 +34,10 @@ class Channel:
         instance: this node's own number.
         peer: instance number of the other side.
         take_report: receives each report of the other side.
+
+    Attributes:
+        topic: as given.
+        destination: as given.
     """
 
     def __init__(
@@ -41,7 +45,7 @@ class Channel:
         take_report: Callable[[HandoffReport], None],
     ) -> None:  # fmt: skip
         self._plain = plain
-        self._destination = destination
+        self.destination = destination
         self._instance = instance
         self._peer = peer
         self._take_report = take_report
@@ -55,7 +59,7 @@ class Channel:
         )
 
     def _take(self, report: HandoffReport) -> None:
-        theirs = report.instance == self._peer and report.destination == self._destination
+        theirs = report.instance == self._peer and report.destination == self.destination
         if theirs and report.protocol_version == PROTOCOL_VERSION:
             self._take_report(report)
 
@@ -65,7 +69,7 @@ class Channel:
         if last is not None and (last.phase, last.message) == (phase, message):
             return
         self._last = HandoffReport(
-            protocol_version=PROTOCOL_VERSION, destination=self._destination,
+            protocol_version=PROTOCOL_VERSION, destination=self.destination,
             instance=self._instance, phase=phase, sequence=sequence, message=message,
         )  # fmt: skip
         self.repeat()

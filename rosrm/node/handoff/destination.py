@@ -11,7 +11,13 @@ from typing import Any, Final
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.snapshot_assembler import Cut, CutAssembler
-from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part
+from rosrm.node.handoff.state_parts import (
+    LARGEST_PART,
+    StateError,
+    StateTopic,
+    differing_part,
+    size_fault,
+)
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
 from rosrm.ros.polling import waiting
@@ -105,7 +111,7 @@ class Destination:
     def follow_part(self, part: StateTopic) -> None:
         """Subscribe to a part of the state; the author may name parts later."""
         if self._assembler is not None:
-            take = partial(self._assembler.add_part, part.topic)
+            take = partial(self._take_part, part.topic)
             self._assembler.expect(part.topic)
             self._follow(part.message_type, part.topic, take, topics.STATE_FOLLOWED, raw=True)
 
@@ -157,13 +163,18 @@ class Destination:
                     return
                 take(message)
 
+    def _take_part(self, topic: str, data: bytes) -> None:
+        if self._assembler is not None and len(data) <= LARGEST_PART:
+            self._assembler.add_part(topic, data)
+
     def _take_mark(self, mark: StateMark) -> None:
         fault = self._fault_of(mark)
         if fault:
             self._end(HandoffReport.FAILED, fault)
         elif self._assembler is not None:
             self._run = mark.run
-            self._assembler.add_mark(mark, time.monotonic())
+            if not self._assembler.add_mark(mark, time.monotonic()):
+                self._end(HandoffReport.FAILED, "too many marks came without the state they name")
 
     def _fault_of(self, mark: StateMark) -> str:
         """Return the reason why this node cannot use the source's state; "" if it can."""
@@ -174,6 +185,9 @@ class Destination:
             )
         if self._run and mark.run != self._run:
             return "the source was started again, and its state is a new one"
+        fault = size_fault(mark)
+        if fault:
+            return fault
         differing = differing_part(self._parts, mark)
         if differing is None:
             return ""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -11,12 +13,24 @@ from rosrm.node.handoff.state_parts import ParametersPart, StateTopic
 from rosrm.node.identity import NodeIdentity
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.snapshots.restore import SnapshotRestore, newest_snapshot
+from rosrm.node.steady_timer import steady_timer
 from rosrm.ros.qos import STATE_CONFIG
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
 
 _MARK: Final = "_rosrm/mark"
 _PARAMETERS: Final = "_rosrm/parameters"
+#: Most reasons for refusals that are logged, each once, and the most letters of a name in one.
+_MOST_REASONS: Final = 16
+_LONGEST_NAME: Final = 64
+#: Epochs by which one message may be ahead, where the slave does not say which is the newest.
+_EPOCH_STEP: Final = 1000
+#: Most messages of an epoch that the slave does not know yet, and the seconds for which each is
+#: held. A master that was restarted may reach the node before its answer reaches the slave.
+_MOST_EARLY: Final = 16
+_EARLY_FOR: Final = 5.0
+#: Seconds between two looks if the slave knows the epoch.
+_LOOK: Final = 0.1
 
 
 class HandoffSession:
@@ -35,6 +49,8 @@ class HandoffSession:
         self._source: HandoffSource | None = None
         self._destination: Destination | None = None
         self._refused: set[str] = set()
+        self._early: deque[tuple[StateConfig, float]] = deque(maxlen=_MOST_EARLY)
+        self._early_timer: Any = None
         self._subscription: Any = None
 
     def begin(self) -> None:
@@ -87,6 +103,11 @@ class HandoffSession:
         if fault:
             self._refuse(fault)
             return
+        if self._is_early(config):
+            self._hold(config, time.monotonic() + _EARLY_FOR)
+            return
+        if self._early and config.epoch > self._epoch:
+            self._look_at_early()  # earlier messages of the new master come first
         self._epoch = config.epoch
         role = self._destination if own.instance == config.destination else self._source
         if role is None:
@@ -96,7 +117,9 @@ class HandoffSession:
                 role.configure(config)
             except Exception as error:  # noqa: BLE001 - no message of the master may end the node
                 what = f"{type(error).__name__}: {error}"
-                self.entities.node.get_logger().error(f"a state_config cannot be followed: {what}")
+                self.entities.node.get_logger().error(
+                    f"a state_config cannot be followed: {what}", throttle_duration_sec=10.0
+                )
 
     def _fault_of(self, config: StateConfig) -> str:
         """Return the reason to ignore this message; "" if it comes from this node's master."""
@@ -105,15 +128,51 @@ class HandoffSession:
                 f"its protocol version is {config.protocol_version}, this node's {PROTOCOL_VERSION}"
             )
         if config.cluster != self.identity.cluster:
-            return f"it is of {config.cluster!r}, and {self.identity.cluster!r} started this node"
+            theirs = config.cluster[:_LONGEST_NAME]
+            return f"it is of {theirs!r}, and {self.identity.cluster!r} started this node"
         if config.epoch < self._epoch:
             return f"it is of epoch {config.epoch}, and this is epoch {self._epoch}"
         if not config.channel:
             return "it names no channel"
+        if not config.channel.startswith(f"{self.identity.namespace}/handoff/"):
+            return "its channel is no topic of a handoff"
         return ""
 
+    def _is_early(self, config: StateConfig) -> bool:
+        """Return True if a message has an epoch that the slave does not know.
+
+        A forged epoch would make this node deaf to its master for ever.
+        """
+        if config.epoch <= self._epoch:
+            return False
+        registered = self.identity.registered_epoch()
+        newest = self._epoch + _EPOCH_STEP if registered is None else registered
+        return bool(config.epoch > newest)
+
+    def _hold(self, config: StateConfig, until: float) -> None:
+        self._early.append((config, until))
+        if self._early_timer is None:
+            self._early_timer = steady_timer(self.entities.plain, _LOOK, self._look_at_early)
+
+    def _look_at_early(self) -> None:
+        """Follow held messages whose epoch the slave knows now; drop old ones."""
+        held = list(self._early)
+        self._early.clear()
+        for config, until in held:
+            if not self._is_early(config):
+                self._configured(config)
+            elif time.monotonic() < until:
+                self._early.append((config, until))
+            else:
+                self._refuse(
+                    f"it is of epoch {config.epoch}, which the slave of this host does not know"
+                )
+        if not self._early and self._early_timer is not None:
+            self.entities.plain.destroy_timer(self._early_timer)
+            self._early_timer = None
+
     def _refuse(self, fault: str) -> None:
-        if fault not in self._refused:
+        if fault not in self._refused and len(self._refused) < _MOST_REASONS:
             self._refused.add(fault)
             self.entities.node.get_logger().warning(f"a state_config is left alone: {fault}")
 

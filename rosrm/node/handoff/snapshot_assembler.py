@@ -7,8 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-#: Newest stored parts of one topic that no mark names yet.
+#: Newest stored parts of one topic that no mark names yet, and most bytes of its stored parts.
 _KEPT: Final = 16
+_MOST_BYTES: Final = 1 << 30
+#: Most marks, and most entries of their lists, that wait for parts of their states.
+_MOST_MARKS: Final = 20_000
+_MOST_ENTRIES: Final = 50_000_000
 
 
 class PartKey(NamedTuple):
@@ -51,6 +55,7 @@ class CutAssembler:
     def __init__(self) -> None:
         self._at_hand: dict[str, dict[PartKey, bytes]] = {}
         self._waiting: list[tuple[Any, float]] = []
+        self._entries = 0
 
     def expect(self, topic: str) -> None:
         """Add a topic that carries a part of the state."""
@@ -62,14 +67,19 @@ class CutAssembler:
         key = part_key(data)
         at_hand.pop(key, None)  # insert it again as the newest
         at_hand[key] = data
-        marked = {_key_of(mark, topic) for mark, _ in self._waiting}
-        for old in list(at_hand)[:-_KEPT]:
-            if old not in marked:
-                del at_hand[old]
+        if len(at_hand) > _KEPT:
+            marked = {_key_of(mark, topic) for mark, _ in self._waiting}
+            for old in list(at_hand)[:-_KEPT]:
+                if old not in marked:
+                    del at_hand[old]
+        while len(at_hand) > 1 and sum(one.size for one in at_hand) > _MOST_BYTES:
+            del at_hand[next(iter(at_hand))]
 
-    def add_mark(self, mark: Any, now: float) -> None:
-        """Add a mark, newer than all before."""
+    def add_mark(self, mark: Any, now: float) -> bool:
+        """Add a mark, newer than all before; return False if too many wait for their parts."""
         self._waiting.append((mark, now))
+        self._entries += entries_of(mark)
+        return len(self._waiting) <= _MOST_MARKS and self._entries <= _MOST_ENTRIES
 
     def take(self) -> Cut | None:
         """Return the newest complete state not taken before; drop older ones."""
@@ -80,6 +90,7 @@ class CutAssembler:
             if all(data is not None for data in parts.values()):
                 passed = tuple(older for older, _ in self._waiting[:index])
                 del self._waiting[: index + 1]
+                self._entries = sum(entries_of(mark) for mark, _ in self._waiting)
                 self._forget_older(wanted)
                 found = {topic: data for topic, data in parts.items() if data is not None}
                 return Cut(mark, passed, found, arrived)
@@ -102,6 +113,12 @@ class CutAssembler:
             at_hand = self._at_hand[topic]
             while next(iter(at_hand)) != key:
                 del at_hand[next(iter(at_hand))]
+
+
+def entries_of(mark: Any) -> int:
+    """Return the number of entries in the lists of a mark."""
+    stamps = sum(len(one.covered) for one in mark.inputs)
+    return stamps + len(mark.parts) + len(mark.inputs) + len(mark.outputs) + len(mark.timers_due)
 
 
 def _key_of(mark: Any, topic: str) -> PartKey | None:

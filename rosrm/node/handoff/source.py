@@ -13,6 +13,7 @@ from rclpy.duration import Duration
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.state_parts import StateError, StateTopic
+from rosrm.node.handoff.stranded import StrandedSource
 from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.snapshots.writer import SnapshotSaver
 from rosrm.node.steady_timer import steady_timer
@@ -43,6 +44,7 @@ class HandoffSource:
         self._timers_due: list[int] = []
         self._silent_since = 0.0
         self._release_timer: Any = None
+        self._stranded: StrandedSource | None = None
         plain = entities.plain
         self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
         for part in parts:
@@ -185,6 +187,7 @@ class HandoffSource:
         if not self._show(last=True):
             self._reactivate(lambda: None)  # the failure has been reported
             return
+        self._stranded = StrandedSource(entities, self._channel.destination)
         self._channel.report(HandoffReport.SILENT, entities.sequence)
         self._release_timer = steady_timer(entities.plain, _LOOK, self._release)
 
@@ -223,7 +226,13 @@ class HandoffSource:
             self._channel.report(HandoffReport.RESUMED, self._entities.sequence)
 
     def _reactivate(self, announce: Callable[[], None]) -> None:
+        self._ask_no_more()
         self._entities.become_active(self._timers_due, self._silent_since, announce)
+
+    def _ask_no_more(self) -> None:
+        if self._stranded is not None:
+            self._stranded.close()
+            self._stranded = None
 
     def _overflowed(self, topic: str) -> None:
         self._entities.node.get_logger().error(
@@ -241,5 +250,6 @@ class HandoffSource:
 
     def end(self) -> None:
         """Store the last snapshot, because the node is destroyed."""
+        self._ask_no_more()
         if self._keeper is not None:
             self._keeper.close()

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.node.handoff.snapshot_assembler import PartKey, part_key
-from rosrm.snapshots.format import Block
+from rosrm.snapshots.format import MOST_CYCLES, Block
 from rosrm_msgs.msg import StateMark, StatePart
 
 #: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to serialise 200 MB.
@@ -153,6 +153,16 @@ def differing_part(parts: Iterable[StateTopic], mark: StateMark) -> DifferingPar
         if ours.get(topic) != marked.get(topic):
             return DifferingPart(topic, ours.get(topic, "none"), marked.get(topic, "none"))
     return None
+
+
+def size_fault(mark: StateMark) -> str:
+    """Return a reason to refuse a mark for a number in it; "": there is none."""
+    if mark.sequence >= MOST_CYCLES:
+        return f"the mark of the state has the impossible number {mark.sequence}"
+    for part in mark.parts:
+        if part.size > LARGEST_PART:
+            return f"the state on {part.topic} claims to have {part.size} bytes"
+    return ""
 
 
 def type_name(message_type: Any) -> str:

@@ -9,7 +9,7 @@ from typing import Final
 
 from rclpy.serialization import deserialize_message
 
-from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part
+from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part, size_fault
 from rosrm.node.identity import NodeIdentity
 from rosrm.node.managed_node import NodeEntities
 from rosrm.node.steady_timer import steady_timer
@@ -21,6 +21,8 @@ from rosrm_msgs.msg import StateMark
 #: Seconds for the author's constructor to name all parts, if it spins first; check interval.
 _PATIENCE: Final = 10.0
 _LOOK: Final = 0.02
+#: Oldest protocol version whose snapshots have the same content.
+_OLDEST_READ: Final = 5
 _REMEDY: Final = (
     "The node does not start, so that the snapshot is not overwritten. To start without it, cancel "
     "the process and submit it again"
@@ -92,11 +94,14 @@ class SnapshotRestore:
         return mark
 
     def _fault_of(self, mark: StateMark) -> str:
-        if mark.protocol_version != PROTOCOL_VERSION:
+        if not _OLDEST_READ <= mark.protocol_version <= PROTOCOL_VERSION:
             return (
                 f"it is of protocol version {mark.protocol_version}, and this node speaks "
                 f"{PROTOCOL_VERSION}"
             )
+        fault = size_fault(mark)
+        if fault:
+            return fault
         if len(mark.parts) != len(self._snapshot.blocks) - 1:
             return (
                 f"it has {len(self._snapshot.blocks) - 1} parts, but its mark lists "

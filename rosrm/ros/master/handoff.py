@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from rosrm.core.master.commands import PublishStateConfig
-from rosrm.core.master.events import Event, HandoffReported
+from rosrm.core.master.events import Event, HandoffReported, SourceStranded
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.ros import names, qos
 from rosrm.ros.control import version_refusal
 from rosrm.ros.participant import Participant
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
+
+#: Most questions of silent sources that are answered at once, and a second. Each asks again.
+_QUESTIONS: Final = 20
+_QUESTIONS_PER_SECOND: Final = 5.0
 
 
 class HandoffEndpoint:
@@ -38,6 +43,12 @@ class HandoffEndpoint:
             msg.StateConfig, self._names(names.STATE_CONFIG), qos.STATE_CONFIG
         )
         self._channels: dict[str, Any] = {}
+        self._questions_left = float(_QUESTIONS)
+        self._questions_at = time.monotonic()
+        participant.node.create_subscription(
+            msg.HandoffReport, self._names.stranded_sources,
+            participant.counted(self._take_question), qos.HANDOFF,
+        )  # fmt: skip
 
     def publish(self, command: PublishStateConfig) -> None:
         """Publish a handoff's phase; subscribe to its channel from the first phase to DONE."""
@@ -83,3 +94,14 @@ class HandoffEndpoint:
                 report.sequence, report.message,
             )
         )  # fmt: skip
+
+    def _take_question(self, report: msg.HandoffReport) -> None:
+        """Pass on the question of a silent source, unless more come than sources can ask."""
+        now = time.monotonic()
+        new = (now - self._questions_at) * _QUESTIONS_PER_SECOND
+        self._questions_left = min(float(_QUESTIONS), self._questions_left + new)
+        self._questions_at = now
+        silent = report.phase == ReportPhase.SILENT
+        if silent and report.protocol_version == PROTOCOL_VERSION and self._questions_left >= 1.0:
+            self._questions_left -= 1.0
+            self._take(SourceStranded(report.instance, report.destination))

@@ -110,5 +110,5 @@ def _missing(node: Node, topic: str, type_name: str, received: int) -> str:
 def _type_of(name: str) -> Any:
     try:
         return message_type(name)
-    except (AttributeError, ImportError, ValueError) as error:
+    except (ImportError, ValueError) as error:
         raise ValueError(f"there is no message type {name!r} on this host: {error}") from error

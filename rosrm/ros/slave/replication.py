@@ -16,7 +16,7 @@ from rosrm_msgs import srv
 
 #: Seconds without use after which a client is destroyed.
 _IDLE: Final = 60.0
-#: Most bytes of one answer.
+#: Most bytes of one part.
 MOST: Final = 256 << 10
 
 
@@ -74,6 +74,9 @@ class ReplicationEndpoint:
 
             if fault:
                 answer(NotStored("version", fault))
+                return
+            if len(request.data) > MOST:
+                answer(NotStored("damaged", f"it has more than {MOST} bytes"))
                 return
             part = TransferPart(
                 request.process, request.number, request.sequence, request.offset, request.total,

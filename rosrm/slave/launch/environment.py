@@ -14,6 +14,8 @@ from rosrm.runtime.ros_wheels import without_bootstrapper
 
 #: Variable that is set if an instance starts as the destination of a handoff.
 SHADOW: Final = "ROSRM_SHADOW"
+#: Variable with the file in which the slave notes the newest epoch of the master.
+EPOCH_FILE: Final = "ROSRM_EPOCH_FILE"
 #: Variables with the directory of the node's snapshots, and the seconds by which they may lag.
 KEEP: Final = "ROSRM_KEEP"
 KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
@@ -21,7 +23,7 @@ KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
 #: on.
 _IDENTITY: Final = (
     "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
-    "ROSRM_MASTER", "ROSRM_EPOCH", SHADOW, KEEP, KEEP_EVERY,
+    "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY,
 )  # fmt: skip
 
 
@@ -35,6 +37,7 @@ class ProcessLocation:
         state_config: topic on which the master publishes handoffs.
         kept: directory of the snapshots of all processes; None: no snapshots.
         keep_every: seconds by which a snapshot may be behind the state.
+        epoch_file: file with the newest epoch of the master; None: there is none.
     """
 
     host: str
@@ -42,6 +45,7 @@ class ProcessLocation:
     state_config: str
     kept: Path | None = None
     keep_every: float = 1.0
+    epoch_file: Path | None = None
 
 
 def snapshot_directory(kept: Path, process: str) -> Path:
@@ -69,6 +73,8 @@ def process_environment(
     environment["ROSRM_STATE_CONFIG"] = where.state_config
     environment["ROSRM_MASTER"] = where.cluster
     environment["ROSRM_EPOCH"] = str(assignment.epoch)
+    if where.epoch_file is not None:
+        environment[EPOCH_FILE] = str(where.epoch_file)
     if spec.ros:  # the name without the alias
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:

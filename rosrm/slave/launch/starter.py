@@ -17,6 +17,7 @@ from rosrm.model.values import Assignment, InstanceId, InstanceState
 from rosrm.ros.names import STATE_CONFIG, Names
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
+from rosrm.slave.epoch import EPOCH_NOTE
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import ProcessLocation
 from rosrm.slave.launch.launchers import Launchers
@@ -142,5 +143,5 @@ class Starter:
         config = self.config
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
-            self.kept, config.keep.every,
+            self.kept, config.keep.every, config.state / EPOCH_NOTE,
         )  # fmt: skip

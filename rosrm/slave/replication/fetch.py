@@ -70,6 +70,8 @@ class Fetch:
             self._next_host(part, now)
         elif part.number < self._assignment.kept_from or not part.data:
             self._next_host("its snapshot is of an earlier process of that name", now)
+        elif part.number > self._assignment.instance.number:
+            self._next_host(f"its snapshot is of a later instance, {part.number}", now)
         elif part.offset == 0 and self._here is not None and self._here.age >= part.age:
             self._next_host("its snapshot is not newer than the one here", now)
         else:

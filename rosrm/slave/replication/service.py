@@ -36,6 +36,8 @@ _REPORT_PERIOD: Final = 10.0
 _PART_TIMEOUT: Final = 1.0
 #: Seconds after which a transfer to a host that refused a snapshot is retried.
 _AGAIN: Final = 3.0
+#: Most parts from other hosts that wait for the thread.
+_MOST_WAITING: Final = 64
 #: Codes of failures of the network alone.
 _TRANSIENT: Final = frozenset({"timeout", "order"})
 
@@ -104,6 +106,7 @@ class ReplicationService:
         self._transfers: dict[str, _Transfer] = {}
         #: Instances that wait for a snapshot; None: the local search is running.
         self._preparing: dict[InstanceId, Fetch | None] = {}
+        self._parts_waiting = 0
         self._snapshots = self._store.scan()
         self._reported: tuple[SnapshotReport, ...] | None = None
         self._reported_at = 0.0
@@ -295,22 +298,23 @@ class ReplicationService:
         """Store a part of a snapshot from another host."""
 
         def taken(refusal: NotStored | None) -> None:
+            self._parts_waiting -= 1
             if part.is_last and refusal is None:
                 self._next_scan = 0.0  # the master may need the new replica at once
             answer(refusal)
 
-        self._in_thread(partial(self._take, part, bounded=True), taken, _FAILED)
-
-    def _take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
-        return self._store.take(part, time.monotonic(), bounded=bounded)
+        if self._parts_waiting >= _MOST_WAITING:
+            answer(NotStored("full", f"{_MOST_WAITING} parts wait for the disk"))
+            return
+        self._parts_waiting += 1
+        self._in_thread(partial(self._store.take, part, bounded=True), taken, _FAILED)
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,
         answer: Callable[[TransferPart | None], None],
     ) -> None:  # fmt: skip
         """Answer another host's request for a part of a snapshot."""
-        read = partial(self._store.read, process, age, offset, size, time.monotonic())
-        self._in_thread(read, answer)
+        self._in_thread(partial(self._store.read, process, age, offset, size), answer)
 
     # --- for a start ---------------------------------------------------------------------
 
@@ -362,7 +366,7 @@ class ReplicationService:
         fetch.advance(time.monotonic())
 
     def _take_fetched(self, part: TransferPart, then: Callable[[NotStored | None], None]) -> None:
-        self._in_thread(partial(self._take, part, bounded=False), then, _FAILED)
+        self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)
 
     def is_preparing(self, instance: InstanceId) -> bool:
         """Return True if the start of an instance waits for a snapshot."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import time
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,22 +14,48 @@ from rosrm.model.values import InstanceId, SnapshotReport
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
 from rosrm.snapshots.format import LARGEST, Damaged, Head, TransferPart
-from rosrm.snapshots.reader import COPY, newest_content, newest_head
+from rosrm.snapshots.reader import COPY, newest_content, newest_head, snapshot_files
 from rosrm.snapshots.writer import CopyWriter, drop_snapshots
 
-#: Seconds for which a snapshot stays in memory between reads of its parts.
+#: Seconds for which a snapshot stays in memory between reads of its parts, and the most bytes of
+#: all snapshots in memory before older ones are dropped sooner.
 _READ_FOR: Final = 10.0
-#: Seconds without a part after which a transfer to this host counts as interrupted.
-_INTERRUPTED: Final = 30.0
+_MOST_READ: Final = 512 << 20
+#: Seconds without a part after which a transfer to this host counts as interrupted, and the most
+#: transfers of replicas to this host at a time.
+INTERRUPTED: Final = 30.0
+MOST_INCOMING: Final = 16
+#: Most processes of other hosts with a replica here, and the bytes that even a small one counts.
+MOST_REPLICAS: Final = 1000
+_LEAST_COUNTED: Final = 4096
+#: A replica whose instance number is greater by more than this than that of a replica which is
+#: offered now is doubtful: no cluster starts as many instances between two of one process. If its
+#: sender does not refresh it for so many seconds, the offered one replaces it.
+FAR_AHEAD: Final = 1_000_000
+DOUBTFUL_FOR: Final = 60.0
 
 
 @dataclass(slots=True)
 class _Incoming:
+    """Transfer of a snapshot to this host.
+
+    Attributes:
+        bounded: of another host's process; False: fetched for a start.
+        until: time at which the transfer is given up.
+    """
+
     age: tuple[int, int]
     total: int
+    bounded: bool
     writer: CopyWriter
+    until: float
     digest: int = 0
-    until: float = 0.0
+
+    def is_followed_by(self, part: TransferPart, *, bounded: bool) -> bool:
+        """Return True if a part is the next one of this transfer."""
+        same = (part.age, part.total, bounded) == (self.age, self.total, self.bounded)
+        fits = 0 < len(part.data) <= self.total - self.writer.size
+        return same and fits and part.offset == self.writer.size
 
 
 @dataclass(slots=True)
@@ -44,12 +72,18 @@ class SnapshotStore:
     Args:
         root: the directory, created with the first snapshot.
         max_bytes: most bytes of all replicas of other hosts' processes.
+        clock: monotonic seconds.
     """
 
-    def __init__(self, root: Path, max_bytes: int) -> None:
+    def __init__(
+        self, root: Path, max_bytes: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._root = root
         self._max_bytes = max_bytes
+        self._clock = clock
+        self._began = clock()
         self._incoming: dict[str, _Incoming] = {}
+        self._refreshed: dict[str, float] = {}
         self._being_read: dict[str, _BeingRead] = {}
 
     def directory(self, process: str) -> Path:
@@ -69,16 +103,42 @@ class SnapshotStore:
         return self._root.exists()
 
     def scan(self) -> tuple[SnapshotReport, ...]:
-        """Return the newest snapshot of each process."""
-        try:
-            directories = sorted(path for path in self._root.iterdir() if path.is_dir())
-        except OSError:
-            return ()
-        heads = [head for one in directories if (head := newest_head(one)) is not None]
+        """Return the newest snapshot of each process.
+
+        Raises:
+            OSError: the files cannot be read now.
+        """
+        heads = []
+        for directory in self._directories():
+            head = newest_head(directory)
+            if head is not None:
+                self._rename(directory, head.process)
+                heads.append(head)
         return tuple(
             SnapshotReport(InstanceId(head.process, head.instance), head.sequence, head.size)
             for head in heads
         )
+
+    def _directories(self) -> list[Path]:
+        """Return the directories of all processes."""
+        try:
+            paths = sorted(self._root.iterdir())
+        except FileNotFoundError:
+            return []
+        for link in [path for path in paths if path.is_symlink() and not path.exists()]:
+            link.unlink(missing_ok=True)  # an old name of a directory whose snapshots were dropped
+        return [path for path in paths if path.is_dir() and not path.is_symlink()]
+
+    def _rename(self, directory: Path, process: str) -> None:
+        """Rename a directory to which an earlier release gave another name, and leave a link.
+
+        The supervisor restarts an instance with the path that it had at its first start.
+        """
+        right = self.directory(process)
+        if directory != right and not right.exists():
+            with contextlib.suppress(OSError):
+                directory.rename(right)
+                directory.symlink_to(right.name)
 
     def newer_than(self, process: str, age: tuple[int, int]) -> tuple[Head, bytes, int] | None:
         """Return the newest complete snapshot with its CRC-32; None if none is newer than `age`."""
@@ -93,76 +153,101 @@ class SnapshotStore:
     def drop(self, process: str, up_to: int) -> None:
         """Delete the snapshots of instances up to a number."""
         drop_snapshots(self.directory(process), up_to)
+        self._refreshed.pop(process, None)
 
     # --- incoming snapshots --------------------------------------------------------------
 
-    def take(self, part: TransferPart, now: float, *, bounded: bool) -> NotStored | None:
+    def take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
         """Write a part of a snapshot; return why it was refused, or None. The last completes it.
 
         With `bounded` it is of another host's process, and `max_bytes` limits all such replicas.
         """
-        if part.offset == 0:
-            refusal = self._begin(part, bounded=bounded)
-            if refusal is not None:
-                return refusal
-        coming = self._incoming.get(part.process)
-        if coming is None or coming.age != part.age or coming.writer.size != part.offset:
-            return NotStored("order", "it does not follow the part before it: send all parts again")
-        coming.until = now + _INTERRUPTED
         try:
-            coming.writer.append(part.data)
-            coming.digest = zlib.crc32(part.data, coming.digest)
-            if part.is_last:
-                self._finish(part, coming)
+            return self._take(part, bounded=bounded)
         except OSError as error:
             self._abandon(part.process)
             return NotStored("full", f"it cannot be written: {error.strerror}")
         except Damaged as fault:
             return NotStored("damaged", str(fault))
+
+    def _take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
+        self.abandon_interrupted(self._clock())
+        if part.offset == 0:
+            refusal = self._refusal(part, bounded=bounded)
+            if refusal is not None:
+                return refusal
+            self._begin(part, bounded=bounded)
+        coming = self._incoming.get(part.process)
+        if coming is None or not coming.is_followed_by(part, bounded=bounded):
+            return NotStored("order", "it does not follow the part before it: send all parts again")
+        coming.until = self._clock() + INTERRUPTED
+        coming.writer.append(part.data)
+        coming.digest = zlib.crc32(part.data, coming.digest)
+        if coming.writer.size == coming.total:
+            self._finish(part, coming)
         return None
 
-    def _begin(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
-        self._abandon(part.process)
-        directory = self.directory(part.process)
-        newest = newest_head(directory)
-        if newest is not None and newest.age >= part.age:
+    def _refusal(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
+        """Return why no transfer of this snapshot may begin; None: it may."""
+        newest = self._as_new_as(part)
+        if newest is not None:
             return NotStored(
                 "newer", f"{newest.process}#{newest.instance}, cycle {newest.sequence} is here"
             )
         if part.total > LARGEST:
             return NotStored("full", f"it has {part.total} bytes; at most {LARGEST} are kept")
-        if bounded and not self._has_room(part):
-            return NotStored(
-                "full", f"with it there were more than {self._max_bytes} bytes (keep.max_bytes)"
-            )
-        self.make()
-        try:
-            writer = CopyWriter(directory)
-        except OSError as error:
-            return NotStored("full", f"it cannot be written: {error.strerror}")
-        self._incoming[part.process] = _Incoming(part.age, part.total, writer)
+        obstacle = self._obstacle(part) if bounded else ""
+        return NotStored("full", obstacle) if obstacle else None
+
+    def _as_new_as(self, part: TransferPart) -> Head | None:
+        """Return a snapshot here that is at least as new as a part's, unless it is doubtful."""
+        refreshed = self._refreshed.get(part.process, self._began)
+        for path, head in snapshot_files(self.directory(part.process)):
+            if head.age < part.age:
+                return None
+            far = path.name == COPY and head.instance - part.number > FAR_AHEAD
+            if not far or self._clock() - refreshed < DOUBTFUL_FOR:
+                return head
         return None
 
-    def _has_room(self, part: TransferPart) -> bool:
-        """Return True if a snapshot fits beside other replicas and running transfers."""
-        own = self.directory(part.process)
-        used = sum(one.total for one in self._incoming.values())
-        with contextlib.suppress(OSError):
-            for directory in self._root.iterdir():
-                if directory != own:
-                    with contextlib.suppress(OSError):
-                        used += (directory / COPY).stat().st_size
-        return used + part.total <= self._max_bytes
+    def _obstacle(self, part: TransferPart) -> str:
+        """Return why a replica of another host's process has no room here; "": there is room."""
+        others = [one for name, one in self._incoming.items() if name != part.process]
+        own = self._incoming.get(part.process)
+        if own is not None and not own.bounded:
+            return "it is being fetched for a start"
+        if len(others) >= MOST_INCOMING:
+            return f"{MOST_INCOMING} others are being received"
+        sizes = [max(one.total, _LEAST_COUNTED) for one in others]
+        sizes += self._sizes_of_replicas(but=self.directory(part.process))
+        if len(sizes) >= MOST_REPLICAS:
+            return f"replicas of {MOST_REPLICAS} processes are here"
+        if sum(sizes) + max(part.total, _LEAST_COUNTED) > self._max_bytes:
+            return f"with it there were more than {self._max_bytes} bytes (keep.max_bytes)"
+        return ""
+
+    def _sizes_of_replicas(self, but: Path) -> list[int]:
+        sizes = []
+        for directory in self._directories():
+            if directory != but:
+                with contextlib.suppress(FileNotFoundError):
+                    sizes.append(max((directory / COPY).stat().st_size, _LEAST_COUNTED))
+        return sizes
+
+    def _begin(self, part: TransferPart, *, bounded: bool) -> None:
+        self._abandon(part.process)
+        self.make()
+        until = self._clock() + INTERRUPTED
+        writer = CopyWriter(self.directory(part.process))
+        self._incoming[part.process] = _Incoming(part.age, part.total, bounded, writer, until)
 
     def _finish(self, part: TransferPart, coming: _Incoming) -> None:
         del self._incoming[part.process]
         if coming.digest != part.digest:
             coming.writer.abandon()
             raise Damaged("what came does not match its checksum")
-        head = coming.writer.finish()
-        if head.process != part.process:
-            drop_snapshots(self.directory(part.process), head.instance)
-            raise Damaged(f"it is a state of {head.process!r}")
+        coming.writer.finish(part.process, part.age)
+        self._refreshed[part.process] = self._clock()
 
     def abandon_interrupted(self, now: float) -> None:
         """Delete the unfinished replicas whose senders send no more; they take room."""
@@ -177,24 +262,31 @@ class SnapshotStore:
     # --- outgoing snapshots --------------------------------------------------------------
 
     def read(
-        self, process: str, age: tuple[int, int], offset: int, size: int, now: float
+        self, process: str, age: tuple[int, int], offset: int, size: int
     ) -> TransferPart | None:
         """Return a part of a snapshot; None: this host does not hold the snapshot (any more).
 
         The age (0, 0) requests the newest snapshot.
         """
+        now = self._clock()
         for name in [name for name, one in self._being_read.items() if now >= one.until]:
             del self._being_read[name]
-        one = self._being_read.get(process)
+        one = self._being_read.pop(process, None)
         if one is None or one.head.age != age:
             found = self.newer_than(process, (0, 0))
             if found is None or age not in {(0, 0), found[0].age}:
                 return None
-            one = self._being_read[process] = _BeingRead(*found, until=now + _READ_FOR)
+            one = _BeingRead(*found, until=now)
         one.until = now + _READ_FOR
         head, data = one.head, one.content[offset : offset + size]
-        if offset + len(data) >= len(one.content):
-            self._being_read.pop(process, None)
+        if offset + len(data) < len(one.content):
+            self._drop_oldest_read(_MOST_READ - len(one.content))
+            self._being_read[process] = one
         return TransferPart(
             process, head.instance, head.sequence, offset, len(one.content), one.digest, data
         )
+
+    def _drop_oldest_read(self, room: int) -> None:
+        """Drop the snapshots in memory that were read longest ago until the others fit."""
+        while self._being_read and sum(len(o.content) for o in self._being_read.values()) > room:
+            del self._being_read[next(iter(self._being_read))]

@@ -540,3 +540,72 @@ def test_reports_of_another_handoff_are_ignored() -> None:
     for report in (("p", 7, 2), ("q", 2, 2), ("p", 2, 9)):
         cluster.tell(happened.HandoffReported(*report, ReportPhase.ACTIVE))
     assert not cluster.state.migrations["p"].handoff_reports
+
+
+# --- stranded sources -------------------------------------------------------------------------
+
+
+def silence(cluster: Cluster, destination: int = 99) -> None:
+    """Silence the node of p by forged messages about a handoff to this number."""
+    (node,) = (node for _, node in cluster.air.nodes() if node.active)
+    node.active, node.handoff = False, destination
+
+
+def test_a_source_that_forged_messages_silenced_resumes() -> None:
+    """The master answers with RESUME and DONE, and records the reason."""
+    cluster = two_hosts()
+    silence(cluster)
+    cluster.tell(happened.SourceStranded(1, 99))
+    cluster.wait(1.0)
+    assert published(cluster) == ["RESUME", "DONE"]
+    assert cluster.active() == ["a"]
+    assert "p#1 is silent for a handoff to p#99" in cluster.recorded("source_stranded")[0]
+    assert cluster.migrate("p", "b").accepted
+    has_moved(cluster)
+
+
+@pytest.mark.parametrize("until", [HandoffPhase.SHADOW, HandoffPhase.SWITCH])
+@pytest.mark.parametrize("destination", [2, 99])
+def test_a_source_is_not_resumed_while_its_process_moves(until, destination) -> None:
+    """The destination may become active at any moment; the plan ends the silence."""
+    cluster = two_hosts()
+    begin(cluster, until)
+    for _ in range(100):
+        cluster.tell(happened.SourceStranded(1, destination))
+        if not cluster.nodes_talk():
+            break
+    cluster.wait(5.0)
+    has_moved(cluster)
+    assert not cluster.recorded("source_stranded")
+
+
+def test_a_source_that_has_a_successor_is_not_resumed() -> None:
+    """The plan is about to stop the source."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SWITCH)
+    while not cluster["p"].migrations:
+        cluster.nodes_talk()
+    cluster.tell(happened.SourceStranded(1, 2))
+    cluster.tell(happened.SourceStranded(1, 99))
+    assert not cluster.recorded("source_stranded")
+
+
+@pytest.mark.parametrize("number", [0, 7, 2**62, 2**64 - 1])
+def test_questions_of_unknown_instances_have_no_effect(number) -> None:
+    cluster = two_hosts()
+    cluster.tell(happened.SourceStranded(number, number))
+    assert published(cluster) == []
+
+
+def test_a_source_is_not_resumed_before_all_hosts_have_reported() -> None:
+    """A host that is still expected may run a destination that the journal lost."""
+    cluster = two_hosts()
+    silence(cluster)
+    cluster.kill_master()
+    cluster.rejoin("a", 0.0)
+    cluster.tell(happened.SourceStranded(1, 99))
+    assert cluster.active() == []
+    cluster.rejoin("b", 1.0)
+    cluster.tell(happened.SourceStranded(1, 99))
+    cluster.wait(1.0)
+    assert cluster.active() == ["a"]

@@ -355,6 +355,19 @@ class Play(RuleBasedStateMachine):
         self.flow()
 
     @precondition(lambda self: self.nodes())
+    @rule(which=which_one, of_another=chance)
+    def source_asks_if_it_may_resume(self, which: int, of_another: bool) -> None:
+        """Any node may ask at any time, with the number of its handoff or of another one.
+
+        `Node.wake` checks that no other node is active.
+        """
+        machine, node = self.pick(self.nodes(), which)
+        if machine.connected:
+            destination = 10**6 if of_another else node.handoff
+            self.tell(happened.SourceStranded(node.instance.number, destination))
+        self.flow()
+
+    @precondition(lambda self: self.nodes())
     @rule(
         which=which_one, until=st.sampled_from(["SHADOW", "SWITCH", "SILENT", "ACTIVE"]),
         fate=st.sampled_from(["", "source ends", "destination ends", "master is killed"]),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import xml.etree.ElementTree as ET
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -227,8 +227,9 @@ def test_the_protocol_page_says_how_a_host_gets_its_name():
     """The steps in the page turn its example into the shown name, which is rosrm's name."""
     text = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8")
     example = re.search(r"`(robot-1)` becomes `(\w+)`", text)
-    assert "`_` and the CRC-32 (as in zlib; 8 hex digits) of the name in UTF-8" in text
-    by_the_page = f"{example[1].replace('-', '_')}_{zlib.crc32(example[1].encode()):08x}"
+    assert "`_` and the first 32 hex digits of the SHA-256 of the name in UTF-8" in text
+    digest = hashlib.sha256(example[1].encode()).hexdigest()[:32]
+    by_the_page = f"{example[1].replace('-', '_')}_{digest}"
     assert example[2] == by_the_page == names.token(example[1])
 
 

@@ -24,7 +24,9 @@ KEPT = {
     happened.HandoffReported, happened.AssignmentWithdrawn,
 }  # fmt: skip
 NEWEST = {happened.ProcessRequested, happened.KeptStatesReceived}
-DROPPED = {happened.TimePassed, happened.UsagesReceived, happened.PeerRefused}
+DROPPED = {
+    happened.TimePassed, happened.UsagesReceived, happened.PeerRefused, happened.SourceStranded,
+}  # fmt: skip
 
 
 def still(now: float = 100.0) -> JournalStall:

@@ -32,3 +32,25 @@ def test_without_rosrm_there_is_no_identity(missing):
     """The node is then a plain rclpy node."""
     assert identity_from({**FULL, missing: ""}) is None
     assert identity_from({}) is None
+
+
+@pytest.mark.parametrize(
+    ("content", "epoch"),
+    [("00000000000000000007\n", 7), ("", None), ("seven", None), ("9" * 20 + "junk", 10**20 - 1)],
+)
+def test_the_epoch_that_the_slave_knows_is_read_from_its_file(tmp_path, content, epoch):
+    file = tmp_path / "epoch"
+    file.write_text(content)
+    assert identity_from({**FULL, "ROSRM_EPOCH_FILE": str(file)}).registered_epoch() == epoch
+
+
+def test_without_a_file_the_epoch_of_the_slave_is_not_known(tmp_path):
+    """A slave of an earlier release names none."""
+    assert identity_from(FULL).registered_epoch() is None
+    missing = str(tmp_path / "epoch")
+    assert identity_from({**FULL, "ROSRM_EPOCH_FILE": missing}).registered_epoch() is None
+
+
+def test_the_topics_of_rosrm_are_beside_the_masters():
+    assert identity_from(FULL).namespace == "/rosrm"
+    assert identity_from({**FULL, "ROSRM_STATE_CONFIG": "/a/b/state_config"}).namespace == "/a/b"

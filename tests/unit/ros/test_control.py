@@ -47,6 +47,7 @@ def test_a_fresh_request_passes() -> None:
         ({"receiver_beat": 101 * S}, "stale", []),
         ({"receiver_beat": 2**63}, "stale", []),
         ({"request_id": ""}, "invalid", []),  # a repetition could not be recognised
+        ({"request_id": "a" * 65}, "invalid", ["more than 64"]),
         # The other fields of another version are not used.
         ({"protocol_version": 99, "receiver_beat": 0}, "version", ["99", str(PROTOCOL_VERSION)]),
     ],
@@ -76,17 +77,75 @@ def test_a_repeated_request_gets_the_same_answer_also_while_it_is_carried_out() 
     assert first.answers == []  # the code that carries out the first request answers it
 
 
-def test_the_gate_forgets_only_the_oldest() -> None:
-    """The gate's memory is bounded.
+class Clock:
+    """The receiver's clock."""
 
-    It holds far more requests than can arrive within the greatest age.
-    """
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> int:
+        return int(self.now * S)
+
+
+def admit(judge: RequestGate, request: Envelope) -> bool:
+    """Return True if a request is admitted, and was not before, as `ControlServer` decides."""
+    if not judge.knows(request) and judge.refusal(request) is not None:
+        return False
+    return not judge.repeated(request, Requested())
+
+
+def flood(judge: RequestGate, count: int, beat: int) -> None:
+    for number in range(count):
+        assert admit(judge, envelope(beat, request_id=f"other {number} at {beat}"))
+
+
+def test_no_id_is_used_twice_within_the_greatest_age_of_a_request() -> None:
+    """A flood of other requests does not make the gate forget one that may still be repeated."""
+    clock = Clock()
+    judge = RequestGate(clock, 5.0)
+    once = envelope(100 * S, request_id="once")
+    assert admit(judge, once)
+    flood(judge, 20_000, 100 * S)
+    clock.now += 5.0
+    assert not admit(judge, once)
+    clock.now += 0.1
+    flood(judge, 20_000, 105 * S)
+    assert not judge.knows(once)
+    assert judge.refusal(once).code == "stale"
+
+
+def test_an_old_id_is_remembered_while_there_is_room() -> None:
+    """A late repetition gets its answer, and is not refused as stale."""
+    clock = Clock()
+    judge = RequestGate(clock, 5.0)
+    assert admit(judge, envelope(100 * S))
+    clock.now += 60.0
+    flood(judge, 9_998, 160 * S)
+    assert judge.knows(envelope(100 * S))
+
+
+def test_the_memory_of_the_gate_is_bounded() -> None:
+    """More requests than it can remember are refused, not executed without protection."""
+    clock = Clock()
+    judge = RequestGate(clock, 5.0)
+    flood(judge, 50_000, 100 * S)
+    refusal = judge.refusal(envelope(100 * S, request_id="one more"))
+    assert (refusal.code, "more than 50000 requests came" in refusal.message) == ("stale", True)
+    clock.now += 5.1
+    assert judge.refusal(envelope(105 * S, request_id="one more")) is None
+    assert not judge._answers.keys() ^ judge._admitted.keys()
+    assert len(judge._answers) < 10_000
+
+
+def test_the_repetitions_that_wait_are_bounded() -> None:
+    """The newest repetitions get the answer, and older ones get none."""
     judge = gate()
-    for number in range(10_001):
-        assert not judge.repeated(envelope(1, request_id=str(number)), Requested())
-    assert judge.repeated(envelope(1, request_id="1"), Requested())
-    assert judge.repeated(envelope(1, request_id="10000"), Requested())
-    assert not judge.repeated(envelope(1, request_id="0"), Requested())
+    assert not judge.repeated(envelope(1), Requested())
+    waiting = [Requested() for _ in range(1000)]
+    assert all(judge.repeated(envelope(1), one) for one in waiting)
+    judge.remember(envelope(1), "done")
+    assert [one.answers for one in waiting if one.answers] == [["done"]] * 16
+    assert waiting[-1].answers
 
 
 def test_check_answer_raises_the_refusal() -> None:

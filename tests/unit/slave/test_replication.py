@@ -289,6 +289,24 @@ def test_a_part_out_of_order_restarts_the_transfer(net):
     assert answers[0].code == "order"
 
 
+def test_parts_that_wait_for_a_slow_disk_are_bounded(net):
+    """A stranger may send faster than the disk writes; the sender of a refused part tries again."""
+    slave = net.add("a")
+    free = threading.Event()
+    slave._jobs.put(lambda: free.wait(PATIENCE))
+    answers = []
+    for number in range(100):
+        part = TransferPart(f"p{number}", 7, 1, 100, 200, 0, bytes(50))
+        slave.take_part(part, lambda refusal: answers.append(refusal.code))
+    assert answers == ["full"] * 36
+    free.set()
+    net.settle()
+    assert answers == ["full"] * 36 + ["order"] * 64
+    slave.take_part(part, lambda refusal: answers.append(refusal.code))
+    net.settle()
+    assert answers[100:] == ["order"]
+
+
 def test_a_slow_disk_does_not_block_the_loop(net, monkeypatch):
     """Files are written by a thread, not by the loop."""
     slave = net.add("a")
@@ -406,6 +424,15 @@ def test_a_local_snapshot_as_new_is_not_fetched(net):
     net.write("b", 41)
     prepare(net, "a", assignment("b"))
     assert net.age("a") == (7, 42)
+
+
+def test_a_snapshot_of_a_later_instance_is_not_fetched(net):
+    """Its number is forged; the node would ignore it, and the one on the next host is true."""
+    net.add_all("abc")
+    net.write("b", 42, number=2**52)
+    net.write("c", 41)
+    prepare(net, "a", assignment("b", "c"))
+    assert net.age("a") == (7, 41)
 
 
 def test_snapshots_and_replicas_are_private_to_their_owner(net):

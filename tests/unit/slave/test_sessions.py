@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from rosrm.slave.sessions import SessionTable, SessionUsage
+from tests.limits import no_more_files
 
 TICKS = os.sysconf("SC_CLK_TCK")
 PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -138,3 +139,17 @@ def test_what_was_handed_out_does_not_change(tree, table):
     table.add(20)
     table.remove(10, 0.0)
     assert before == (10,)
+
+
+def test_without_descriptors_the_last_usage_stays(tree, table):
+    """Usage of 0, and all seconds of a process in the next look, would be wrong readings."""
+    tree.put(10, 10, own=5.0, pages=100)
+    table.add(10)
+    table.refresh(0.0)
+    tree.put(10, 10, own=6.0, pages=100)
+    with no_more_files():
+        table.refresh(1.0)
+    assert table.usage() == {10: SessionUsage(0.0, 100 * PAGE)}
+    assert table.members(10) == (10,)
+    table.refresh(2.0)
+    assert table.usage() == {10: SessionUsage(pytest.approx(0.5), 100 * PAGE)}

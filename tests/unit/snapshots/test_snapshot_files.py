@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosrm.snapshots import reader
-from rosrm.snapshots.format import Block, Damaged, decoded, encoded_head
+from rosrm.snapshots.format import MOST_CYCLES, Block, Damaged, decoded, encoded_head
 from rosrm.snapshots.writer import CopyWriter, SlotWriter, drop_snapshots
 
 
@@ -25,7 +25,8 @@ def blocks(*contents: bytes) -> list[Block]:
 def write_copy(directory: Path, data: bytes) -> None:
     copy = CopyWriter(directory)
     copy.append(data)
-    copy.finish()
+    head = decoded(data).head
+    copy.finish(head.process, head.age)
 
 
 def write(directory: Path, sequence: int, *contents: bytes, instance: int = 7) -> bool:
@@ -44,7 +45,7 @@ def newest(directory: Path, up_to: int = 99):
 CONTENTS = st.lists(st.binary(max_size=200), min_size=1, max_size=4)
 
 
-@given(contents=CONTENTS, sequence=st.integers(0, 2**64 - 1), name=st.text(max_size=20))
+@given(contents=CONTENTS, sequence=st.integers(0, MOST_CYCLES - 1), name=st.text(max_size=20))
 def test_what_is_written_is_read(contents, sequence, name):
     """Name, instance, sequence and every block are equal, bit by bit."""
     parts = blocks(*contents)
@@ -72,6 +73,40 @@ def test_no_change_goes_unseen(contents, data):
 def test_a_file_that_is_no_snapshot_is_refused(garbage):
     with pytest.raises(Damaged):
         decoded(garbage)
+
+
+@pytest.mark.parametrize(
+    ("instance", "sequence"), [(2**64 - 1, 1), (7, 2**64 - 1), (MOST_CYCLES, 0), (0, MOST_CYCLES)]
+)
+def test_a_number_that_would_overflow_is_refused(instance, sequence):
+    """The node would continue to count from there."""
+    parts = blocks(b"state")
+    with pytest.raises(Damaged, match="no instance has such a number"):
+        decoded(encoded_head("counter", instance, sequence, parts) + b"state")
+
+
+@pytest.mark.parametrize("size", [2**64 - 1, 2**63, 2**31])
+def test_a_block_of_an_absurd_size_is_refused_without_memory_for_it(size):
+    class Claimed(bytes):
+        def __len__(self) -> int:
+            return min(size, 2**63 - 1)
+
+    head = encoded_head("counter", 7, 1, [Block(Claimed(), 0)])
+    with pytest.raises(Damaged, match="larger than a state can be"):
+        decoded(head)
+
+
+def test_a_replica_of_another_process_or_age_replaces_nothing(tmp_path):
+    """A sender must not bring a state under a name or number that its parts did not have."""
+    write(tmp_path, 5, b"mine")
+    data = encoded_head("other", 2**40, 9, blocks(b"forged")) + b"forged"
+    for process, age in (("counter", (2**40, 9)), ("other", (7, 9))):
+        copy = CopyWriter(tmp_path)
+        copy.append(data)
+        with pytest.raises(Damaged, match="it is a state of other#"):
+            copy.finish(process, age)
+    assert newest(tmp_path, up_to=2**41) == ((7, 5), (b"mine",))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(reader.SLOTS)
 
 
 def test_the_newest_counts(tmp_path):

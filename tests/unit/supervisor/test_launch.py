@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import hypothesis.strategies as st
 import pytest
@@ -342,6 +343,13 @@ def test_a_node_gets_its_own_name_in_its_environment():
     assert made["ROSRM_EPOCH"] == "3"
     packaged = assignment(package="demo_nodes", executable="talker", namespace="/")
     assert process_environment(packaged, {}, HERE)["ROSRM_NODE"] == "/talker"
+
+
+def test_a_process_knows_the_file_with_the_masters_epoch():
+    here = replace(HERE, epoch_file=Path("/state/epoch"))
+    made = process_environment(assignment(command=("x",)), {}, here)
+    assert made["ROSRM_EPOCH_FILE"] == "/state/epoch"
+    assert "ROSRM_EPOCH_FILE" not in process_environment(assignment(command=("x",)), made, HERE)
 
 
 def test_the_identity_of_the_slave_is_not_inherited():

@@ -20,6 +20,8 @@ from rosrm.core.master.outcomes import (
     StepProgress,
     done_if,
 )
+from rosrm.core.master.recovery import journal_gap
+from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.migration import HandoffReports, Migration
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
@@ -118,9 +120,40 @@ def _take_over(state: MasterState, migration: Migration, step: Configure, now: f
 
 def handoff_reported(state: MasterState, event: happened.HandoffReported, now: float) -> None:
     """Note the reported phase of the source or the destination."""
-    for migration in (state.migrations.get(event.process), state.standbys.get(event.process)):
+    of_process = (state.migrations.get(event.process), state.standbys.get(event.process))
+    for migration in of_process:
         if migration is not None and migration.destination.number == event.destination:
             _note(state, migration, event, now)
+
+
+def source_stranded(state: MasterState, event: happened.SourceStranded, now: float) -> None:
+    """Let a silent source resume whose handoff is not under way.
+
+    Forged messages can silence a node, and the source cannot know if its destination is active. The
+    master knows that it is not: the source owns the name, no migration of the process is under way,
+    and the destination never existed or has ended.
+    """
+    source = state.instances.get(event.source)
+    process = None if source is None else state.owned_by(source)
+    if source is None or process is None or source.stopping:
+        return
+    if process.name in state.migrations or event.destination in state.instances:
+        return
+    hosts_missing = bool((state.hosts.condition == HostCondition.EXPECTED).any())
+    if hosts_missing or journal_gap.why_no_work(state, now):
+        return  # a destination may run that the journal does not have; the source asks again
+    spec = process.spec
+    node = qualified_name(spec.namespace, source.node_name or spec.name)
+    state.record(
+        now, EventKind.SOURCE_STRANDED,
+        f"{source.id} is silent for a handoff to {process.name}#{event.destination}, which is not "
+        f"under way: it publishes again",
+        process=process.name, host=source.host.name,
+    )  # fmt: skip
+    for phase in (HandoffPhase.RESUME, HandoffPhase.DONE):
+        state.emit(
+            PublishStateConfig(process.name, phase, event.source, event.destination, node, "")
+        )
 
 
 def _note(

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosrm.node.handoff import snapshot_assembler
 from rosrm.node.handoff.snapshot_assembler import CutAssembler, part_key
 
 A, B = "/a", "/b"
 
 
-def mark(sequence, **parts):
+def mark(sequence, stamps=(), **parts):
     described = [
         SimpleNamespace(topic=f"/{name}", size=part_key(data).size, digest=part_key(data).digest)
         for name, data in parts.items()
     ]
-    return SimpleNamespace(sequence=sequence, parts=described)
+    return SimpleNamespace(
+        sequence=sequence, parts=described, outputs=(), timers_due=(),
+        inputs=[SimpleNamespace(topic="/in", covered=stamps)],
+    )  # fmt: skip
 
 
 def assembler(*topics):
@@ -88,3 +93,30 @@ def test_any_order_of_arrival_ends_at_the_last_state(data):
     for cut in taken:
         assert (cut.parts[A], cut.parts[B]) == states[cut.mark.sequence]
     assert taken[-1].mark.sequence == len(states) - 1
+
+
+def test_the_bytes_of_parts_are_bounded(monkeypatch):
+    """Marks that name many parts of one topic, and of another one that never comes, keep all."""
+    monkeypatch.setattr(snapshot_assembler, "_MOST_BYTES", 100)
+    cuts = assembler(A, B)
+    for sequence in range(50):
+        data = b"%02d" % sequence * 10
+        cuts.add_mark(mark(sequence, a=data, b=b"never"), 0.0)
+        cuts.add_part(A, data)
+        assert sum(map(len, cuts._at_hand[A].values())) <= 100
+    cuts.add_part(B, b"never")
+    assert cuts.take().mark.sequence == 49
+
+
+@pytest.mark.parametrize("stamps", [(), range(100)])
+def test_the_marks_that_wait_are_bounded(monkeypatch, stamps):
+    """The destination then fails the handoff; marks whose states came do not count."""
+    monkeypatch.setattr(snapshot_assembler, "_MOST_MARKS", 50)
+    monkeypatch.setattr(snapshot_assembler, "_MOST_ENTRIES", 3000)
+    cuts = assembler(A)
+    cuts.add_part(A, b"here")
+    for sequence in range(200):
+        assert cuts.add_mark(mark(sequence, stamps, a=b"here"), 0.0)
+        assert cuts.take() is not None
+    waiting = [cuts.add_mark(mark(200 + one, stamps, a=b"never"), 0.0) for one in range(60)]
+    assert waiting.index(False) == (29 if stamps else 50)

@@ -1,0 +1,38 @@
+"""Note of the master's newest epoch, for the migratable nodes of this host.
+
+A node judges by it which messages about handoffs are its master's. The file `epoch` of the state
+directory is overwritten in place, so it needs no room on a full disk.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+EPOCH_NOTE: Final = "epoch"
+
+
+class EpochNote:
+    """Writes the epoch of the master with which this slave is registered."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._written = 0
+
+    def note(self, epoch: int) -> None:
+        """Write the epoch, unless it is written; a failure is retried with the next call."""
+        if epoch == self._written:
+            return
+        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+        try:
+            file = os.open(self._path, flags, 0o600)
+        except OSError:
+            return
+        try:
+            os.pwrite(file, f"{epoch:020d}\n".encode(), 0)
+            self._written = epoch
+        except OSError:
+            return
+        finally:
+            os.close(file)
