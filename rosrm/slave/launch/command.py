@@ -38,13 +38,11 @@ def launch_order(
     """
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
-    command = _command(spec, environment, python)
-    if spec.ros:
-        parameters_file = _write_parameters(assignment, state_directory)
-        ros = ros_arguments(spec, assignment.node_name, parameters_file)
-        arguments = join_arguments(spec.arguments, ros)
-    else:
-        arguments = list(spec.arguments)
+    try:
+        command = _command(spec, environment, python)
+        arguments = _arguments(assignment, state_directory)
+    except (OSError, ValueError) as error:  # a folder of another user, a text without encoding
+        raise LaunchError(f"{assignment.instance}: {error}") from None
     plain = Launch(assignment, where.cluster, (*command, *arguments), environment)
     launch = launchers.prepare(plain)
     return LaunchOrder(
@@ -91,6 +89,16 @@ def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> 
         raise LaunchError(f"{spec.name!r} has nothing to run: set package, module or command")
     program, *words = spec.command
     return (_at_home(program, "command"), *words)
+
+
+def _arguments(assignment: Assignment, state_directory: Path) -> list[str]:
+    """Return the arguments of a command line; the parameters of a node go to a file."""
+    spec = assignment.spec
+    if not spec.ros:
+        return list(spec.arguments)
+    parameters_file = _write_parameters(assignment, state_directory)
+    ros = ros_arguments(spec, assignment.node_name, parameters_file)
+    return join_arguments(spec.arguments, ros)
 
 
 def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:

@@ -200,6 +200,21 @@ def test_what_is_missing_is_named(tmp_path, prefix, package, executable, said):
         assert part in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"package": "x" * 300, "executable": "talker"},
+        {"package": "demo_nodes", "executable": "x" * 300},
+        {"command": ("node",), "ros": True, "parameters": {"half": "\ud800"}},
+    ],
+    ids=["package", "executable", "parameter"],
+)
+def test_a_launch_that_the_system_refuses_ends_no_slave(tmp_path, prefix, fields):
+    """A name is too long, or a text has no encoding: the instance is refused with the reason."""
+    with pytest.raises(LaunchError, match=r"talker#7: .*(too long|encode)"):
+        order(tmp_path, {"AMENT_PREFIX_PATH": str(prefix)}, **fields)
+
+
 def test_a_few_packages_are_listed_and_many_counted(prefix):
     """The first names of many would not help; their number shows that the path is not empty."""
     with pytest.raises(LaunchError, match="'quux' was not found; there: demo_nodes"):
