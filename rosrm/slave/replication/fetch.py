@@ -46,6 +46,10 @@ class Fetch:
         now = time.monotonic()
         self._deadline, self._host_by = now + LONGEST, now + PATIENCE
 
+    def cancel(self) -> None:
+        """Ask for no further part; `ended` is not called."""
+        self._has_ended = True
+
     def advance(self, now: float) -> None:
         """Ask for the next part, or try the next host if this one does not answer."""
         if self._has_ended:

@@ -94,6 +94,13 @@ class SnapshotStore:
         """Delete the snapshots of instances up to a number."""
         drop_snapshots(self.directory(process), up_to)
 
+    def end_interrupted(self, now: float) -> None:
+        """Give up the transfers whose other side is silent; they take disk space and memory."""
+        for process in [name for name, one in self._incoming.items() if now >= one.until]:
+            self._abandon(process)
+        for process in [name for name, one in self._being_read.items() if now >= one.until]:
+            del self._being_read[process]
+
     # --- incoming snapshots --------------------------------------------------------------
 
     def take(self, part: TransferPart, now: float, *, bounded: bool) -> NotStored | None:
@@ -164,11 +171,6 @@ class SnapshotStore:
             drop_snapshots(self.directory(part.process), head.instance)
             raise Damaged(f"it is a state of {head.process!r}")
 
-    def abandon_interrupted(self, now: float) -> None:
-        """Delete the unfinished replicas whose senders send no more; they take room."""
-        for process in [name for name, one in self._incoming.items() if now >= one.until]:
-            self._abandon(process)
-
     def _abandon(self, process: str) -> None:
         coming = self._incoming.pop(process, None)
         if coming is not None:
@@ -183,8 +185,6 @@ class SnapshotStore:
 
         The age (0, 0) requests the newest snapshot.
         """
-        for name in [name for name, one in self._being_read.items() if now >= one.until]:
-            del self._being_read[name]
         one = self._being_read.get(process)
         if one is None or one.head.age != age:
             found = self.newer_than(process, (0, 0))
