@@ -470,7 +470,7 @@ def test_a_start_that_is_called_off_does_not_happen(net):
 
 
 def test_a_fetch_that_is_called_off_disturbs_no_later_one(net, monkeypatch):
-    """It asks for no further part: two fetches of one process would refuse each other's parts."""
+    """No further part is asked for; two fetches of one process refuse each other's parts."""
     slave, source = net.add("a"), net.add("b")
     net.write("b", 42, 10_000)
     asked: list[int] = []
