@@ -15,7 +15,7 @@ import pytest
 
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
-from rosrm.ros.slave.replication import NotStored
+from rosrm.ros.slave.replication import NotSent, NotStored
 from rosrm.slave.replication import fetch
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.snapshots import reader
@@ -51,7 +51,7 @@ class Wire:
 
     def ask(self, host, request, now, timeout, done) -> None:
         def answer(part: TransferPart | None) -> None:
-            done("there is no such snapshot here" if part is None else part)
+            done(NotSent("there is no such snapshot here") if part is None else part)
 
         age = (request.number, request.sequence)
         self.net.slaves[host].read_part(request.process, age, request.offset, 1000, answer)
