@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
@@ -15,8 +16,15 @@ from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.environment import ProcessLocation, process_environment
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ros_arguments
+from rosrm.supervisor import json_lines
 from rosrm.supervisor.client import log_path
 from rosrm.supervisor.client_values import LaunchOrder
+
+#: Most bytes of command line and environment, as the supervisor receives them; the rest of its
+#: longest line is for the other fields.
+_LONGEST: Final = json_lines.LONGEST_LINE - (1 << 16)
+#: Characters that are always short enough: JSON has at most 12 bytes for each.
+_SHORT: Final = _LONGEST // 16
 
 
 def launch_order(
@@ -45,6 +53,7 @@ def launch_order(
         raise LaunchError(f"{assignment.instance}: {error}") from None
     plain = Launch(assignment, where.cluster, (*command, *arguments), environment)
     launch = launchers.prepare(plain)
+    _check_length(launch)
     return LaunchOrder(
         instance=assignment.instance,
         argv=launch.argv,
@@ -57,6 +66,19 @@ def launch_order(
         fence=assignment.fence,
         last_contact=last_contact,
     )
+
+
+def _check_length(launch: Launch) -> None:
+    """Raise `LaunchError` if the supervisor would refuse the order, which is one line for it."""
+    parts = (*launch.argv, *launch.environment, *launch.environment.values())
+    if sum(len(part) + 1 for part in parts) < _SHORT:
+        return
+    length = len(json_lines.line({"parts": parts}))
+    if length > _LONGEST:
+        raise LaunchError(
+            f"{launch.assignment.instance}: command line and environment have {length} bytes; "
+            f"allowed: {_LONGEST}. Pass long texts in a file"
+        )
 
 
 def _working_directory(spec: ProcessSpec) -> str | None:
