@@ -91,6 +91,14 @@ def one_line(reason: str) -> str:
     return reason.replace("\n", "; ")
 
 
+def sendable(text: str) -> str:
+    """Return a text with "?" for each character without a UTF-8 form, as in a path of other bytes.
+
+    ROS messages hold UTF-8 alone.
+    """
+    return text.encode(errors="replace").decode()
+
+
 def words(name: str) -> str:
     """Return the name of a state or kind without underscores."""
     return name.replace("_", " ")

@@ -18,6 +18,7 @@ from typing import Any, Final
 from rosrm.errors import Refused
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.version import PROTOCOL_VERSION
+from rosrm.wording import sendable
 from rosrm_msgs.msg import Answer, Envelope
 
 #: Ids that are remembered at least, for late repetitions, and at most. An id is never forgotten
@@ -43,14 +44,17 @@ def version_refusal(version: int, who: str) -> str:
 
 def accepted(message: str = "", epoch: int = 0) -> Answer:
     """Return the answer to a request that was carried out."""
-    return Answer(protocol_version=PROTOCOL_VERSION, accepted=True, message=message, epoch=epoch)
+    return Answer(
+        protocol_version=PROTOCOL_VERSION, accepted=True, message=sendable(message), epoch=epoch
+    )
 
 
 def refused(code: str, message: str, epoch: int = 0) -> Answer:
     """Return the answer to a request that changed nothing."""
     return Answer(
-        protocol_version=PROTOCOL_VERSION, accepted=False, code=code, message=message, epoch=epoch
-    )
+        protocol_version=PROTOCOL_VERSION, accepted=False, code=code, message=sendable(message),
+        epoch=epoch,
+    )  # fmt: skip
 
 
 def check_answer(answer: Answer, who: str) -> None:

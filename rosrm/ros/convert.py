@@ -12,6 +12,7 @@ from typing import Any, Final, TypeVar, get_args, get_type_hints
 from rosrm.errors import Refused
 from rosrm.model import values
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.wording import sendable
 from rosrm_msgs import msg
 
 _INFINITE: Final = float("inf")
@@ -92,7 +93,7 @@ def _unchanged(value: Any) -> Any:
     return value
 
 
-def _to_msg(message: Any, value: Any, **others: Any) -> Any:
+def _to_msg(message: Any, value: Any, /, **others: Any) -> Any:
     """Return a dataclass as a message of a type with the same fields; `others` are converted."""
     same = {
         there: convert(getattr(value, name))
@@ -102,7 +103,7 @@ def _to_msg(message: Any, value: Any, **others: Any) -> Any:
     return message(**same, **others)
 
 
-def _from_msg(wanted: type[_Value], message: Any, **others: Any) -> _Value:
+def _from_msg(wanted: type[_Value], message: Any, /, **others: Any) -> _Value:
     """Return the inverse of `_to_msg`."""
     same = {
         name: convert(getattr(message, there))
@@ -300,7 +301,7 @@ def _description(
 
 def status_to_msg(status: values.InstanceStatus) -> msg.ProcessStatus:
     """Return an instance's status as a message."""
-    return _to_msg(msg.ProcessStatus, status)
+    return _to_msg(msg.ProcessStatus, status, message=sendable(status.message))
 
 
 def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:

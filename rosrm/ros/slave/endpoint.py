@@ -25,6 +25,7 @@ from rosrm.ros.participant import Participant
 from rosrm.ros.slave.journal_watermark import JournalWatermark, Watermark
 from rosrm.ros.slave.reporter import Reporter
 from rosrm.version import PROTOCOL_VERSION, __version__
+from rosrm.wording import sendable
 from rosrm_msgs import msg, srv
 
 _log = logging.getLogger("rosrm.slave")
@@ -372,7 +373,7 @@ class SlaveEndpoint:
                 incarnation=self._description.incarnation, sequence=self._status_sequence,
                 complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
                 failing=[
-                    msg.PluginState(kind=kind, name=name, state="failing", reason=reason)
+                    msg.PluginState(kind=kind, name=name, state="failing", reason=sendable(reason))
                     for (kind, name), reason in self.failing.items()
                 ],
             )

@@ -33,6 +33,16 @@ class NotStored(NamedTuple):
     message: str
 
 
+class NotSent(NamedTuple):
+    """Reason why another slave has not sent a part of a snapshot.
+
+    Attributes:
+        message: as text for the user.
+    """
+
+    message: str
+
+
 class ReplicationHost(Protocol):
     """Interface of the slave for its replication endpoint."""
 
@@ -144,7 +154,7 @@ class ReplicationEndpoint:
 
     def ask(
         self, host: str, wanted: TransferPart, now: float, timeout: float,
-        done: Callable[[TransferPart | str], None],
+        done: Callable[[TransferPart | NotSent], None],
     ) -> None:  # fmt: skip
         """Request a part from another slave; `done` gets it, or the reason why there is none.
 
@@ -156,11 +166,10 @@ class ReplicationEndpoint:
         )  # fmt: skip
 
         def answered(response: srv.ReadKept.Response | None) -> None:
-            done(
-                f"no answer within {timeout:g} s"
-                if response is None
-                else _part_of(response, wanted)
-            )
+            if response is None:
+                done(NotSent(f"no answer within {timeout:g} s"))
+            else:
+                done(_part_of(response, wanted))
 
         client = self._peer(srv.ReadKept, names.READ_KEPT, host, now)
         self._client.call(client, request, now + timeout, answered)
@@ -172,10 +181,10 @@ class ReplicationEndpoint:
             self._participant.node.destroy_client(self._peers.pop(key).client)
 
 
-def _part_of(response: srv.ReadKept.Response, wanted: TransferPart) -> TransferPart | str:
+def _part_of(response: srv.ReadKept.Response, wanted: TransferPart) -> TransferPart | NotSent:
     answer = response.answer
     if not answer.accepted:
-        return str(answer.message)
+        return NotSent(str(answer.message))
     return TransferPart(
         wanted.process, response.number, response.sequence, wanted.offset, response.total,
         response.digest, bytes(response.data),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
@@ -15,8 +16,15 @@ from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.environment import ProcessLocation, process_environment
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ros_arguments
+from rosrm.supervisor import json_lines
 from rosrm.supervisor.client import log_path
 from rosrm.supervisor.client_values import LaunchOrder
+
+#: Most bytes of command line and environment, as the supervisor receives them; the rest of its
+#: longest line is for the other fields.
+_LONGEST: Final = json_lines.LONGEST_LINE - (1 << 16)
+#: Characters that are always short enough: JSON has at most 12 bytes for each.
+_SHORT: Final = _LONGEST // 16
 
 
 def launch_order(
@@ -38,15 +46,14 @@ def launch_order(
     """
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
-    command = _command(spec, environment, python)
-    if spec.ros:
-        parameters_file = _write_parameters(assignment, state_directory)
-        ros = ros_arguments(spec, assignment.node_name, parameters_file)
-        arguments = join_arguments(spec.arguments, ros)
-    else:
-        arguments = list(spec.arguments)
+    try:
+        command = _command(spec, environment, python)
+        arguments = _arguments(assignment, state_directory)
+    except (OSError, ValueError) as error:  # a folder of another user, a text without encoding
+        raise LaunchError(f"{assignment.instance}: {error}") from None
     plain = Launch(assignment, where.cluster, (*command, *arguments), environment)
     launch = launchers.prepare(plain)
+    _check_length(launch)
     return LaunchOrder(
         instance=assignment.instance,
         argv=launch.argv,
@@ -59,6 +66,19 @@ def launch_order(
         fence=assignment.fence,
         last_contact=last_contact,
     )
+
+
+def _check_length(launch: Launch) -> None:
+    """Raise `LaunchError` if the supervisor would refuse the order, which is one line for it."""
+    parts = (*launch.argv, *launch.environment, *launch.environment.values())
+    if sum(len(part) + 1 for part in parts) < _SHORT:
+        return
+    length = len(json_lines.line({"parts": parts}))
+    if length > _LONGEST:
+        raise LaunchError(
+            f"{launch.assignment.instance}: command line and environment have {length} bytes; "
+            f"allowed: {_LONGEST}. Pass long texts in a file"
+        )
 
 
 def _working_directory(spec: ProcessSpec) -> str | None:
@@ -91,6 +111,16 @@ def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> 
         raise LaunchError(f"{spec.name!r} has nothing to run: set package, module or command")
     program, *words = spec.command
     return (_at_home(program, "command"), *words)
+
+
+def _arguments(assignment: Assignment, state_directory: Path) -> list[str]:
+    """Return the arguments of a command line; the parameters of a node go to a file."""
+    spec = assignment.spec
+    if not spec.ros:
+        return list(spec.arguments)
+    parameters_file = _write_parameters(assignment, state_directory)
+    ros = ros_arguments(spec, assignment.node_name, parameters_file)
+    return join_arguments(spec.arguments, ros)
 
 
 def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Final
 
 from rosrm.model.values import Assignment
-from rosrm.ros.slave.replication import NotStored, ReplicationEndpoint
+from rosrm.ros.slave.replication import NotSent, NotStored, ReplicationEndpoint
 from rosrm.snapshots.format import Head, TransferPart
 
 #: Seconds for the discovery of a slave, or its answer; then the next host is asked.
@@ -46,6 +46,10 @@ class Fetch:
         now = time.monotonic()
         self._deadline, self._host_by = now + LONGEST, now + PATIENCE
 
+    def cancel(self) -> None:
+        """Ask for no further part; `ended` is not called."""
+        self._has_ended = True
+
     def advance(self, now: float) -> None:
         """Ask for the next part, or try the next host if this one does not answer."""
         if self._has_ended:
@@ -62,12 +66,12 @@ class Fetch:
             elif now >= self._host_by:
                 self._next_host(f"its slave was not found within {PATIENCE:g} s", now)
 
-    def _answered(self, part: TransferPart | str) -> None:
+    def _answered(self, part: TransferPart | NotSent) -> None:
         if self._has_ended:
             return
         now = time.monotonic()
-        if isinstance(part, str):
-            self._next_host(part, now)
+        if isinstance(part, NotSent):
+            self._next_host(part.message, now)
         elif part.number < self._assignment.kept_from or not part.data:
             self._next_host("its snapshot is of an earlier process of that name", now)
         elif part.number > self._assignment.instance.number:

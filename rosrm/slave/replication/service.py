@@ -194,7 +194,7 @@ class ReplicationService:
         return self._snapshots
 
     def _scan(self, now: float) -> tuple[SnapshotReport, ...]:
-        self._store.abandon_interrupted(now)
+        self._store.end_interrupted(now)
         return self._store.scan()
 
     def _scanned(self, states: tuple[SnapshotReport, ...] | None) -> None:
@@ -376,5 +376,7 @@ class ReplicationService:
         """Cancel the preparation of an instance's start; return False if there is none."""
         if instance not in self._preparing:
             return False
-        del self._preparing[instance]
+        fetch = self._preparing.pop(instance)
+        if fetch is not None:
+            fetch.cancel()
         return True

@@ -155,6 +155,13 @@ class SnapshotStore:
         drop_snapshots(self.directory(process), up_to)
         self._refreshed.pop(process, None)
 
+    def end_interrupted(self, now: float) -> None:
+        """Give up the transfers whose other side is silent; they take disk space and memory."""
+        for process in [name for name, one in self._incoming.items() if now >= one.until]:
+            self._abandon(process)
+        for process in [name for name, one in self._being_read.items() if now >= one.until]:
+            del self._being_read[process]
+
     # --- incoming snapshots --------------------------------------------------------------
 
     def take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
@@ -249,11 +256,6 @@ class SnapshotStore:
         coming.writer.finish(part.process, part.age)
         self._refreshed[part.process] = self._clock()
 
-    def abandon_interrupted(self, now: float) -> None:
-        """Delete the unfinished replicas whose senders send no more; they take room."""
-        for process in [name for name, one in self._incoming.items() if now >= one.until]:
-            self._abandon(process)
-
     def _abandon(self, process: str) -> None:
         coming = self._incoming.pop(process, None)
         if coming is not None:
@@ -269,8 +271,6 @@ class SnapshotStore:
         The age (0, 0) requests the newest snapshot.
         """
         now = self._clock()
-        for name in [name for name, one in self._being_read.items() if now >= one.until]:
-            del self._being_read[name]
         one = self._being_read.pop(process, None)
         if one is None or one.head.age != age:
             found = self.newer_than(process, (0, 0))

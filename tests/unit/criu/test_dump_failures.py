@@ -167,7 +167,7 @@ def test_a_process_that_ended_since_costs_no_host_its_capability(tmp_path):
 
 
 def test_a_node_that_cannot_be_called_back_is_reported(tmp_path, process):
-    """It runs, and names no control directory."""
+    """The process runs, and names no control directory."""
     away = tmp_path / "images" / "periodic-1" / "away"
     away.parent.mkdir(parents=True)
     away.write_text("p#1-periodic-1")

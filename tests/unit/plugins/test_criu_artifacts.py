@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
@@ -82,11 +84,29 @@ def test_remains_of_a_former_slave_are_removed(tmp_path, monkeypatch):
         (place / "manifest.json").touch()
     artifacts.sweep(tmp_path, ["p#3"])
     assert not outgoing(tmp_path, 1).exists()
-    assert [directory for _, _, directory in later] == [incoming(tmp_path, 2)]
-    for _, do, directory in later:
-        do(directory)
+    assert [directory for _, _, directory, _ in later] == [incoming(tmp_path, 2)]
+    for _, do, *arguments in later:
+        do(*arguments)
     assert not incoming(tmp_path, 2).exists()
     assert incoming(tmp_path, 3).exists()
+
+
+def test_an_image_is_not_removed_while_it_is_restored(tmp_path, monkeypatch):
+    """A large image takes longer than a slave keeps the rest of its predecessor."""
+    later = []
+    monkeypatch.setattr(artifacts, "_later", lambda *call: later.append(call))
+    directory = incoming(tmp_path, 1)
+    directory.mkdir(parents=True)
+    words = [sys.executable, "-c", "input()", str(directory)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE) as shim:
+        artifacts.remove_unused_later(directory, 1.0)
+        _, do, *arguments = later.pop()
+        do(*arguments)
+        assert directory.exists()
+        shim.kill()
+    _, do, *arguments = later.pop()
+    do(*arguments)
+    assert not directory.exists()
 
 
 @pytest.mark.parametrize(("reason", "known"), [("", True), ("the image is damaged", False)])

@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosrm.errors import Refused
 from rosrm.model import values
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
-from rosrm.ros import convert
+from rosrm.ros import control, convert
 from rosrm_msgs import msg
 from tests.drawing import SPECS, drawn
 
@@ -54,6 +54,18 @@ def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
     setattr(message, name, value)
     with pytest.raises(Refused, match="a restart policy: "):
         convert.restart_from_msg(message)
+
+
+def test_a_status_about_a_path_of_other_bytes_can_be_sent() -> None:
+    """A path that is no UTF-8 has surrogates, which ended the slave at the next report."""
+    path = b"/opt/caf\xe9/talker".decode(errors="surrogateescape")
+    status = values.InstanceStatus(
+        values.InstanceId("p", 1), values.InstanceState.FAILED, message=f"no executable {path}"
+    )
+    message = over_the_wire(convert.status_to_msg(status))
+    assert message.message == "no executable /opt/caf?/talker"
+    answer = over_the_wire(control.refused("unable", path))
+    assert answer.message == "/opt/caf?/talker"
 
 
 @given(drawn(values.InstanceStatus))

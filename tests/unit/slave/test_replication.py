@@ -15,7 +15,7 @@ import pytest
 
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
-from rosrm.ros.slave.replication import NotStored
+from rosrm.ros.slave.replication import NotSent, NotStored
 from rosrm.slave.replication import fetch
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.snapshots import reader
@@ -51,7 +51,7 @@ class Wire:
 
     def ask(self, host, request, now, timeout, done) -> None:
         def answer(part: TransferPart | None) -> None:
-            done("there is no such snapshot here" if part is None else part)
+            done(NotSent("there is no such snapshot here") if part is None else part)
 
         age = (request.number, request.sequence)
         self.net.slaves[host].read_part(request.process, age, request.offset, 1000, answer)
@@ -494,3 +494,36 @@ def test_a_start_that_is_called_off_does_not_happen(net):
     assert slave.forget(request.instance)
     net.pass_times(20)
     assert not slave.is_preparing(request.instance)
+
+
+def test_a_fetch_that_is_called_off_disturbs_no_later_one(net, monkeypatch):
+    """No further part is asked for; two fetches of one process refuse each other's parts."""
+    slave, source = net.add("a"), net.add("b")
+    net.write("b", 42, 10_000)
+    asked: list[int] = []
+    read_part = source.read_part
+    monkeypatch.setattr(
+        source, "read_part", lambda *part: (asked.append(part[2]), read_part(*part))
+    )
+    request = assignment("b")
+    slave.prepare(request, lambda _: pytest.fail("it was started"))
+    net.until(lambda: asked, "the first part")
+    slave.forget(request.instance)
+    before = list(asked)
+    net.pass_times(20)
+    assert asked == before
+    assert prepare(net, "a", assignment("b", number=10))
+    assert net.age("a") == (7, 42)
+
+
+def test_a_snapshot_whose_reader_is_lost_leaves_the_memory(net):
+    """A slave's memory is small, and a snapshot may have hundreds of megabytes."""
+    source = net.add("b")
+    net.write("b", 42, 10_000)
+    answers = []
+    source.read_part("p", (0, 0), 0, 1000, answers.append)
+    net.settle()
+    assert len(answers[0].data) == 1000
+    assert source._store._being_read
+    net.pass_time(60.0)
+    assert not source._store._being_read

@@ -23,6 +23,7 @@ from rosrm.slave.launch.environment import (
 )
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text
+from rosrm.supervisor.json_lines import LONGEST_LINE
 
 HERE = ProcessLocation("robot1", "fleet", "/rosrm/state_config")
 VENV = "/home/robot/venv"
@@ -199,6 +200,30 @@ def test_what_is_missing_is_named(tmp_path, prefix, package, executable, said):
         order(tmp_path, environment, package=package, executable=executable)
     for part in [*said, str(prefix)]:
         assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"package": "x" * 300, "executable": "talker"},
+        {"package": "demo_nodes", "executable": "x" * 300},
+        {"command": ("node",), "ros": True, "parameters": {"half": "\ud800"}},
+    ],
+    ids=["package", "executable", "parameter"],
+)
+def test_a_launch_that_the_system_refuses_ends_no_slave(tmp_path, prefix, fields):
+    """A name is too long, or a text has no encoding: the instance is refused with the reason."""
+    with pytest.raises(LaunchError, match=r"talker#7: .*(too long|encode)"):
+        order(tmp_path, {"AMENT_PREFIX_PATH": str(prefix)}, **fields)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"arguments": ("x" * LONGEST_LINE,)}, {"environment": {"BIG": "\0" * (2 << 20)}}]
+)
+def test_a_launch_that_is_too_long_for_the_supervisor_is_refused(tmp_path, fields):
+    """The supervisor would refuse the connection, and the slave would end."""
+    with pytest.raises(LaunchError, match=r"talker#7: command line and .* have \d+ bytes"):
+        order(tmp_path, command=("node",), **fields)
 
 
 def test_a_few_packages_are_listed_and_many_counted(prefix):

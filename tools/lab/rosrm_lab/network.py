@@ -30,6 +30,8 @@ _MAIN_TABLE: Final = 254
 #: TC_H_ROOT: pyroute2's own `root=True` also requires a handle, which a deletion must not have.
 _ROOT: Final = 0xFFFFFFFF
 _IPV4: Final = 2
+#: Seconds for nft; meanwhile the lab is locked for other commands.
+_RULES: Final = 30.0
 
 
 @contextlib.contextmanager
@@ -138,7 +140,9 @@ def set_rules(lab: LabPlan, links: Mapping[str, Link]) -> None:
     switch = names.namespace_path(names.switch_namespace(lab.name))
     rules = ruleset({lab.port(host): link for host, link in links.items()})
     command = [find_command("nsenter"), f"--net={switch}", "--", nft, "-f", "-"]
-    done = subprocess.run(command, input=rules, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, input=rules, capture_output=True, text=True, check=False, timeout=_RULES
+    )
     if done.returncode:
         raise LabError(
             f"the firewall of lab {lab.name!r} could not be set, and nothing was changed: "

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from rosrm.supervisor.procfs import inner_pid, read_stat
+from rosrm.supervisor.procfs import everyone, inner_pid, read_stat
 
 #: Namespaces that CRIU must share with the process that it dumps, each with its nsenter option.
 _NAMESPACES: Final = {
@@ -60,6 +60,11 @@ def root_of(leader: int) -> int:
 def is_shim(pid: int) -> bool:
     """Return True if a process is a shim."""
     return _names(_words(pid), SHIM)
+
+
+def has_shim(directory: Path) -> bool:
+    """Return True if the shim of an image runs; a walk over /proc, so only for rare occasions."""
+    return any(str(directory) in _words(stat.pid) for stat in everyone())
 
 
 def leads(pid: int) -> bool | None:

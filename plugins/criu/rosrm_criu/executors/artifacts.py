@@ -137,8 +137,16 @@ def await_restored(asked: StepArguments) -> Outcome:
 
 
 def remove_unused_later(directory: Path, keep: float) -> None:
-    """Call `remove_unused` after `keep` seconds."""
-    _later(keep, remove_unused, directory)
+    """Call `remove_unused` after `keep` seconds, or later if a restore from the image runs then."""
+    _later(keep, _remove_if_idle, directory, keep)
+
+
+def _remove_if_idle(directory: Path, keep: float) -> None:
+    # The shim stays after the restore, and the image is then no longer needed.
+    if process_tree.has_shim(directory) and not restore_result.was_restored(directory):
+        remove_unused_later(directory, keep)
+    else:
+        remove_unused(directory)
 
 
 def remove_unused(directory: Path) -> None:
