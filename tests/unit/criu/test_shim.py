@@ -22,6 +22,7 @@ FAILED = 125
 def directory(tmp_path):
     """Return an invalid image, with an unreadable manifest."""
     image.create(tmp_path / "in-7")
+    (tmp_path / "in-7" / image.MANIFEST).touch(mode=0o600)
     (tmp_path / "in-7" / image.MANIFEST).write_text("{")
     (tmp_path / "in-7" / image.PAGES / "pages-1.img").write_text("memory")
     return tmp_path / "in-7"
