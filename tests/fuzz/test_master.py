@@ -130,7 +130,7 @@ def hostile_events(draw: Any) -> happened.Event:
     return event
 
 
-#: Seconds until an event; None in place of an event: the honest hosts go on for a while.
+#: Seconds until an event; None in place of an event: the honest hosts work for a while.
 PAUSES = st.sampled_from([0.0, 0.0, 0.1, 1.0, 6.0, 1e6])
 STREAMS = st.lists(
     st.tuples(PAUSES, hostile_events() | hostile_events() | st.none()), min_size=1, max_size=10
@@ -218,7 +218,7 @@ def test_repeated_events_are_not_remembered_again(stream):
 
 @pytest.mark.xfail(reason="a number beyond the largest one hides the others that a host reports")
 def test_an_instance_gets_no_number_that_a_host_has_claimed():
-    """Two instances of one number overwrite each other in the books."""
+    """Two instances of one number would overwrite each other."""
     cluster = Besieged()
     claims = [
         InstanceStatus(InstanceId("job", number), InstanceState.HELD) for number in (6, 1 << 53)

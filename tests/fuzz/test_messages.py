@@ -86,7 +86,7 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 @fuzzed(60)
 @given(data=st.data())
 def test_a_message_is_converted_or_refused(name, data):
-    """What is converted can be written to the journal."""
+    """The journal can hold each converted value."""
     kind, reader = READERS[name]
     message = data.draw(messages_of(kind))
     with contextlib.suppress(Refused):

@@ -84,7 +84,8 @@ SECONDS = st.sampled_from([0.0, 5e-324, 0.5, 1.0, 1e9, 1e308])
 RULES: dict[str, Any] = {
     "instance": KEYS, "at": floats, "alive": floats, "reason": texts, "message": texts,
     "pid": st.integers(-1, 3) | uint64s, "code": st.integers(-1, 300),
-    "signal": st.integers(-1, 70), "peak_memory": floats, "cpu_time": floats, "heard": st.none() | SECONDS,
+    "signal": st.integers(-1, 70), "peak_memory": floats, "cpu_time": floats,
+    "heard": st.none() | SECONDS,
     "kill": st.booleans(), "transient": st.booleans(), "leftovers": st.booleans(),
     "restart": st.builds(RestartRule, WHEN, SECONDS, SECONDS, SECONDS, NUMBERS, SECONDS),
     "stop": st.builds(StopRule, SECONDS, SECONDS),

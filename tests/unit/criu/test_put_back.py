@@ -17,13 +17,6 @@ from tests.unit.criu.test_image import MANIFEST
 
 
 @pytest.fixture
-def work(tmp_path):
-    """Return an empty working directory."""
-    (tmp_path / "work").mkdir()
-    return tmp_path / "work"
-
-
-@pytest.fixture
 def directory(tmp_path):
     """Return an image with one copy of a file."""
     made = tmp_path / "image"
@@ -104,7 +97,7 @@ def test_a_link_in_place_of_the_file_is_replaced_and_its_target_left_alone(
 
 
 def test_the_working_directory_itself_may_be_a_link(work, directory, tmp_path):
-    """It is chosen by the process's file, not by the image."""
+    """The process's file chooses it, not the image."""
     (tmp_path / "data").symlink_to(work)
     put(directory, tmp_path / "data", copied(tmp_path / "data/file"))
     assert (work / "file").read_bytes() == b"content"

@@ -28,7 +28,7 @@ _GROUPS: Final = frozenset({2, 4, 6, 8, 14})
 _CAPABILITIES: Final = frozenset({10, 11})
 #: CRIU's files that would give a process other credentials than those of its threads' files.
 _OTHER_CREDENTIALS: Final = re.compile(rf"{image.PAGES}/(creds|userns)-\d+\.img")
-#: Bits of an id, or of one word of a set of capabilities; CRIU ignores higher ones.
+#: Bits of an id, or of one number of a set of capabilities; CRIU ignores higher ones.
 _WORD: Final = 0xFFFFFFFF
 
 
