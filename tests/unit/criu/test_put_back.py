@@ -74,7 +74,7 @@ def test_of_a_process_in_the_root_directory_nothing_is_expected_and_detours_are_
 
 
 def test_a_link_on_the_way_is_not_followed(work, directory, tmp_path):
-    """Whoever may write to the working directory would choose what the slave overwrites."""
+    """Otherwise a user who may write there would choose the files that the slave overwrites."""
     (tmp_path / "away").mkdir()
     (work / "link").symlink_to(tmp_path / "away")
     with pytest.raises(CriuError, match="is a symbolic link, which is not followed"):
