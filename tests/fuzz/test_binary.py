@@ -7,6 +7,7 @@ import io
 import tarfile
 import tempfile
 import zlib
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,12 @@ from rosrm.supervisor import log_index
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_criu.engine import protobuf, received, relocation
 from rosrm_criu.transfer.archive import Archive, Unpacker
+from rosrm_criu.transfer.receiving import _Stream
 from rosrm_msgs.msg import Arrays
 from tests.fuzz.hostile import damaged_bytes, fuzzed, uint64s
 from tests.unit.criu.test_received import core, credentials
 from tests.unit.criu.test_relocation import image_of
-from tests.unit.test_transfer import Chunks, tree, zstd
+from tests.unit.test_transfer import OFFER, Chunks, tree, zstd
 
 # --- readings ----------------------------------------------------------------------------------
 
@@ -167,6 +169,35 @@ def test_an_archive_is_unpacked_or_refused(data, files):
         assert all(not one.is_symlink() and (one.is_dir() or one.is_file()) for one in found)
         assert sum(one.stat().st_size for one in found if one.is_file()) <= len(data)
         assert sum(one.is_file() for one in found) <= files
+
+
+class Connection:
+    """Connection that delivers some bytes in small pieces, and then its end."""
+
+    def __init__(self, data: bytes) -> None:
+        self._file = io.BytesIO(data)
+
+    def settimeout(self, seconds: float) -> None:
+        assert seconds > 0.0
+
+    def recv(self, size: int) -> bytes:
+        return self._file.read(min(size, 7))
+
+
+STREAM = b"\0\0\0\x05hello\0\0\0\x03abc\0\0\0\0the disk is full"
+
+
+@fuzzed(100)
+@given(data=damaged_bytes(STREAM) | st.binary(max_size=12))
+def test_a_stream_of_parts_is_read_or_refused(data):
+    """Each ends with an error here, because no reader has enough."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Stream, "_connect", lambda *_: (Connection(data), "10.0.0.1"))
+        patch.setattr("rosrm_criu.transfer.receiving._context", lambda _: None)
+        stream = _Stream(OFFER, timeout=60.0, identity=None)
+        with pytest.raises(TransferError):
+            deque(iter(stream.read, b""))
+        assert stream.received <= len(data)
 
 
 @st.composite
