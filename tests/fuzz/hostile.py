@@ -17,7 +17,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 
 #: Times as many examples, with random seeds; 0: the fixed ones.
@@ -28,6 +28,7 @@ def fuzzed(examples: int, **more: Any) -> Callable[[Any], Any]:
     """Return the settings of a fuzz test with so many examples in `make test`."""
     return settings(
         max_examples=examples * max(1, HUNT), derandomize=not HUNT, database=None, deadline=None,
+        phases=(Phase.generate, Phase.shrink),  # to explain failures, Hypothesis traces each line
         print_blob=True, suppress_health_check=list(HealthCheck), **more,
     )  # fmt: skip
 
