@@ -2,7 +2,7 @@
 # Nothing needs to be activated.
 
 PYTHON ?= python3
-LAYERS ?= unit contract integration ros faults
+LAYERS ?= unit contract fuzz integration ros faults
 ARGS   ?=
 
 SHELL := /bin/bash
@@ -21,12 +21,12 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
 
 .DEFAULT_GOAL := help
-.PHONY: help setup environment check test lint format demo demo-migration bench evaluation clean
+.PHONY: help setup environment check test lint format demo demo-migration bench evaluation fuzz clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-16s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
-	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration), OUT=folder (evaluation)"
+	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration), OUT=folder (evaluation), MINUTES=60 (fuzz)"
 
 setup: SETUP := --tests
 setup: environment ## make .venv with all that the other targets need
@@ -63,6 +63,9 @@ demo-migration: environment ## a LiDAR drive is mapped while the SLAM moves to a
 
 bench: setup ## all benchmarks; each ends with one line of JSON
 	@set -e; for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python -m benchmarks.$$name; done
+
+fuzz: setup ## hostile input with random seeds for a while: make fuzz MINUTES=60
+	@$(BIN)/python scripts/fuzz.py --minutes "$(or $(MINUTES),60)"
 
 evaluation: setup ## the paper's figures and table, on virtual hosts: out/evaluation/ (root, 40 minutes)
 	@$(BIN)/python -m benchmarks.paper all --out "$(or $(OUT),out/evaluation)"

@@ -123,7 +123,10 @@ def parts(lab: Lab, folder: Path) -> Iterator[None]:
         },
         **{
             # Without cpu: the hosts share the processor, and a busy one would make all refuse work.
-            host: {"host": host, "state": f"{DATA}/slave", "probes": {"memory": {}, "disk": {}}}
+            host: {
+                "host": host, "state": f"{DATA}/slave", "probes": {"memory": {}, "disk": {}},
+                "strategies": {"criu": {"as_root": True}},
+            }
             for host in _HOSTS
         },
     }  # fmt: skip

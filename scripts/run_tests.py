@@ -26,10 +26,10 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "build" / "test-results"
 
 #: The folders under tests/, in the order in which their results are shown.
-LAYERS = ("unit", "contract", "integration", "ros", "faults")
+LAYERS = ("unit", "contract", "fuzz", "integration", "ros", "faults")
 
 #: The runs of pytest, in this order. A run with its output in a file runs beside the next ones.
-RUNS = (("contract",), ("unit",), ("integration",), ("ros", "faults"))
+RUNS = (("contract",), ("fuzz",), ("unit",), ("integration",), ("ros", "faults"))
 BESIDE = "unit"
 
 #: Workers of the folders that run in parallel. Tests in real time mostly wait, so that a core
@@ -38,6 +38,7 @@ BESIDE = "unit"
 _REAL_TIME_WORKERS = ["-n", "4", "--dist", "loadscope", "--no-loadscope-reorder"]
 WORKERS = {
     "unit": ["-n", "2"],
+    "fuzz": ["-n", "2"],
     "integration": _REAL_TIME_WORKERS,
     "ros": _REAL_TIME_WORKERS,
     "faults": _REAL_TIME_WORKERS,

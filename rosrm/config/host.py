@@ -37,13 +37,17 @@ def checked_host(root: Node, path: str | Path, registry: Registry | None) -> Hos
     plugins = PluginCheck(registry, problems)
     probes = plugins.by_name("probe", chosen)
     given = chosen is not None and chosen.value is not None
+    strategies = plugins.by_name("migration", root.get("strategies"), part="host_options")
     if registry is not None:
         measured = probes if given else registry.default_probes()
         for key in ("limits", "budget"):
             plugins.check_resources(root.get(key), key, measured)
     problems.raise_any()
     assert config is not None  # else there was a problem
-    return replace(config, state=settled(config.state, path), probes=probes if given else None)
+    return replace(
+        config, state=settled(config.state, path), probes=probes if given else None,
+        strategies=strategies,
+    )  # fmt: skip
 
 
 def _check_rules(root: Node, problems: Problems) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Any, Final, get_args, get_type_hints
+from typing import Any, Final, Literal, get_args, get_type_hints
 
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
@@ -18,6 +18,9 @@ from rosrm.model.values import ProcessSpec
 
 #: Entry of `probes` that selects all default probes.
 DEFAULT_PROBES: Final = "default"
+
+#: Field of an offer with the type of options: for all processes, for one process, or for one host.
+OptionsOf = Literal["options", "own_options", "host_options"]
 
 
 def _holds_resources(hint: Any) -> bool:
@@ -53,8 +56,9 @@ class PluginCheck:
         return no_standby(strategy, known)
 
     def choice(
-        self, kind: PluginKind, name: str, named: Node, options: Node | None, *, own: bool = False
-    ) -> Mapping[str, Any]:
+        self, kind: PluginKind, name: str, named: Node, options: Node | None, *,
+        part: OptionsOf = "options",
+    ) -> Mapping[str, Any]:  # fmt: skip
         """Return the options of one chosen plugin.
 
         Args:
@@ -62,7 +66,7 @@ class PluginCheck:
             name: name of the offer.
             named: node of the name in the file.
             options: node of the options in the file; None: no options.
-            own: True for the options of one process.
+            part: field of the offer with the type of the options.
         """
         given = options if options is not None and options.value is not None else None
         plain = {} if given is None or not given.items else given.plain()
@@ -75,7 +79,7 @@ class PluginCheck:
             return dict(plain)
         if given is None:
             given = Node({}, named.place)
-        wanted = getattr(offer, "own_options", None) if own else None
+        wanted = getattr(offer, part, None)
         return self._options(f"options of {TITLES[kind]} {name!r}", wanted or offer.options, given)
 
     def _options(self, title: str, wanted: type[Any], given: Node) -> Mapping[str, Any]:
@@ -121,10 +125,12 @@ class PluginCheck:
                 continue
             self._problems.add(node.key_place or node.place, f"{where}: {note}")
 
-    def by_name(self, kind: PluginKind, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
+    def by_name(
+        self, kind: PluginKind, chosen: Node | None, *, part: OptionsOf = "options"
+    ) -> dict[str, Mapping[str, Any]]:
         """Return the options of each plugin in a list of names or a mapping from name to options.
 
-        The name `default` selects the default probes.
+        The name `default` selects the default probes; `part` is that of `choice`.
         """
         if chosen is None:
             return {}
@@ -139,5 +145,5 @@ class PluginCheck:
             if kind == "probe" and name == DEFAULT_PROBES and self._registry is not None:
                 found = {**self._registry.default_probes(), **found}
             else:
-                found[name] = self.choice(kind, name, *pair)
+                found[name] = self.choice(kind, name, *pair, part=part)
         return found

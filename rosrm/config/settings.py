@@ -311,6 +311,7 @@ class HostConfig:
         limits: upper limits, fractions by resource; a resource without a limit has the default.
         rate: rate of `resource_info` in Hz.
         probes: names of the chosen probes, with their options; None: the default ones.
+        strategies: this host's own options of migration strategies, by name.
         max_processes: highest number of running processes; 0: no limit.
         max_starting: highest number of processes that are starting and not ready; 0: no limit.
         logs: logs of the processes.
@@ -329,6 +330,9 @@ class HostConfig:
     limits: Mapping[str, Fraction] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
     rate: Annotated[float, Quantity(low=0.1, high=1000.0, hint="Hz")] = 10.0
     probes: Annotated[Mapping[str, Options] | None, OptionsByName()] = None
+    strategies: Annotated[Mapping[str, Options], OptionsByName()] = field(
+        default_factory=lambda: EMPTY
+    )
     max_processes: Count = 0
     max_starting: Count = 8
     logs: LogSettings = field(default_factory=LogSettings)

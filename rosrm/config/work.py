@@ -133,7 +133,7 @@ def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] 
         return None
     own = given.items if given is not None else {}
     options = given if own else None
-    checked = plugins.choice("migration", strategy.value, strategy, options, own=True)
+    checked = plugins.choice("migration", strategy.value, strategy, options, part="own_options")
     return {name: value for name, value in checked.items() if name in own}
 
 

@@ -323,6 +323,8 @@ class MigrationOffer:
             the step's arguments (a JSON object) and returns a JSON object.
         own_options: a dataclass derived from `options`, if one process may have more options than
             the cluster.
+        host_options: options of one host, which its own file gives under `strategies`; executors
+            get them as `here.options`.
     """
 
     name: str
@@ -332,6 +334,7 @@ class MigrationOffer:
     executors: Mapping[str, Executor] = field(default_factory=lambda: EMPTY)
     own_options: type[Any] | None = None
     capabilities: Capabilities | Callable[[Any], Capabilities] = Capabilities()
+    host_options: type[Any] = NoOptions
 
 
 # --- launchers (slave) ------------------------------------------------------------------------

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Executor, Launcher, Probe, ProbeOffer
 from rosrm.extensions.discovery import FAULTS
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.rows import PluginKind
-from rosrm.model.values import RESOURCE_SLOTS, Reading, ResourceDescription
+from rosrm.model.values import EMPTY, RESOURCE_SLOTS, Reading, ResourceDescription
 from rosrm.wording import get_close_matches
 
 #: Members that an object of each kind must have.
@@ -99,10 +99,15 @@ class MadeLaunchers:
 
 @dataclass(frozen=True)
 class OfferedExecutor:
-    """An executor, and the name of the migration strategy that offers it."""
+    """An executor, and the name of the migration strategy that offers it.
+
+    Attributes:
+        options: options of this host for the strategy, as JSON types; empty if its file has none.
+    """
 
     strategy: str
     call: Executor
+    options: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
 
 
 # --- checks -----------------------------------------------------------------------------------

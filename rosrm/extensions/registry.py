@@ -54,7 +54,7 @@ from rosrm.extensions.made import (
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
 from rosrm.extensions.time_limit import limited
-from rosrm.model.codec import from_plain
+from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.rows import PluginKind, PluginRow, PluginState
 from rosrm.model.values import (
     EMPTY,
@@ -284,13 +284,29 @@ class Registry:
                 broken[name] = str(fault)
         return MadeLaunchers(made, absent, broken)
 
-    def executors(self) -> dict[str, OfferedExecutor]:
-        """Return the executors that plans may name on this host, of all migration offers."""
+    def executors(self, chosen: NameToOptions = EMPTY) -> dict[str, OfferedExecutor]:
+        """Return the executors that plans may name on this host, from all migration offers.
+
+        Args:
+            chosen: the options of this host by strategy.
+
+        Raises:
+            ConfigError: for an unknown strategy or an invalid option.
+        """
+        options = {name: self._host_options(name, given) for name, given in chosen.items()}
         return {
-            executor: OfferedExecutor(name, function)
+            executor: OfferedExecutor(name, function, options.get(name, EMPTY))
             for name in self.names("migration")
             for executor, function in self._strategy(name).executors.items()
         }
+
+    def _host_options(self, name: str, given: Mapping[str, Any]) -> Mapping[str, Any]:
+        try:
+            return cast(
+                Mapping[str, Any], to_plain(from_plain(self._strategy(name).host_options, given))
+            )
+        except ValueError as wrong:
+            raise ConfigError(f"strategies: options of {name!r}: {wrong}") from wrong
 
     def broken_strategies(self) -> dict[str, str]:
         """Return the name of each broken migration offer, with the reason."""

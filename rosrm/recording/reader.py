@@ -106,7 +106,7 @@ class _Reader:
             raise self._nonsense("a frame of this kind is not allowed there")
         try:
             self._take(kind, content)
-        except (ValueError, TypeError, KeyError) as fault:
+        except (ValueError, TypeError, KeyError, RecursionError) as fault:
             raise self._nonsense(str(fault)) from None
 
     def _take(self, kind: FrameKind, content: bytes) -> None:

@@ -348,15 +348,17 @@ def _fraction(value: float) -> float:
 
 
 def host_row_from_msg(message: msg.HostState) -> HostRow:
-    """Return the inverse of `host_row_to_msg`."""
+    """Return the inverse of `host_row_to_msg`; raises `Refused` for an invalid row."""
+    columns = (message.usage, message.in_flight, message.limit, message.stale)
+    if {len(message.description.resources)} != {*map(len, columns)}:
+        raise Refused(f"host {message.description.name!r}: its readings do not fit its resources")
     resources = tuple(
         ResourceRow(
             resource.name, resource.unit, resource.capacity, resource.scope, _fraction(usage),
             _fraction(in_flight), _fraction(limit), bool(stale),
         )
         for resource, usage, in_flight, limit, stale in zip(
-            message.description.resources, message.usage, message.in_flight, message.limit,
-            message.stale, strict=True,
+            message.description.resources, *columns, strict=True
         )
     )  # fmt: skip
     description = _description(message.description, message.description.resources)

@@ -65,7 +65,8 @@ class Executors:
         Args:
             arguments: a JSON object.
             timeout: seconds, after which its strategy counts as failing.
-            here: description of this host in JSON types, a further argument.
+            here: description of this host in JSON types, a further argument; the strategy's
+                options for this host are added.
             done: called in the loop with the outcome.
 
         Raises:
@@ -82,7 +83,7 @@ class Executors:
             min(timeout, threading.TIMEOUT_MAX), self._post, [partial(self._fail, strategy, late)]
         )
         timer.daemon = True
-        complete = {**arguments, "here": here}
+        complete = {**arguments, "here": {**here, "options": dict(offered.options)}}
 
         def settle(outcome: ExecutorOutcome) -> None:
             if outcome.code in ("", "unable"):

@@ -22,5 +22,5 @@ def from_memo(text: str) -> Memo | None:
     try:
         plain = json.loads(text)
         return from_plain(Memo, plain) if plain else None
-    except ValueError:
+    except (ValueError, RecursionError):
         return None

@@ -99,7 +99,7 @@ class SlaveRuntime:
         self._from_threads: deque[Callable[[], None]] = deque()
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
         self._executors = Executors(
-            registry.executors(), registry.broken_strategies(),
+            registry.executors(config.strategies), registry.broken_strategies(),
             post=self._post, changed=self._note_executors,
         )  # fmt: skip
         self._closing = contextlib.ExitStack()

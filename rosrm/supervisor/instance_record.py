@@ -73,7 +73,7 @@ def read(state: str) -> Recorded:
             continue
         try:
             _take(recorded, json_lines.parse(line))
-        except (json_lines.ProtocolError, KeyError, TypeError, ValueError) as error:
+        except (json_lines.ProtocolError, *messages.UNREADABLE) as error:
             recorded.notes.append(f"{path}:{number}: left out, it cannot be read: {error}")
     return recorded
 

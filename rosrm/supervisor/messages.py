@@ -62,6 +62,8 @@ from rosrm.supervisor.json_lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
 
 PROTOCOL: Final = 3
+#: What a reader of JSON raises for values of another shape.
+UNREADABLE: Final = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 class Hello(NamedTuple):
@@ -204,12 +206,12 @@ def decode_order(text: bytes) -> Order:
         raise ProtocolError(f"unknown order {kind!r}; known: {', '.join(_READERS)}")
     try:
         return reader(fields)
-    except (KeyError, TypeError, ValueError) as error:
+    except UNREADABLE as error:
         raise ProtocolError(f"the order {kind!r} cannot be read: {error!r}") from None
 
 
 def read_launch(fields: Mapping[str, Any]) -> Launch:
-    """Undo `launch_fields`. Raises KeyError, TypeError or ValueError."""
+    """Undo `launch_fields`. Raises one of `UNREADABLE`."""
     argv = tuple(_text(argument) for argument in fields["argv"])
     directory = fields["directory"]
     if not argv:

@@ -16,7 +16,7 @@ from rosrm.extensions.contracts import Imaging, MigrationOffer, MigrationStrateg
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.extensions.time_limit import CALL_LIMIT
-from rosrm.model.codec import checked
+from rosrm.model.codec import checked, to_plain
 from rosrm.model.plan import (
     Aim,
     Commit,
@@ -273,7 +273,7 @@ class MigrationContract:
                 pids = {str(move.source): os.getpid()}
                 here = {
                     "host": step.host, "state": str(tmp_path), "pids": pids,
-                    "instances": list(pids),
+                    "instances": list(pids), "options": to_plain(self.offer.host_options()),
                 }  # fmt: skip
                 self._check_executor(step)
                 given = json.loads(json.dumps({**step.arguments, "results": results, "here": here}))

@@ -22,12 +22,14 @@ from rosrm_criu.engine import process_tree, restore_result
 from tests.ros.clusters import MIB, PATIENCE, QUICK, Cluster, Make, host, wait_until
 
 NAME = "portable_counter"
+#: Both slaves are this test's own, and where CRIU works they mostly run as root.
+AS_ROOT = {"criu": {"as_root": True}}
 
 
 def two_hosts(make: Make, **settings) -> Cluster:
     """Return a cluster of `left` and `right`, without automatic migrations."""
     return make(
-        host("left"), host("right"),
+        host("left", strategies=AS_ROOT), host("right", strategies=AS_ROOT),
         migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
         defaults=ProcessDefaults(needs={"memory": MIB}), **settings,
     )  # fmt: skip

@@ -32,6 +32,7 @@ from tests.ros.clusters import (
     python,
     wait_until,
 )
+from tests.ros.portable_kit import AS_ROOT
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -217,7 +218,7 @@ def test_a_portable_node_can_migrate_after_a_restore(criu, make_cluster):
     """A checkpoint does not ask the node to leave the graph; a later migration does."""
     require_udp()
     cluster = make_cluster(
-        host("left"), host("right"), liveness=STEADY,
+        host("left", strategies=AS_ROOT), host("right", strategies=AS_ROOT), liveness=STEADY,
         migration=MigrationSettings(strategies={"criu": {}}, automatic=False),
         defaults=ProcessDefaults(needs={"memory": MIB}),
     )  # fmt: skip

@@ -162,7 +162,8 @@ MANIFEST_VALUES: dict[str, Any] = {
 def test_the_manifest_of_a_checkpoint_image(tmp_path: Path) -> None:
     """A restore reads the manifest that an older rosrm wrote."""
     tmp_path.chmod(0o700)
-    (tmp_path / "files").mkdir()
+    (tmp_path / "files").mkdir(mode=0o700)
+    (tmp_path / "files/0").touch(mode=0o600)
     (tmp_path / "files/0").write_bytes(b"1\n")
     image.write(tmp_path, MANIFEST)
     assert json.loads((tmp_path / image.MANIFEST).read_text()) == MANIFEST_VALUES

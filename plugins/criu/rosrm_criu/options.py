@@ -67,6 +67,18 @@ class OwnCriuOptions(CriuOptions):
             )
 
 
+@dataclass(frozen=True)
+class HostCriuOptions:
+    """Options of one host, in its own file.
+
+    Attributes:
+        as_root: a slave that runs as root takes images from other hosts. Each of these hosts can
+            then run any program as root here.
+    """
+
+    as_root: bool = False
+
+
 def capabilities(options: OwnCriuOptions) -> Capabilities:
     """Return the strategy's capabilities for a process with these options."""
     periodic = options.checkpoint_every > 0.0

@@ -121,7 +121,7 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
             ),
             execute(
                 move, there, FETCH, options.transfer_timeout, reserve=options.reserve,
-                keep=start + options.restore_timeout,
+                keep=start + options.restore_timeout, working_directory=spec.working_directory,
             ),
             Start(
                 move.destination, there, start,

@@ -10,7 +10,13 @@ from typing import Any, Final
 from rosrm import Launcher, LauncherContext, LauncherOffer, MigrationOffer, hookimpl
 from rosrm_criu import plans
 from rosrm_criu.control.messages import VARIABLE
-from rosrm_criu.options import NAME, CriuOptions, OwnCriuOptions, capabilities
+from rosrm_criu.options import (
+    NAME,
+    CriuOptions,
+    HostCriuOptions,
+    OwnCriuOptions,
+    capabilities,
+)
 from rosrm_criu.strategy import Criu
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
@@ -46,6 +52,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             create=Criu,
             options=CriuOptions,
             own_options=OwnCriuOptions,
+            host_options=HostCriuOptions,
             capabilities=capabilities,
             summary="the whole memory of a portable node is dumped, and restored elsewhere",
             executors={step: partial(_execute, step) for step in EXECUTORS},

@@ -39,6 +39,8 @@ class Criu:
             for one in (source, destination):
                 if one.get("no_transfer"):
                     return f"no image can be sent to or from {one['host']}: {one['no_transfer']}"
+            if destination.get("takes_none"):
+                return destination["takes_none"]
         return mismatch(source, destination)
 
     def spec_fault(self, spec: ProcessSpec) -> str:

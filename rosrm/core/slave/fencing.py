@@ -20,7 +20,7 @@ RENEW_PERIOD: Final = 0.1
 
 def contact_confirmed(state: SlaveState, event: ContactConfirmed, now: float) -> list[Command]:
     """Note the last contact, and renew the fences."""
-    state.last_contact = max(state.last_contact, event.at)
+    state.last_contact = max(state.last_contact, min(event.at, now))
     return renew_in_time(state, now)
 
 

@@ -178,7 +178,7 @@ class SnapshotStore:
             return NotStored("damaged", str(fault))
 
     def _take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
-        self.abandon_interrupted(self._clock())
+        self.end_interrupted(self._clock())
         if part.offset == 0:
             refusal = self._refusal(part, bounded=bounded)
             if refusal is not None:

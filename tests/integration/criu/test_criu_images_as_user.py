@@ -13,7 +13,7 @@ import pytest
 HOPS = """
 import json, os, subprocess, sys, time
 from pathlib import Path
-from rosrm_criu.engine import dump, restore_result
+from rosrm_criu.engine import dump, received, restore_result
 from rosrm_criu.engine.binary import opened
 
 program, folder = Path(sys.argv[1]), Path(sys.argv[2])
@@ -47,6 +47,7 @@ try:
         grown(logs[logs.index(log) - 1])
         image = folder / log.stem
         dump.dump(opened(program), process.pid, image, leave="killed", timeout=60)
+        received.check(image, state=folder, working_directory=None, uid=os.geteuid())
         process.wait(60)
         words = restore_result.command(sys.executable, image, criu=program, remove=True, timeout=60)
         process = start(words, log)

@@ -10,7 +10,7 @@ import pytest
 from rosrm.config.host import load_host
 from rosrm.config.settings import HostConfig
 from rosrm.errors import SkipPlugin
-from rosrm.extensions.contracts import ProbeOffer
+from rosrm.extensions.contracts import MigrationOffer, ProbeOffer
 from tests.plugin_kit import registry_of
 
 
@@ -21,11 +21,18 @@ class DiskOptions:
     path: str = "/"
 
 
+@dataclass(frozen=True)
+class TowOptions:
+    """Options of one host for a migration strategy."""
+
+    as_root: bool = False
+
+
 @pytest.fixture
 def registry():
     read = ("disk", "memory", "cpu", "gpu")
     disk = ProbeOffer("disk", lambda *_: None, DiskOptions, default=True, resources=read)
-    return registry_of(disk)
+    return registry_of(disk, MigrationOffer("tow", lambda _: None, host_options=TowOptions))
 
 
 def test_an_empty_file_gives_the_defaults(file):
@@ -49,6 +56,7 @@ def test_every_setting_is_read(file, tmp_path, registry):
             limits: {memory: 0.7, gpu: 0.95}
             rate: 20
             probes: {disk: {path: /data}}
+            strategies: {tow: {as_root: true}}
             max_processes: 4
             logs: {max_bytes: 1MB, keep: 1}
             control: {max_age: 8s}
@@ -63,6 +71,7 @@ def test_every_setting_is_read(file, tmp_path, registry):
     assert config.limits == {"memory": 0.7, "cpu": 0.9, "disk": 0.9, "gpu": 0.95}
     assert (config.rate, config.period) == (20.0, 0.05)
     assert config.probes == {"disk": {"path": "/data"}}
+    assert config.strategies == {"tow": {"as_root": True}}
     assert (config.max_processes, config.on_stop) == (4, "keep")
     assert (config.logs.max_bytes, config.logs.keep) == (1_000_000, 1)
     assert config.control.max_age == 8.0
@@ -73,6 +82,14 @@ def test_probes_may_be_a_list_of_names_or_none_at_all(file, registry):
     assert load_host(file("probes: [disk]"), registry).probes == {"disk": {"path": "/"}}
     assert load_host(file("probes: {}"), registry).probes == {}
     assert load_host(file("probes:"), registry).probes is None
+
+
+def test_options_of_a_strategy_are_checked(refusal, registry):
+    said = refusal(lambda path: load_host(path, registry), "strategies: {tow: {root: true}}")
+    assert "'tow'" in said
+    assert "root" in said
+    said = refusal(lambda path: load_host(path, registry), "strategies: {towing: {}}")
+    assert "unknown migration strategy 'towing'; did you mean 'tow'?" in said
 
 
 def test_a_limit_outside_0_to_1_is_refused(refusal):

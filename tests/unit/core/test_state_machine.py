@@ -7,7 +7,6 @@ that really run, independently of the core's state. After every step the invaria
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,6 +32,7 @@ from rosrm.model.values import (
     SnapshotReport,
     StandbyPolicy,
 )
+from tests.unit.core import invariants
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
 from tests.unit.core.nodes import QUIRKS, Node
 from tests.unit.core.portable import Everywhere, Portable
@@ -701,47 +701,11 @@ class Play(RuleBasedStateMachine):
 
     @invariant()
     def no_process_is_lost(self) -> None:
-        """Check that each process is in exactly one place that matches its phase."""
-        state = self.cluster.state
-        queued = set(state.queue)
-        for process in state.processes.values():
-            name, phase = process.name, process.phase
-            assert (phase is ProcessPhase.QUEUED) == (name in queued), (name, phase)
-            assert (phase is ProcessPhase.SET_ASIDE) == (name in state.set_aside), (name, phase)
-            moving = name in state.migrations
-            assert moving or phase not in (ProcessPhase.MIGRATING, ProcessPhase.STUCK)
-            if phase.is_terminal or name in queued or name in state.set_aside:
-                assert not process.owner, (name, phase)
-                assert not moving
-                assert phase.is_terminal or not process.instances
-            elif not moving:
-                waits_for_an_end = process.wanted is not DesiredState.RUN and process.instances
-                assert process.owner in state.instances or waits_for_an_end, (name, phase)
-        assert queued <= set(state.processes)
+        invariants.no_process_is_lost(self.cluster.state)
 
     @invariant()
     def the_books_balance(self) -> None:
-        """Check that the load of each host is the sum over its instances and not negative."""
-        state = self.cluster.state
-        of_process = defaultdict(set)
-        for number, instance in state.instances.items():
-            of_process[instance.id.process].add(number)
-            assert number in instance.host.instances
-        for process in state.processes.values():
-            assert process.instances == of_process.pop(process.name, set())
-        assert {
-            name: numbers for name, numbers in state.unowned_instances.items() if numbers
-        } == of_process
-        for host in state.hosts.hosts:
-            held = [state.instances[number] for number in host.instances]
-            assert all(instance.host is host for instance in held)
-            assert state.hosts.processes[host.column] == len(held)
-            total = np.zeros(len(state.hosts.resources))
-            for instance in held:
-                assert (instance.reserved >= 0.0).all()
-                total[: len(instance.reserved)] += instance.reserved
-            assert np.allclose(state.hosts.load[:, host.column], total, atol=1e-6)
-            assert (state.hosts.load[:, host.column] >= 0.0).all()
+        invariants.the_books_balance(self.cluster.state)
 
     def given_up(self) -> set[int]:
         """Return instances that may run on lost hosts, unaware of their successors.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -40,7 +41,7 @@ def written(
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder, "image")
         image.create(directory)
-        (directory / image.COPIES).mkdir()
+        (directory / image.COPIES).mkdir(mode=0o700)
         for name, content in files.items():
             (directory / name).write_bytes(content)
         made = image.file_checksums(directory, files) if checksums else {}
@@ -175,4 +176,32 @@ def test_checksums_lie_in_the_image_too():
     with written() as directory:
         image.write(directory, replace(image.read(directory), checksums={"../secret": 1}))
         with pytest.raises(CriuError, match=r"'\.\./secret' does not lie in"):
+            image.read(directory)
+
+
+@pytest.mark.parametrize("name", ["", "manifest.json", "criu", "criu/pstree.img", "files/0"])
+def test_what_is_open_to_others_is_refused(name):
+    """The memory of a process may hold keys, and another user could have changed it."""
+    with written() as directory:
+        (directory / name).chmod((directory / name).stat().st_mode | 0o040)
+        with pytest.raises(CriuError, match=r"open to others: its mode has to be 0[67]00"):
+            image.read(directory)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "criu", "criu/pstree.img"])
+def test_a_link_in_an_image_is_refused(name, tmp_path):
+    with written() as directory:
+        path = directory / name
+        path.rename(tmp_path / "away")
+        path.symlink_to(tmp_path / "away")
+        with pytest.raises(CriuError, match="is a link, or belongs to another user"):
+            image.read(directory)
+
+
+def test_an_image_of_another_user_is_refused(monkeypatch):
+    with written() as directory:
+        monkeypatch.setattr("os.geteuid", lambda: 12345)
+        if directory.stat().st_uid == 0:
+            os.chown(directory, 54321, -1)
+        with pytest.raises(CriuError, match="belongs to another user"):
             image.read(directory)

@@ -13,13 +13,6 @@ from rosrm_criu.engine.image import HeldFile
 
 
 @pytest.fixture
-def work(tmp_path):
-    """Return an empty working directory."""
-    (tmp_path / "work").mkdir()
-    return tmp_path / "work"
-
-
-@pytest.fixture
 def directory(tmp_path):
     """Return the directory of an empty image."""
     image.create(tmp_path / "image")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.errors import CriuError
 from rosrm_criu.engine import image, restore_result
 from rosrm_criu.engine.restore_result import Outcome
 
@@ -22,6 +23,7 @@ FAILED = 125
 def directory(tmp_path):
     """Return an invalid image, with an unreadable manifest."""
     image.create(tmp_path / "in-7")
+    (tmp_path / "in-7" / image.MANIFEST).touch(mode=0o600)
     (tmp_path / "in-7" / image.MANIFEST).write_text("{")
     (tmp_path / "in-7" / image.PAGES / "pages-1.img").write_text("memory")
     return tmp_path / "in-7"
@@ -43,6 +45,13 @@ def test_after_a_restored_process_has_ended_its_command_runs(directory):
         assert start(directory, "echo", "started").stdout == "started\n"
         assert restore_result.read(directory) == outcome
         assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
+
+
+def test_a_result_that_is_nested_deeply_is_no_result(directory):
+    (directory / restore_result.FILE).write_text("[" * 100_000)
+    with pytest.raises(CriuError, match="cannot be read"):
+        restore_result.read(directory)
+    assert not restore_result.was_restored(directory)
 
 
 def test_without_an_image_no_command_runs(tmp_path):

@@ -359,6 +359,26 @@ def test_executors_come_from_every_migration_offer():
     assert registry.broken == ()
 
 
+@dataclass(frozen=True)
+class OfHost:
+    """Options of one host."""
+
+    speed: float = 1.0
+
+
+def test_an_executor_has_the_options_that_the_host_s_file_gives():
+    """Without any the executor uses its own defaults."""
+    offer = MigrationOffer("a", lambda options: None, executors={"x": run}, host_options=OfHost)
+    registry = Registry.of(ours=plugin(offer), theirs=moving("b", {"y": run}))
+    assert registry.executors()["x"].options == {}
+    given = registry.executors({"a": {}})
+    assert (given["x"].options, given["y"].options) == ({"speed": 1.0}, {})
+    with pytest.raises(ConfigError, match="options of 'a': unknown pace"):
+        registry.executors({"a": {"pace": 2}})
+    with pytest.raises(ConfigError, match="unknown migration strategy 'c'"):
+        registry.executors({"c": {}})
+
+
 def test_offers_with_executors_of_one_name_are_both_broken_and_name_each_other():
     """An order has only the executor's name, so the choice would be random."""
     registry = Registry.of(

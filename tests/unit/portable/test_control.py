@@ -236,6 +236,13 @@ def test_a_node_that_cannot_join_reports_why(directory, node) -> None:
         ask_prepare(directory, None, "m2")
 
 
+def test_a_status_that_is_nested_deeply_is_refused(directory, node) -> None:
+    """The node may belong to another user than the slave that reads its status."""
+    (directory / "status").write_text("[" * 60_000)
+    with pytest.raises(PortableError, match="holds no JSON"):
+        await_joined(directory, "m1", PATIENCE)
+
+
 def test_a_process_without_a_portable_node_is_not_asked(directory) -> None:
     """A request without a status fails; the error names `run_portable`."""
     with pytest.raises(PortableError, match="run_portable"):

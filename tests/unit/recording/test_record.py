@@ -190,6 +190,7 @@ def framed(body: bytes) -> bytes:
         (b"H{}", "is not allowed there"),
         (b"E" + bytes(16) + b'{"kind":"Unheard"}', "KeyError"),
         (b"E" + bytes(16) + b"no json", "is invalid for"),
+        pytest.param(b"E" + bytes(16) + b"[" * 100_000, "is invalid for", id="deep"),
         (b"E" + bytes(16) + b'{"kind":"HostLeft","request":1}', "is missing"),
         (b"R" + bytes(16) + b"\xff\xff", "is invalid for"),
         (b"E" + struct.pack("<dd", -5.0, 0.0) + b'{"kind":"TimePassed"}', "its time is before"),

@@ -105,6 +105,15 @@ def test_host_row_survives(host, data) -> None:
     assert survives(row, "host_row")
 
 
+def test_a_host_row_with_a_reading_too_few_is_refused() -> None:
+    """A false master could otherwise end `rosrm hosts` with a traceback."""
+    message = msg.HostState(
+        description=msg.HostDescription(name="a", resources=[msg.ResourceDescription()])
+    )
+    with pytest.raises(Refused, match="its readings do not fit its resources"):
+        convert.host_row_from_msg(message)
+
+
 def test_rows_survive() -> None:
     """Rows of `ps`, `plugins` and `events` are received whole."""
     process = ProcessRow(

@@ -455,6 +455,11 @@ def test_a_host_is_under_its_limits_where_each_limited_reading_is(
     assert under_limits(values, limit, present, stale) is under
 
 
+def test_a_memo_of_another_program_is_left_out() -> None:
+    for text in ("", "{", '{"awaited": 1}', "[" * 100_000):
+        assert from_memo(text or "null") is None
+
+
 # --- any order of events ----------------------------------------------------------------------
 
 NUMBERS = st.integers(1, 4)

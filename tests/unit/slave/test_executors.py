@@ -54,6 +54,14 @@ def test_an_answer_that_is_no_object_is_a_failure_of_its_own(answer, said) -> No
     assert message == f"wait answered {said}; a JSON object is required"
 
 
+def test_an_executor_gets_its_host_with_the_options_of_its_strategy() -> None:
+    rig, seen = Rig(lambda _: {}), []
+    offered = OfferedExecutor("acme", lambda given: seen.append(given) or {}, {"as_root": True})
+    rig.executors = Executors({"wait": offered}, {}, post=rig.posted.put, changed=rig.said.append)
+    rig.run()
+    assert seen == [{"here": {"host": "alpha", "options": {"as_root": True}}}]
+
+
 @pytest.mark.parametrize("answer", [{}, {"a": 1}, ChainMap({"a": 1})])
 def test_any_mapping_is_an_answer(answer) -> None:
     """The answer is sent as JSON."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf, nan
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -56,6 +58,15 @@ def test_an_older_beat_does_not_count() -> None:
     newest = one.now
     assert one.step(events.ContactConfirmed(newest - 0.5), 0.5) == [Renew(newest, one.now)]
     assert one.state.last_contact == newest
+
+
+@pytest.mark.parametrize("at", [inf, nan, 1e9])
+def test_a_contact_in_the_future_counts_as_one_of_now_at_most(at) -> None:
+    """Otherwise the fence would never end an instance that has a successor."""
+    one = registered()
+    one.assign(fence=FENCE)
+    one.step(events.ContactConfirmed(at), 1.0)
+    assert one.state.last_contact <= one.now
 
 
 def test_a_fence_is_known_again_from_the_supervisor() -> None:

@@ -101,10 +101,10 @@ def test_a_transfer_that_stops_is_given_up_and_its_file_closed(shelf):
     first, second = parts("p", 7)
     assert shelf.take(first) == ""
     shelf.now += stores.INTERRUPTED - 1.0
-    shelf.store.abandon_interrupted(shelf.now)
+    shelf.store.end_interrupted(shelf.now)
     assert open_files() == before + 1
     shelf.now += 1.0
-    shelf.store.abandon_interrupted(shelf.now)
+    shelf.store.end_interrupted(shelf.now)
     assert open_files() == before
     assert not (shelf.root / "p").exists()
     assert shelf.take(second) == "order"
@@ -195,7 +195,7 @@ def test_no_sequence_of_parts_harms_the_transfer_of_another_process(tmp_path_fac
         shelf.now += data.draw(st.sampled_from([0.0, 1.0, 29.0, 31.0]))
         shelf.take(part)
         assert open_files() <= before + stores.MOST_INCOMING
-    shelf.store.abandon_interrupted(shelf.now + 100.0)
+    shelf.store.end_interrupted(shelf.now + 100.0)
     assert open_files() == before
     assert shelf.send("honest", 7) == ""
     assert {path.parent for path in shelf.root.parent.iterdir()} == {shelf.root.parent}

@@ -98,6 +98,9 @@ def test_lines_are_cut_wherever_the_stream_is(lines, data):
             "'amend' cannot be read: ValueError",
         ),
         (b'{"do": ["stop"]}', "unknown order"),
+        (b'{"do": "environment", "id": "e", "variables": null}', "read: AttributeError"),
+        (b'{"do": "hello", "protocol": 1e999, "pid": 1, "log": []}', "read: OverflowError"),
+        (b"[" * 100_000, "not a line of JSON"),
     ],
 )
 def test_what_is_not_understood_is_refused(line, said):

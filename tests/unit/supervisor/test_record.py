@@ -103,6 +103,15 @@ def test_a_record_of_before_protocol_2_is_read(tmp_path, core):
     assert recorded.launches[TALKER].memo == ""
 
 
+@pytest.mark.parametrize(
+    "line", ["[" * 100_000, '{"record": "dead", "process": "p", "number": 1e999, "key": ["p", 1]}']
+)
+def test_a_line_that_no_reader_expects_is_left_out_with_a_note(tmp_path, line):
+    """A successor that failed at a line would fail at each of its starts."""
+    (tmp_path / "instances.jsonl").write_text(f"{line}\n")
+    assert ":1: left out, it cannot be read" in rc.read(str(tmp_path)).notes[0]
+
+
 def test_the_last_line_counts(tmp_path, core, record):
     """Later states replace earlier ones; an ended instance needs its launch no more."""
     core.handle(events.StopOrdered(TALKER), 1.0)

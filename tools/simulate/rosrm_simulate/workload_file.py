@@ -257,7 +257,9 @@ def _process(
     strategy = given.migration.strategy
     if strategy is not None:
         named = node.deepest(("migration", "strategy"))
-        plugins.choice("migration", strategy, named, node.get("migration", "options"), own=True)
+        plugins.choice(
+            "migration", strategy, named, node.get("migration", "options"), part="own_options"
+        )
     _check_fits(node, given, hosts, problems)
 
     def draw(span: Span) -> float:

@@ -125,7 +125,7 @@ def read_message(directory: Path, kind: type[_Content]) -> _Content | None:
         raise PortableError(f"{path} cannot be read: {error.strerror}") from None
     try:
         found = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise PortableError(f"{path} holds no JSON") from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise PortableError(f"{path} is not of format {FORMAT}, which this rosrm speaks")

@@ -9,9 +9,11 @@ hold.json         the result of the restore (see `rosrm_criu.engine.shim`)
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
+import stat
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -193,17 +195,17 @@ def read(directory: Path) -> Manifest:
     """Return the manifest of an image, after a check that all files exist with their sizes.
 
     Raises:
-        CriuError: it is no image, is incomplete or damaged, or has another format.
+        CriuError: it is no image, is incomplete or damaged, has another format, or is of another
+            user or open to others.
     """
     try:
-        open_to_others = directory.stat().st_mode & 0o077
+        _check_private(directory, stat.S_IFDIR)
+        _check_private(directory / MANIFEST, stat.S_IFREG)
         text = (directory / MANIFEST).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise CriuError(f"{directory} holds no complete image: there is no {MANIFEST}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise CriuError(f"{directory / MANIFEST} cannot be read: {error}") from None
-    if open_to_others:
-        raise CriuError(f"the image {directory} is open to others: its mode has to be 0700")
     try:
         values = json.loads(text)
         written = values.pop("format", None)
@@ -211,7 +213,7 @@ def read(directory: Path) -> Manifest:
         manifest = _manifest(_whole(values, written)) if known else None
     except KeyError as error:
         raise CriuError(f"the image {directory} is damaged: {MANIFEST}: no {error}") from None
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise CriuError(f"the image {directory} is damaged: {MANIFEST}: {error}") from None
     if manifest is None:
         raise CriuError(
@@ -221,10 +223,30 @@ def read(directory: Path) -> Manifest:
     return manifest
 
 
+def _check_private(path: Path, kind: int) -> os.stat_result:
+    """Return the status of a file or directory of an image; raise OSError.
+
+    Raises:
+        CriuError: the path is of another kind, of another user, or open to others.
+    """
+    found = path.lstat()
+    if stat.S_IFMT(found.st_mode) != kind or found.st_uid not in (0, os.geteuid()):
+        raise CriuError(f"{path} is a link, or belongs to another user: the image is refused")
+    if found.st_mode & 0o077:
+        mode = "0700" if kind == stat.S_IFDIR else "0600"
+        raise CriuError(
+            f"the image is refused: {path} is open to others: its mode has to be {mode}"
+        )
+    return found
+
+
 def _check_files(directory: Path, manifest: Manifest) -> None:
+    for folder in {name.split("/")[0] for name in manifest.sizes if "/" in name}:
+        with contextlib.suppress(FileNotFoundError):  # the missing file is named below
+            _check_private(directory / folder, stat.S_IFDIR)
     for name, size in manifest.sizes.items():
         try:
-            found = (directory / name).lstat().st_size
+            found = _check_private(directory / name, stat.S_IFREG).st_size
         except OSError as error:
             raise _damaged(directory, manifest, f"{name}: {error.strerror}") from None
         if found != size:

@@ -4,9 +4,8 @@ Processes without a configured working directory run in the supervisor's, whose 
 name of its host. CRIU opens files by the paths in its image, so these paths are changed there.
 Copies of the paths in the memory of the process stay unchanged.
 
-A CRIU image file consists of two magic numbers and Protocol Buffers messages, each preceded by its
-size. In `files.img` each message is an open file; its field 3 is a regular file or a directory,
-and the path is the only string in that field.
+In `files.img` each message is an open file; its field 3 is a regular file or a directory, and the
+path is the only string in that field.
 """
 
 from __future__ import annotations
@@ -20,15 +19,12 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
+from rosrm_criu.engine import protobuf
 from rosrm_criu.engine.image import HERE, link_or_copy
 
 _FILES: Final = "files.img"
-#: Bytes before the first message.
-_MAGIC: Final = 8
 #: Field of a FileEntry with a regular file or directory.
 _REGULAR: Final = 3
-#: Wire types: varint; eight bytes; bytes preceded by their length; four bytes.
-_NUMBER, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
 
 
 def moved(path: str, old: str, new: str) -> str:
@@ -69,21 +65,17 @@ def images(directory: Path, old: str, new: str) -> Iterator[Path]:
         data = _files((directory / _FILES).read_bytes(), lambda path: moved(path, old, new))
         (beside / _FILES).write_bytes(data)
         yield beside
-    except (struct.error, IndexError, ValueError) as error:
+    except ValueError as error:
         raise CriuError(f"{directory / _FILES} is damaged: {error}") from None
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 
 
 def _files(data: bytes, change: Callable[[str], str]) -> bytes:
-    changed = [data[:_MAGIC]]
-    position = _MAGIC
-    while position < len(data):
-        (size,) = struct.unpack_from("<I", data, position)
-        message = data[position + 4 : position + 4 + size]
-        position += 4 + size
-        message = _fields(message, lambda number, value: _entry(number, value, change))
-        changed.append(struct.pack("<I", len(message)) + message)
+    changed = [data[: protobuf.MAGIC]]
+    for message in protobuf.messages(data):
+        new = _fields(message, lambda number, value: _entry(number, value, change))
+        changed.append(struct.pack("<I", len(new)) + new)
     return b"".join(changed)
 
 
@@ -102,43 +94,9 @@ def _text(value: bytes, change: Callable[[str], str]) -> bytes:
 def _fields(message: bytes, change: Callable[[int, bytes], bytes]) -> bytes:
     """Return a message with `change` applied to its fields of bytes."""
     changed = []
-    position = 0
-    while position < len(message):
-        begin = position
-        key, position = _varint(message, position)
-        wire = key & 7
-        if wire == _NUMBER:
-            _, position = _varint(message, position)
-        elif wire in (_EIGHT, _FOUR):
-            position += 8 if wire == _EIGHT else 4
-        elif wire == _BYTES:
-            size, start = _varint(message, position)
-            position = start + size
-            value = change(key >> 3, message[start:position])
-            changed.append(_encoded(key) + _encoded(len(value)) + value)
-            continue
+    for one in protobuf.fields(message):
+        if isinstance(one.value, bytes):
+            changed.append(protobuf.encoded_bytes(one.number, change(one.number, one.value)))
         else:
-            raise ValueError(f"there is no wire type {wire}")
-        changed.append(message[begin:position])
+            changed.append(one.raw)
     return b"".join(changed)
-
-
-def _varint(message: bytes, position: int) -> tuple[int, int]:
-    """Return a varint and the position after it."""
-    number = shift = 0
-    while True:
-        byte = message[position]
-        position += 1
-        number |= (byte & 0x7F) << shift
-        shift += 7
-        if byte < 0x80:
-            return number, position
-
-
-def _encoded(number: int) -> bytes:
-    out = bytearray()
-    while number >= 0x80:
-        out.append(number & 0x7F | 0x80)
-        number >>= 7
-    out.append(number)
-    return bytes(out)

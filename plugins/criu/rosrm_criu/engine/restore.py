@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
-import shutil
 import stat
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,18 +21,22 @@ from rosrm_criu.engine import criu_log, image, relocation
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.dump import COMMON
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
+from rosrm_criu.engine.put_back import is_tracing
 
 #: File into which CRIU writes the pid of the restored root.
 _PID_FILE: Final = "restored.pid"
-#: LTTng's files, which every ROS process maps: without content, and made by its first user.
-_TRACING: Final = "/dev/shm/lttng-ust-wait-"  # noqa: S108 - LTTng's own
 #: Ids that CRIU and its children may use during a restore.
 _IDS_OF_CRIU: Final = 400
 
 
-def moved_here(manifest: Manifest) -> Manifest:
-    """Return the manifest with this host's paths: default working directories differ by host."""
-    state = os.environ.get(SUPERVISOR_MARK, "")
+def moved_here(manifest: Manifest, state: str | None = None) -> Manifest:
+    """Return the manifest with this host's paths: default working directories differ by host.
+
+    Args:
+        manifest: of the image.
+        state: the supervisor's directory; None: as the environment names it; "": unknown.
+    """
+    state = os.environ.get(SUPERVISOR_MARK, "") if state is None else state
     new = paths.work_directory(state) if state else ""
 
     def here(path: str) -> str:
@@ -64,7 +67,7 @@ def check(manifest: Manifest) -> None:
         if not held.copy and not held.grows:
             _check_file(held, here, "has open")
     for mapped in manifest.mapped:
-        if not mapped.path.startswith(_TRACING):
+        if not is_tracing(mapped.path):
             _check_file(mapped, here, "has mapped")
 
 
@@ -83,75 +86,6 @@ def _check_file(file: HeldFile | MappedFile, here: str, holds: str) -> None:
             f"the file {file.path}, which the process {holds}, is another one on {here}: "
             f"{status.st_size} bytes instead of {file.size}"
         )
-
-
-def prepare(directory: Path, manifest: Manifest) -> None:
-    """Put back the files that follow the process; create missing append-only and LTTng files.
-
-    The checksums of the whole image are compared before the first change. Otherwise a damaged file
-    could replace an intact one, and CRIU would restore damaged memory without an error.
-
-    Raises:
-        CriuError: the image is damaged, or a file cannot be put back.
-    """
-    image.check_contents(directory, manifest)
-    for mapped in manifest.mapped:
-        if mapped.path.startswith(_TRACING) and not Path(mapped.path).exists():
-            _make_tracing_file(mapped)
-    for held in manifest.files:
-        try:
-            _put_back(directory, held)
-        except OSError as error:
-            raise CriuError(
-                f"the file {held.path}, which the process has open, cannot be put back on "
-                f"{platform.node()}: {error.strerror}"
-            ) from None
-
-
-def _put_back(directory: Path, held: HeldFile) -> None:
-    target = Path(held.path)
-    if not held.copy and (not held.grows or target.exists()):
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if held.copy:
-        _replace(directory / held.copy, target, held.mode)
-    else:
-        target.touch(mode=held.mode)
-
-
-def _replace(source: Path, target: Path, mode: int) -> None:
-    """Replace a file by a copy with the same owner; no symbolic link there is followed.
-
-    Otherwise the owner of the folder could make root write anywhere.
-    """
-    new = target.with_name(f".{target.name}.rosrm")
-    new.unlink(missing_ok=True)
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    try:
-        with source.open("rb") as copy, os.fdopen(os.open(new, flags, 0o600), "wb") as file:
-            shutil.copyfileobj(copy, file)
-            if os.geteuid() == 0:
-                before = (target if target.exists() else target.parent).lstat()
-                os.fchown(file.fileno(), before.st_uid, before.st_gid)
-            os.fchmod(file.fileno(), mode)
-        new.replace(target)
-    except OSError:
-        new.unlink(missing_ok=True)
-        raise
-
-
-def _make_tracing_file(mapped: MappedFile) -> None:
-    new = f"{mapped.path}.{os.getpid()}"
-    descriptor = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    try:
-        os.ftruncate(descriptor, mapped.size)
-        os.fchmod(descriptor, mapped.mode)
-        os.link(new, mapped.path)  # unlike rename, this keeps a file that appeared since the check
-    except FileExistsError:
-        pass
-    finally:
-        os.close(descriptor)
-        os.unlink(new)  # noqa: PTH108
 
 
 def restore(

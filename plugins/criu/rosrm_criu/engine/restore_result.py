@@ -86,7 +86,7 @@ def read(directory: Path) -> Outcome | None:
         return Outcome(**json.loads((directory / FILE).read_text(encoding="utf-8")))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise CriuError(f"{directory / FILE} cannot be read: {error}") from None
 
 

@@ -35,7 +35,7 @@ if not __package__:
 
 from rosrm.errors import CriuError
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
-from rosrm_criu.engine import image, process_tree, restore, restore_result
+from rosrm_criu.engine import image, process_tree, put_back, restore, restore_result
 from rosrm_criu.engine.binary import CriuBinary, opened
 from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.restart_from_image import become
@@ -127,7 +127,7 @@ class _Restore:
 
     def run(self, marks: dict[str, str]) -> int:
         """Restore the process; return its pid in this namespace, or raise CriuError."""
-        restore.prepare(self.directory, self.here)
+        put_back.prepare(self.directory, self.here)
         log = _reopened_log()
         try:
             pid = restore.restore(

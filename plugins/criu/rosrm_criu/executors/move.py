@@ -6,8 +6,11 @@ whose slave was restarted. `artifacts` has the state that is kept between the ca
 
 from __future__ import annotations
 
+import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rosrm.errors import CriuError, PortableError
 from rosrm_criu.control.client import (
@@ -18,7 +21,7 @@ from rosrm_criu.control.client import (
 )
 from rosrm_criu.control.directory import remove_directory
 from rosrm_criu.control.messages import State, Status, read_message
-from rosrm_criu.engine import dump, process_tree
+from rosrm_criu.engine import dump, process_tree, received
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import incoming, outgoing
 from rosrm_criu.engine.probe import criu_support
@@ -45,7 +48,24 @@ def report_capability(arguments: Answer) -> Answer:
     found = criu_support()
     if not found.works:
         raise CriuError(found.reason)
-    return {**found.facts, "host": here["host"], "no_transfer": missing()}
+    return {
+        **found.facts, "host": here["host"], "no_transfer": missing(),
+        "takes_none": refusal_of_images(here),
+    }  # fmt: skip
+
+
+def refusal_of_images(here: Mapping[str, Any]) -> str:
+    """Return the reason why this slave takes no image from another host; "": it takes them.
+
+    CRIU restores the user that the image names, so its source could run any program as root here.
+    """
+    if os.geteuid() != 0 or here["options"].get("as_root") is True:
+        return ""
+    return (
+        f"the slave of {here['host']} runs as root, and so takes no image of another host, which "
+        "could run any program as root here. Run the slave as an ordinary user, or write "
+        "`strategies: {criu: {as_root: true}}` in its host file"
+    )
 
 
 # --- the source -------------------------------------------------------------------------------
@@ -160,6 +180,8 @@ def _offer(sender: Sender, directory: Path, asked: StepArguments) -> Offer:
 def introduce(arguments: Answer) -> Answer:
     """Prepare the fetch before the node is frozen; return the only certificate that may fetch."""
     asked = StepArguments.of(arguments)
+    if refusal := refusal_of_images(arguments["here"]):
+        raise CriuError(refusal)
     named = arguments.get("working_directory")
     if named and not Path(named).expanduser().is_dir():
         raise CriuError(f"its working directory {named} does not exist on {asked.host}: make it")
@@ -178,6 +200,7 @@ def _fetch(asked: StepArguments) -> Answer:
     uid, control = int(dumped["uid"]), Path(dumped["control"])
     if control != control_directory(control.name, uid):
         raise PortableError(f"{control} is no control directory of user {uid}")
+    received.check_source(uid)
     directory = incoming(asked.state, asked.destination)
     artifacts.discard(directory)
     artifacts.forget_restored(asked.state, asked.instances)
@@ -192,11 +215,22 @@ def _fetch(asked: StepArguments) -> Answer:
             Offer.from_json(dumped["offer"]), directory, timeout=asked.timeout,
             reserve=int(asked.arguments["reserve"]),
         )  # fmt: skip
+        _check_received(asked, directory, uid)
     finally:
         artifacts.close_soon(fetcher)
         artifacts.remove_unused_later(directory, float(asked.arguments["keep"]))
     make_directory(control, uid)
     return {"seconds": {"transfer": fetched.seconds}, "received": fetched.received}
+
+
+def _check_received(asked: StepArguments, directory: Path, uid: int) -> None:
+    """Remove an image that this host must not restore, and raise `CriuError`."""
+    named = asked.arguments.get("working_directory")
+    try:
+        received.check(directory, state=asked.state, working_directory=named, uid=uid)
+    except CriuError:
+        artifacts.discard(directory)
+        raise
 
 
 def await_restored(arguments: Answer) -> Answer:

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import hmac
 import os
-import shutil
 import stat
 import sys
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, Final
+from typing import Final
 
 from rosrm.errors import TransferError
 from rosrm_criu.transfer.form import DIGEST_SIZE, new_digest
@@ -31,6 +30,14 @@ _PIECE: Final = 1 << 18
 #: The fastest regular level; a higher one is slower than a gigabit network.
 _LEVEL: Final = 1
 _END: Final = bytes(2 * tarfile.BLOCKSIZE)
+#: Most bytes of the header with what a tar header has no room for, such as a long name.
+_LARGEST_HEADER: Final = 1 << 16
+#: Its fields that a sender writes.
+_FIELDS: Final = frozenset({"path", "size", "hdrcharset"})
+#: Most directories: the offer bounds the number of files alone.
+_MOST_DIRECTORIES: Final = 1000
+#: Most digits of a file's size.
+_LONGEST_SIZE: Final = 18
 _NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -154,49 +161,46 @@ def _unreadable(path: Path, error: OSError) -> str:
 
 
 class Unpacker:
-    """Reader of a compressed archive, which checks its length and its checksum.
+    """Reader of a compressed archive, which checks its length, its entries and its checksum.
 
     Args:
         receive: returns the next compressed bytes, at least one; raises `TransferError`.
         length: bytes of the archive; no more are accepted.
+        files: number of files; no more are accepted.
 
     Attributes:
         position: bytes of the archive that were read.
     """
 
-    def __init__(self, receive: Callable[[], bytes], length: int) -> None:
+    def __init__(self, receive: Callable[[], bytes], length: int, files: int) -> None:
         self._receive = receive
         self._length = length
+        self._files = files
         self._decompressor = ZstdDecompressor()
         self._digest = new_digest()
         self.position = 0
 
-    def unpack(self, directory: Path) -> int:
-        """Write the archive into an empty directory; return the number of files.
+    def unpack(self, directory: Path) -> None:
+        """Write the archive into an empty directory.
 
         Raises:
             TransferError: it is no archive, is damaged, or contains something forbidden.
             OSError: something cannot be written.
         """
-        files = 0
-        try:
-            # tarfile calls only read(size).
-            source: Any = self
-            with tarfile.open(fileobj=source, mode="r|", bufsize=_PIECE) as tar:
-                for entry in tar:
-                    files += _write(tar, entry, directory)
-            while self.read(_PIECE):
-                pass  # tarfile stops at the archive's end mark, but the checksum covers all bytes
-        except (tarfile.TarError, EOFError) as error:
-            raise TransferError(f"the received data is no sound archive: {error}") from None
-        return files
-
-    def read(self, size: int, /) -> bytes:
-        """Return at most `size` bytes of the archive; none at its end. Raise `TransferError`."""
-        data = self._next(min(size, self._length - self.position))
-        self.position += len(data)
-        self._digest.update(data)
-        return data
+        files = directories = 0
+        while entry := self._entry():
+            directories += entry.is_directory
+            files += not entry.is_directory
+            if files > self._files or directories > _MOST_DIRECTORIES:
+                raise TransferError(
+                    f"the archive holds more than the {self._files} files that were offered, or "
+                    f"more than {_MOST_DIRECTORIES} directories: refused"
+                )
+            self._write(entry, directory)
+        while self._read(_PIECE):
+            pass  # the checksum covers all bytes, also those after the end mark
+        if files != self._files:
+            raise TransferError(f"{files} files came, {self._files} were offered")
 
     def check(self) -> str:
         """Return the checksum of the archive in hexadecimal digits, after `unpack`.
@@ -214,6 +218,71 @@ class Unpacker:
             )
         return sent.hex()
 
+    def _entry(self) -> _Entry | None:
+        """Return the next entry; None: the end mark was read. Raise `TransferError`."""
+        header = self._header()
+        fields: Mapping[str, str] = {}
+        if header is not None and header.type == tarfile.XHDTYPE:
+            fields = self._extended(header.size)
+            header = self._header()
+            if header is None:
+                raise TransferError("the archive ends within the header of a file")
+        return None if header is None else _checked(header, fields)
+
+    def _header(self) -> tarfile.TarInfo | None:
+        """Return the next header; None: the end mark was read. Raise `TransferError`."""
+        block = self._exactly(tarfile.BLOCKSIZE)
+        if not any(block):
+            return None
+        try:
+            return tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+        except tarfile.TarError as error:
+            raise TransferError(f"the received data is no sound archive: {error}") from None
+
+    def _extended(self, size: int) -> Mapping[str, str]:
+        """Return the fields of an extended header of so many bytes; raise `TransferError`."""
+        if not 0 <= size <= _LARGEST_HEADER:
+            raise TransferError(
+                f"the archive holds a header of {size} bytes, allowed are {_LARGEST_HEADER}: "
+                "refused"
+            )
+        return _fields(self._exactly(size + -size % tarfile.BLOCKSIZE)[:size])
+
+    def _write(self, entry: _Entry, directory: Path) -> None:
+        path = directory / entry.name
+        try:
+            if entry.is_directory:
+                path.mkdir(mode=0o700)
+                return
+            descriptor = os.open(path, _NEW, 0o600)
+        except (FileExistsError, FileNotFoundError, NotADirectoryError):
+            raise TransferError(f"the archive names {entry.name!r} twice or out of order") from None
+        with os.fdopen(descriptor, "wb", buffering=0) as file:
+            left = entry.size
+            while left:
+                piece = self._read(min(_PIECE, left))
+                if not piece:
+                    raise TransferError(f"the archive ends within {entry.name!r}")
+                left -= file.write(piece)
+        self._exactly(entry.padding)
+
+    def _exactly(self, size: int) -> bytes:
+        """Return so many bytes of the archive; raise `TransferError` if it has less."""
+        data = b""
+        while len(data) < size:
+            piece = self._read(size - len(data))
+            if not piece:
+                raise TransferError("the received data is no sound archive: it ends too soon")
+            data += piece
+        return data
+
+    def _read(self, size: int) -> bytes:
+        """Return at most `size` bytes of the archive; none at its end. Raise `TransferError`."""
+        data = self._next(min(size, self._length - self.position))
+        self.position += len(data)
+        self._digest.update(data)
+        return data
+
     def _next(self, size: int) -> bytes:
         """Return the next uncompressed bytes: at most `size`, and at least one if `size` is."""
         data = b""
@@ -226,35 +295,32 @@ class Unpacker:
         return data
 
 
-def _write(tar: tarfile.TarFile, entry: tarfile.TarInfo, directory: Path) -> int:
-    path = directory / _checked(entry, directory)
-    try:
-        if entry.isdir():
-            path.mkdir(mode=0o700)
-            return 0
-        content = tar.extractfile(entry)
-        assert content is not None  # because it is a regular file
-        with os.fdopen(os.open(path, _NEW, 0o600), "wb", buffering=0) as file:
-            _copy(content, file, entry)
-    except (FileExistsError, FileNotFoundError, NotADirectoryError):
-        raise TransferError(f"the archive names {entry.name!r} twice or out of order") from None
-    return 1
+def _fields(data: bytes) -> Mapping[str, str]:
+    """Return the fields of an extended header, each preceded by its length; raise on others."""
+    found: dict[str, str] = {}
+    while data:
+        digits, _, _ = data[:8].partition(b" ")
+        size = int(digits) if digits.isdigit() else 0
+        name, equals, value = data[len(digits) + 1 : size - 1].partition(b"=")
+        field = name.decode("utf-8", "surrogateescape")
+        if not equals or data[size - 1 : size] != b"\n" or field not in _FIELDS:
+            raise TransferError("the received data is no sound archive: an extended header is none")
+        found[field] = value.decode("utf-8", "surrogateescape")
+        data = data[size:]
+    return found
 
 
-def _copy(content: IO[bytes], file: IO[bytes], entry: tarfile.TarInfo) -> None:
-    shutil.copyfileobj(content, file, _PIECE)
-    if file.tell() != entry.size:
-        raise TransferError(f"the archive ends within {entry.name!r}")
-
-
-def _checked(entry: tarfile.TarInfo, directory: Path) -> PurePosixPath:
-    """Return the path of an entry below the directory; raise `TransferError` if it is forbidden."""
-    path = PurePosixPath(entry.name)
-    if path.is_absolute() or ".." in path.parts or not path.parts:
-        raise TransferError(f"the archive holds {entry.name!r}, which lies outside of it: refused")
-    if entry.type not in (tarfile.REGTYPE, tarfile.DIRTYPE) or entry.issparse():
+def _checked(header: tarfile.TarInfo, fields: Mapping[str, str]) -> _Entry:
+    """Return the entry of a header; raise `TransferError` if it is forbidden."""
+    name = fields.get("path", header.name).rstrip("/")
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or not path.parts or "\0" in name:
+        raise TransferError(f"the archive holds {name!r}, which lies outside of it: refused")
+    if header.type not in (tarfile.REGTYPE, tarfile.DIRTYPE):
         raise TransferError(
-            f"the archive holds {entry.name!r}, which is neither a file nor a directory: refused"
+            f"the archive holds {name!r}, which is neither a file nor a directory: refused"
         )
-    tarfile.data_filter(entry, os.fspath(directory))
-    return path
+    size = fields.get("size", str(header.size))
+    if not (size.isascii() and size.isdigit() and len(size) <= _LONGEST_SIZE):
+        raise TransferError(f"the archive holds {name!r} with a size of {size[:40]!r}: refused")
+    return _Entry(name, int(size), is_directory=header.type == tarfile.DIRTYPE)

@@ -29,6 +29,8 @@ TAKEN: Final = b"\x01"
 
 _HEX: Final = re.compile(r"[0-9a-f]{64}")
 _MOST: Final = 1 << 60
+#: Most files of a directory, each of which takes an inode at the destination.
+_MOST_FILES: Final = 100_000
 
 
 def new_digest() -> hashlib.blake2b:
@@ -93,6 +95,7 @@ class Offer:
         return (
             all(isinstance(one, str) for one in texts)
             and all(type(one) is int and 0 <= one < _MOST for one in counts)
+            and self.files <= _MOST_FILES
             and type(self.port) is int
             and 0 < self.port < 1 << 16
             and type(self.seconds) in (int, float)

@@ -1,0 +1,52 @@
+"""Invariants of the master's state alone, whatever users, hosts and strangers have sent."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.process import DesiredState, ProcessPhase
+
+
+def no_process_is_lost(state: MasterState) -> None:
+    """Check that each process is in exactly one place that matches its phase."""
+    queued = set(state.queue)
+    for process in state.processes.values():
+        name, phase = process.name, process.phase
+        assert (phase is ProcessPhase.QUEUED) == (name in queued), (name, phase)
+        assert (phase is ProcessPhase.SET_ASIDE) == (name in state.set_aside), (name, phase)
+        moving = name in state.migrations
+        assert moving or phase not in (ProcessPhase.MIGRATING, ProcessPhase.STUCK)
+        if phase.is_terminal or name in queued or name in state.set_aside:
+            assert not process.owner, (name, phase)
+            assert not moving
+            assert phase.is_terminal or not process.instances
+        elif not moving:
+            waits_for_an_end = process.wanted is not DesiredState.RUN and process.instances
+            assert process.owner in state.instances or waits_for_an_end, (name, phase)
+    assert queued <= set(state.processes)
+
+
+def the_books_balance(state: MasterState) -> None:
+    """Check that the load of each host is the sum over its instances and not negative."""
+    of_process = defaultdict(set)
+    for number, instance in state.instances.items():
+        of_process[instance.id.process].add(number)
+        assert number in instance.host.instances
+    for process in state.processes.values():
+        assert process.instances == of_process.pop(process.name, set())
+    assert {
+        name: numbers for name, numbers in state.unowned_instances.items() if numbers
+    } == of_process
+    for host in state.hosts.hosts:
+        held = [state.instances[number] for number in host.instances]
+        assert all(instance.host is host for instance in held)
+        assert state.hosts.processes[host.column] == len(held)
+        total = np.zeros(len(state.hosts.resources))
+        for instance in held:
+            assert (instance.reserved >= 0.0).all()
+            total[: len(instance.reserved)] += instance.reserved
+        assert np.allclose(state.hosts.load[:, host.column], total, atol=1e-6)
+        assert (state.hosts.load[:, host.column] >= 0.0).all()
