@@ -33,7 +33,7 @@ from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
-from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
+from rosrm.model.values import EMPTY, LARGEST_NUMBER, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 
 #: Records of one process that `explain` shows.
@@ -46,8 +46,8 @@ _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING}
 _MOST_REMOVED: Final = 10_000
 #: Faster than `fields_to_plain`, because a process is saved in the turn of its decision.
 _journaled_of: Final = attrgetter(*JOURNALED)
-#: No instance gets a number as large as this.
-_LARGEST: Final = 2**53
+#: Seconds between two records of the same kind about the same host.
+RECORD_PERIOD: Final = 10.0
 
 
 @dataclass(slots=True)
@@ -62,7 +62,7 @@ class JournalGap:
         records_missing: some are lost, and some hosts may not have had the time to report since.
     """
 
-    newest: int = _LARGEST
+    newest: int = LARGEST_NUMBER
     started: float = 0.0
     machine_rebooted: bool = False
     lost: int = 0
@@ -132,6 +132,8 @@ class MasterState:
         self.held_since = inf
         self.journal_gap = JournalGap()
         self.missing_since: dict[int, float] = {}
+        self.stranger_refused_at = -inf
+        self.ahead_since: dict[int, tuple[float, int]] = {}
         self.reviewed = -inf
         self.demands: dict[Any, Demand] = {}
         self._out: list[Command] = []
@@ -169,6 +171,12 @@ class MasterState:
             known.history.append((now, kind, message))
             if len(known.history) > _HISTORY:
                 del known.history[0]
+
+    def record_seldom(self, host: Host, kind: EventKind, now: float, message: str) -> None:
+        """Write a line about a host, unless one of that kind was written a moment ago."""
+        if now - host.recorded_at.get(kind, -inf) >= RECORD_PERIOD:
+            host.recorded_at[kind] = now
+            self.record(now, kind, message, host=host.name)
 
     def save(self, process: Process) -> None:
         """Persist the desired state of a process, as it stands after the current event."""
@@ -344,7 +352,7 @@ class MasterState:
 
         Other instances may have had later numbers, and have ended.
         """
-        if self.next_instance <= seen < _LARGEST:
+        if self.next_instance <= seen < LARGEST_NUMBER:
             self.next_instance = seen + _RESERVED
             self._reserve_numbers()  # the slave may never report it again
 

@@ -74,7 +74,6 @@ class SlaveEndpoint:
     Attributes:
         link: state of the connection to the master.
         failure: reason to give up; "": there is none.
-        superseded: the reason is another live slave with its name.
         cluster: name of the last master that greeted this slave; "" before the first one.
         epoch: newest known epoch of the master.
         failing: kind and name of each failing plugin on this host, with the reason; sent with the
@@ -93,7 +92,6 @@ class SlaveEndpoint:
         self._seen = seen or JournalWatermark()
         self.link = MasterLink.SEARCHING
         self.failure = ""
-        self.superseded = False
         self.cluster = ""
         self.failing: dict[Plugin, str] = {}
         self.host_id = 0
@@ -262,7 +260,6 @@ class SlaveEndpoint:
                 )  # fmt: skip
         if answer.code != "name_taken" or now - self._taken_since >= self._patience():
             self.failure = answer.message
-            self.superseded = answer.code == "name_taken"
             return
         self.link = MasterLink.SEARCHING
 

@@ -9,7 +9,7 @@ import numpy as np
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import Instance
 from rosrm.extensions.contracts import Intent
-from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
+from rosrm.model.values import MOST_USED, InstanceState, InstanceStatus, ProcessSpec
 
 #: Seconds: a shorter run is mostly start-up, so it does not show the CPU use of a program.
 _TELLING_RUN: Final = 1.0
@@ -44,6 +44,7 @@ def learn_from(
         "memory": max(status.peak_memory, instance.peak.get("memory", 0.0)),
         "cpu": max(cpu, instance.peak.get("cpu", 0.0)),
     }
-    counts = state.learned.learn(spec.program, peaks)
+    plausible = {name: used for name, used in peaks.items() if used <= MOST_USED[name]}
+    counts = state.learned.learn(spec.program, plausible)
     if counts is not None:
         state.emit(Intent("learned", spec.program, counts))

@@ -24,6 +24,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.extensions.contracts import Intent
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.values import LARGEST_NUMBER
 from rosrm.wording import counted
 
 _KEY: Final = "unheard"
@@ -76,7 +77,7 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     """Compare the journal with the newest record that a host has seen, and begin a wait."""
     gap = state.journal_gap
     lost = seen - gap.newest
-    if lost <= gap.lost:
+    if lost <= gap.lost or seen >= LARGEST_NUMBER:
         return
     gap.lost = lost
     state.skip_numbers(state.next_instance + lost)  # each may have held a new instance
