@@ -16,9 +16,11 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.errors import Refused
+from rosrm.ros.bounds import MOST_LETTERS, check_bounds
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import Answer, Envelope
+from rosrm_msgs.msg import Answer, Envelope, MasterBeat
+from rosrm_msgs.srv import Handshake
 
 #: Remembered ids: more than can arrive within the greatest age of a request.
 _REMEMBERED: Final = 10_000
@@ -37,14 +39,23 @@ def version_refusal(version: int, who: str) -> str:
 
 def accepted(message: str = "", epoch: int = 0) -> Answer:
     """Return the answer to a request that was carried out."""
-    return Answer(protocol_version=PROTOCOL_VERSION, accepted=True, message=message, epoch=epoch)
+    return Answer(
+        protocol_version=PROTOCOL_VERSION, accepted=True, message=message[:MOST_LETTERS],
+        epoch=epoch,
+    )  # fmt: skip
 
 
 def refused(code: str, message: str, epoch: int = 0) -> Answer:
     """Return the answer to a request that changed nothing."""
     return Answer(
-        protocol_version=PROTOCOL_VERSION, accepted=False, code=code, message=message, epoch=epoch
-    )
+        protocol_version=PROTOCOL_VERSION, accepted=False, code=code,
+        message=message[:MOST_LETTERS], epoch=epoch,
+    )  # fmt: skip
+
+
+def master_identity(message: MasterBeat | Handshake.Response) -> tuple[str, int, int]:
+    """Return the identity of a master, as far as a greeting contains it, too."""
+    return message.hostname, message.pid, message.epoch
 
 
 def check_answer(answer: Answer, who: str) -> None:
@@ -170,6 +181,12 @@ class ControlServer:
         self._participant.serve(service_type, name, take)
 
 
+def _bounded(response: Any) -> Any:
+    """Return a received response; raise `Refused` for one that exceeds its bounds."""
+    check_bounds(response)
+    return response
+
+
 @dataclass(slots=True)
 class Call:
     """A request without an answer yet.
@@ -220,7 +237,7 @@ class ControlClient:
         if call in self._calls:
             self._calls.remove(call)
             guard = self.participant.guard
-            if guard.call(lambda: call.done(call.future.result())):
+            if guard.call(lambda: call.done(_bounded(call.future.result()))):
                 guard.call(call.done, None)  # an unusable response counts as none
 
     def expire(self, now: float) -> None:

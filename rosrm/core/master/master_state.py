@@ -34,7 +34,7 @@ from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.values import EMPTY, LARGEST_NUMBER, Assignment, InstanceId, ProcessSpec
-from rosrm.wording import one_line
+from rosrm.wording import one_line, printable
 
 #: Records of one process that `explain` shows.
 _HISTORY: Final = 12
@@ -46,6 +46,8 @@ _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING}
 _MOST_REMOVED: Final = 10_000
 #: Faster than `fields_to_plain`, because a process is saved in the turn of its decision.
 _journaled_of: Final = attrgetter(*JOURNALED)
+#: Most letters of the message of a record.
+_LONGEST_RECORD: Final = 10_000
 #: Seconds between two records of the same kind about the same host.
 RECORD_PERIOD: Final = 10.0
 
@@ -164,7 +166,7 @@ class MasterState:
         """Write a line of the event record; `by` is the client that requested it."""
         if by:
             message, facts = f"{message} (by {by})", {**facts, "by": by}
-        message = one_line(message)
+        message = printable(one_line(message), _LONGEST_RECORD)
         self.emit(Record(kind, process, host, message, facts))
         known = self.processes.get(process)
         if known is not None:

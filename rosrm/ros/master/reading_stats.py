@@ -12,11 +12,16 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.core.master.state.hosts import MOST_AHEAD
 from rosrm.ros.reading_codec import Runs
 
 #: Seconds of silence after which a host's reading is no longer expected.
 _GONE: Final = 10.0
 _FIRST_ROOM: Final = 16
+_NS: Final = 1e-9
+#: Seconds by which a beat may be ahead of the time that has passed since the one before. An order
+#: with a beat that is still to come for its slave would be stale.
+_BEAT_AHEAD: Final = 10.0
 
 
 class ReadingStats:
@@ -68,15 +73,25 @@ class ReadingStats:
         known &= self._incarnation[at] == runs.incarnation
         at, sequence, cycles = at[known], runs.sequence[known], runs.cycles[known]
         before = self._sequence[at]
-        # No cycle before the first message of a run was expected.
-        expected = np.maximum(sequence - np.where(before, before, runs.first[known] - 1), 0)
+        # No cycle before the first message of a run was expected, nor any after an absurd step.
+        step = sequence - np.where(before, before, runs.first[known] - 1)
+        absurd = np.abs(step) > MOST_AHEAD
         self.cycles += int(cycles.sum())
-        self.missed += int((expected - cycles).sum())
-        newer = sequence > before
+        self.missed += int(np.where(absurd, 0, np.maximum(step, 0) - cycles).sum())
+        newer = (sequence > before) | absurd
         self._sequence[at[newer]] = sequence[newer]
-        self.beat[at] = runs.beat[known]
+        self._take_beats(at, runs.beat[known], now)
         self._last_contact[at] = now
         return at
+
+    def _take_beats(
+        self, at: npt.NDArray[np.int64], beats: npt.NDArray[np.uint64], now: float
+    ) -> None:
+        """Enter beats, except those that the clocks of the slaves cannot have reached."""
+        before, passed = self.beat[at], now - self._last_contact[at]
+        ahead = np.where(beats > before, beats - before, np.uint64(0)) * _NS
+        possible = (before == 0) | (ahead <= passed + _BEAT_AHEAD)
+        self.beat[at[possible]] = beats[possible]
 
     def ages(self, now: float) -> tuple[int, float]:
         """Return the number of reporting hosts, and the greatest age of a newest reading, s."""

@@ -63,6 +63,16 @@ def slave(monkeypatch, caplog) -> Slave:
     return slave
 
 
+@pytest.mark.parametrize("failure", ["a live slave has the name 'h0' already", "another version"])
+def test_a_refused_slave_keeps_its_processes(slave, caplog, failure) -> None:
+    """Another may have taken its name: fences end what may have a successor, and nothing else."""
+    slave.endpoint.failure = failure
+    slave.when_stopped = lambda: pytest.fail("the processes were stopped")
+    assert slave.ending.carry_out("") == 1
+    assert failure in caplog.text
+    assert "2 processes keep running, those with a fence until it expires" in caplog.text
+
+
 def test_an_order_to_stop_that_was_not_taken_is_no_stop(slave, caplog) -> None:
     """If the supervisor hangs, the line names the running processes and the way to stop them."""
     slave.when_stopped = lambda: slave.report("q", InstanceState.STOPPING)
