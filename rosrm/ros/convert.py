@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from functools import cache, partial
 from operator import attrgetter
 from typing import Any, Final, TypeVar, get_type_hints
@@ -314,7 +314,9 @@ def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
     resources = sorted(message.resources, key=lambda resource: int(resource.slot))
     if [resource.slot for resource in resources] != list(range(len(resources))):
         raise Refused(f"host {message.name!r:.250}: its resources do not fill the slots 0, 1, 2, …")
-    description = _description(message, resources)
+    described = _description(message, resources)
+    absent = {probe: printable(reason) for probe, reason in described.absent.items()}
+    description = replace(described, absent=absent)
     fault = description_fault(description)
     if fault:
         raise Refused(fault)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-#: Seconds by which a beat may be faster than the fastest one before it. The first one is the answer to
-#: a handshake, which takes at most a few seconds.
+#: Seconds by which a beat may be faster than the fastest one before it. The first one is in the
+#: answer to a handshake, which takes at most a few seconds.
 _FASTER: Final = 10.0
 #: Share by which one monotonic clock may run faster than another: twice what `adjtimex` allows.
 _DRIFT: Final = 1e-3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 
@@ -16,7 +17,11 @@ from rosrm.ros.master.slave_links import HostLinks
 from rosrm.ros.participant import Participant
 from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
+from rosrm.wording import printable
 from rosrm_msgs import msg
+
+#: Most letters of the name of a failing plugin.
+_LONGEST_PLUGIN: Final = 200
 
 
 class SlaveSubscriptions:
@@ -108,4 +113,8 @@ class SlaveSubscriptions:
 
 
 def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:
-    return {row.name: row.reason for row in message.failing if row.kind == kind}
+    return {
+        printable(row.name, _LONGEST_PLUGIN): printable(row.reason)
+        for row in message.failing
+        if row.kind == kind
+    }

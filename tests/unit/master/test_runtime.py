@@ -53,7 +53,7 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
     ],
 )  # fmt: skip
 def test_the_younger_of_two_masters_stops(uptime, incarnation, stops) -> None:
-    """Of two that started at once the smaller incarnation does. An impossible uptime stops none."""
+    """After simultaneous starts the greater incarnation stays. An impossible uptime stops none."""
     master = MasterRuntime.__new__(MasterRuntime)
     master._started, master._stopping = 0.0, ""
     master._endpoint = SimpleNamespace(incarnation=8)

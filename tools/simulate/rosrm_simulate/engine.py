@@ -74,13 +74,14 @@ class Simulation(World[Machine]):
         strategies: Mapping[str, MigrationStrategy],
         declared: Declared | None = None,
     ) -> None:
-        bounds = {
-            "max_hosts": max(settings.max_hosts, len(workload.hosts)),
-            "max_processes": max(settings.max_processes, len(workload.processes)),
-        }
+        settings = replace(
+            settings,
+            max_hosts=max(settings.max_hosts, len(workload.hosts)),
+            max_processes=max(settings.max_processes, len(workload.processes)),
+        )
         super().__init__(
             MasterState(
-                replace(settings, **bounds), policy[0], policy[1], strategies, epoch=1,
+                settings, policy[0], policy[1], strategies, epoch=1,
                 declared=replace(declared or Declared(), executors=EMPTY),
             )
         )  # fmt: skip
