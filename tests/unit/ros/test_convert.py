@@ -70,6 +70,7 @@ HOSTS = drawn(
         max_size=16, unique_by=lambda resource: resource.name,
     ).map(tuple),
     labels=st.dictionaries(PRINTABLE, PRINTABLE, max_size=3),
+    absent=st.dictionaries(PRINTABLE, PRINTABLE, max_size=3),
     executors=st.lists(PRINTABLE, max_size=3).map(tuple),
     hostname=PRINTABLE, software_version=PRINTABLE,
 )  # fmt: skip
