@@ -1,6 +1,6 @@
 """Journal of intent: desired processes, the queue, assignments and migrations, durably stored.
 
 sqlite.py     the journal
-errors.py     failures of a disk: those that may pass, and permanent ones
-recovery.py   repair of a journal with a gap, or of an unreadable one
+errors.py     errors, temporary and permanent, with remedies
+recovery.py   recovery of a damaged journal
 """

@@ -1,8 +1,8 @@
-"""The journal in SQLite: intent, and the event record.
+"""Journal in SQLite: intents and the event record.
 
 One group of records and intents is one transaction. In WAL mode with `synchronous=NORMAL` a
-committed group survives the death of the process at any instant; `full` adds a disk flush for each
-group and survives a power failure too.
+committed group survives a kill of the process at any instant. With `FULL`, each commit flushes the
+disk, so the group also survives a power failure.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record, StoredRecord
 
 #: Version of the tables; a file with another version is refused.
 SCHEMA: Final = 1
@@ -33,9 +33,9 @@ CREATE TABLE IF NOT EXISTS intent (
 ) WITHOUT ROWID;
 """
 
-#: Milliseconds for which a write waits while another program holds the file.
+#: Milliseconds for which a write waits while another program has locked the file.
 _PATIENCE_MS: Final = 200
-#: Excess of records at which old ones are deleted.
+#: Number of new records after which old ones are deleted.
 _PRUNE_EVERY: Final = 1000
 
 
@@ -43,14 +43,14 @@ class SqliteJournal:
     """Intents and events in one SQLite file.
 
     Args:
-        path: of the file; file and folder are created where missing.
+        path: path of the file; a missing file or folder is created.
         sync: "normal" or "full".
-        keep_events: newest records kept.
-        wall: unix time, seconds.
+        keep_events: number of the newest records that are not deleted.
+        wall: returns the unix time in seconds.
 
     Raises:
         JournalError: the file is damaged, of another version, in use by another master, or the
-            disk is full; the message says what to do.
+            disk is full; the message has the remedy.
     """
 
     def __init__(
@@ -73,7 +73,8 @@ class SqliteJournal:
             lambda: self._database.execute("SELECT max(sequence) FROM record").fetchone()
         )
         self._sequence = int(newest[0] or 0)
-        self._since_pruned = 0
+        # The first write prunes, because short runs would add up to any number of records.
+        self._since_pruned = _PRUNE_EVERY
 
     def _open(self, sync: str) -> sqlite3.Connection:
         if self._path.is_file() and not self._path.stat().st_size:
@@ -84,7 +85,7 @@ class SqliteJournal:
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version not in (0, SCHEMA):
             raise other_version(self._path, version, SCHEMA)
-        # 0.14 s for 100,000 events, where quick_check takes 0.09 s and misses damaged indexes.
+        # 0.14 s for 100,000 events; quick_check takes 0.09 s, but does not find damaged indexes.
         (verdict,) = database.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
             raise sqlite3.DatabaseError(verdict)
@@ -106,7 +107,7 @@ class SqliteJournal:
 
     @property
     def last_sequence(self) -> int:
-        """Sequence of the newest record; 0: there is none."""
+        """Return the sequence of the newest record; 0: there is none."""
         return self._sequence
 
     def write(
@@ -115,7 +116,7 @@ class SqliteJournal:
         """Append records and replace intents in one atomic group.
 
         Raises:
-            JournalBlocked: a failure that may pass; nothing was changed, and a retry is safe.
+            JournalBlocked: a temporary failure; nothing was changed, and a retry is safe.
             JournalError: the file is damaged.
         """
         wall = self._wall()
@@ -130,7 +131,7 @@ class SqliteJournal:
         return stored
 
     def _prune(self) -> None:
-        """Delete old records; ignore a failure, because the next call tries again."""
+        """Delete old records; ignore a failure, because the next call deletes them."""
         self._since_pruned = 0
         oldest = self._sequence - self._keep
         with contextlib.suppress(sqlite3.Error):
@@ -190,7 +191,7 @@ class SqliteJournal:
         if process:
             where.append("process = ?")
             matched.append(process)
-        if host:  # or a migration from it, matched as text, because damaged facts are no JSON
+        if host:  # also a migration from it, matched as text, because damaged facts are no JSON
             where.append("(host = ? OR instr(facts, ?))")
             matched += [host, f'"from": {json.dumps(host)}']
         rows = self._guarded(
@@ -212,12 +213,12 @@ class SqliteJournal:
             raise fault_of(self._path, sqlite3.DatabaseError(str(error))) from error
 
     def close(self) -> None:
-        """Flush and release the files."""
+        """Flush and close the files."""
         self._guarded(self._database.close)
 
 
 def _facts(text: str) -> Mapping[str, Any]:
-    """Return a record's facts; damaged ones as text, so that the other records stay readable."""
+    """Return a record's facts; damaged facts as text, so that other records stay readable."""
     try:
         facts = json.loads(text)
     except ValueError:

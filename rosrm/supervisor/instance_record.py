@@ -22,15 +22,13 @@ from typing import Any, Final
 from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
-from rosrm.supervisor import json_lines, messages, paths, procfs
+from rosrm.supervisor import atomic_file, json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
 
 VERSION: Final = 1
 #: The file is compacted beyond this size, and beyond this multiple of its size after the last time.
 COMPACT_BYTES: Final = 1 << 20
 COMPACT_FACTOR: Final = 4
-
-_APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
 
 
 class InstanceRecordError(Exception):
@@ -223,16 +221,7 @@ class InstanceRecord:
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._size)
 
     def _replace(self, text: bytes) -> None:
-        new = f"{self._path}.new"
-        file = os.open(new, _APPEND | os.O_TRUNC, 0o600)
-        try:
-            view = memoryview(text)
-            while view:
-                view = view[os.write(file, view) :]
-            os.replace(new, self._path)
-        except OSError:
-            os.close(file)
-            raise
+        file = atomic_file.replace(self._path, text, os.O_APPEND)
         if self._file >= 0:
             os.close(self._file)
         self._file = file
@@ -240,7 +229,8 @@ class InstanceRecord:
     def _open_old(self) -> None:
         """Keep using the existing record, behind a tail that may be torn."""
         if self._file < 0:
-            self._file = os.open(self._path, _APPEND, 0o600)
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+            self._file = os.open(self._path, flags, 0o600)
             self._waiting.insert(0, b"\n")
 
     def _add(self, fields: Mapping[str, Any]) -> None:

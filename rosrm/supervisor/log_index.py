@@ -17,6 +17,8 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from rosrm.supervisor import atomic_file
+
 if TYPE_CHECKING:
     from typing_extensions import Self
 
@@ -61,13 +63,7 @@ def size(log: str) -> int:
 
 def begin(log: str, mark: Mark, rest: bytes = b"") -> None:
     """Replace the index of a log file, as a whole."""
-    new = f"{path_of(log)}.new"
-    index = os.open(new, os.O_WRONLY | os.O_TRUNC | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        os.write(index, _RECORD.pack(*mark) + rest)
-    finally:
-        os.close(index)
-    os.replace(new, path_of(log))
+    os.close(atomic_file.replace(path_of(log), _RECORD.pack(*mark) + rest))
 
 
 def base(log: str) -> int | None:

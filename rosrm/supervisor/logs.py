@@ -55,15 +55,22 @@ class LogKeeper:
         self._folder = LogFolder(state)
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
-        """Open the log of a starting instance; make room, but keep logs of `known` instances."""
+        """Open the log of a starting instance; make room, but keep logs of `known` instances.
+
+        Raises:
+            OSError: the log cannot be opened. An old log that cannot be removed prevents no start.
+        """
         log = os.open(
             paths.log_file(self._state, *instance),
             os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC,
             0o600,
         )
         self._opened[instance] = os.fstat(log).st_size
-        self._folder.add(instance, known, self.limits)
-        self._folder.remove_old_processes(known, self.limits)
+        try:
+            self._folder.add(instance, known, self.limits)
+            self._folder.remove_old_processes(known, self.limits)
+        except OSError as error:
+            own_log.write(f"an old log cannot be removed: {error}")
         return log
 
     def watch(self, instance: Key, now: float, started: int = 0) -> None:

@@ -25,8 +25,8 @@ def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> B
     host's stored reading stale.
 
     Returns:
-        (N,) True where a reading was refused: an unknown or former host, NaN, a negative or absurd
-        value, a sequence that is far ahead.
+        (N,) True where a reading was refused: unknown host, former run of its slave, a value that
+        is NaN, negative or above `ABSURD_USAGE`, or a sequence that is far ahead.
     """
     columns = readings.host_id - 1
     known = (columns >= 0) & (columns < len(table))
@@ -79,7 +79,7 @@ def _store(
         table.usage[rows[used], where] = usage[used]
         table.limit[rows[used], where] = limit[used]
     np.add(table.usage, table.load, out=table.busy)
-    if stale.any():  # only a resource with a limit closes a host when its probe is late
+    if stale.any():  # a stale reading excludes the host only if the resource has a limit
         stale = stale & ((limit < 1.0) * _SLOT_BITS).sum(axis=1, dtype=np.uint32)
     table.stale[at] = stale
     table.accepting[at] = readings.accepting[good]
