@@ -126,3 +126,12 @@ def test_a_beat_after_a_long_silence_counts(ledger: ReadingStats) -> None:
     assert ledger.beat[1] == 101 * 10**9
     ledger.take(runs((1, 42, 1), beat=7), 100.1)
     assert ledger.beat[1] == 7
+
+
+def test_beats_far_ahead_count_after_a_suspension(ledger: ReadingStats) -> None:
+    """The machine of the master was suspended for an hour, and its clock stood still."""
+    ledger.take(runs((1, 40, 1), beat=10**9), 0.0)
+    for cycle in range(1, 17):
+        beat = 3601 * 10**9 + cycle * 2 * 10**8
+        ledger.take(runs((1, 40 + cycle, 1), beat=beat), 0.2 * cycle)
+        assert ledger.beat[1] == (beat if cycle >= 16 else 10**9)
