@@ -394,6 +394,7 @@ def test_huge_messages_are_refused(cluster, stranger) -> None:
 def test_the_younger_of_two_masters_stops(make_cluster) -> None:
     """The older one proves itself by its answer to a handshake."""
     cluster = make_cluster()
+    cluster.client.list()  # from here on it runs, and has looked for another master
     incarnation = 99
 
     def answer(request, open_request) -> None:
