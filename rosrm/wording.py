@@ -99,6 +99,19 @@ def sendable(text: str) -> str:
     return text.encode(errors="replace").decode()
 
 
+def printable(text: str, most: int = 4096) -> str:
+    """Return a text without control characters, which a terminal would execute, and not too long.
+
+    Args:
+        text: by any sender.
+        most: letters.
+    """
+    cut = text if len(text) <= most else f"{text[: most - 1]}…"
+    if cut.isprintable():
+        return cut
+    return "".join(one if one.isprintable() else " " if one.isspace() else "?" for one in cut)
+
+
 def words(name: str) -> str:
     """Return the name of a state or kind without underscores."""
     return name.replace("_", " ")

@@ -16,6 +16,13 @@ Drawn = st.SearchStrategy[Any]
 _LETTERS: Final = st.characters(codec="utf-8", exclude_characters="\0")
 WORDS: Final = st.text(_LETTERS, max_size=12)
 NAMES: Final = st.text(_LETTERS, min_size=1, max_size=12)
+#: Names that a host, a process and a resource may have.
+PROPER_NAMES: Final = st.from_regex(r"[A-Za-z][A-Za-z0-9_.-]{0,11}", fullmatch=True)
+#: Texts that a terminal shows as they are.
+PRINTABLE: Final = st.text(
+    st.characters(codec="utf-8", categories=("L", "N", "P", "S")), max_size=12
+)
+_NAMESPACES: Final = st.from_regex(r"(/[A-Za-z_][A-Za-z0-9_]{0,5}){0,3}", fullmatch=True)
 _PLAIN: Final = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | WORDS,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=3),
@@ -25,14 +32,17 @@ _INT32: Final = st.integers(-(2**31), 2**31 - 1)
 _BY_TYPE: Final[Mapping[Any, Drawn]] = {
     str: WORDS,
     int: st.integers(0, 2**31 - 1),
-    float: st.floats(0.0, 1e18),
+    float: st.floats(0.0, 3e8),
     str | None: st.none() | NAMES,
     Any: _PLAIN,
 }
 #: Fields with another range than other fields of their type.
 _BY_NAME: Final[Mapping[str, Drawn]] = {
-    "name": NAMES,
-    "process": NAMES,
+    "name": PROPER_NAMES,
+    "process": PROPER_NAMES,
+    "namespace": _NAMESPACES,
+    "needs": st.dictionaries(PROPER_NAMES, st.floats(0.0, 1e18), max_size=3),
+    "message": PRINTABLE,
     "priority": _INT32,
     "exit_code": _INT32,
     "number": st.integers(0, 2**64 - 1),

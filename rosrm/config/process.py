@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.model.description_checks import is_namespace
 from rosrm.model.values import (
     EMPTY,
     Health,
@@ -195,7 +196,6 @@ def flattened(parameters: Mapping[str, Any], before: str = "") -> Iterator[tuple
 _NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
 _TOPIC: Final = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _LIFECYCLE: Final = ("unconfigured", "inactive", "active", "finalized")
-_NAMESPACE: Final = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROS_ONLY: Final = ("namespace", "parameters", "remappings")
 
 
@@ -292,7 +292,7 @@ def _about_node(spec: ProcessSpec) -> Iterator[Complaint]:
         allowed = "at most 200 letters, digits and '_', the first of them not a digit"
         text = f"{spec.name!r} cannot be the name of a ROS node. Allowed: {allowed}"
         yield Complaint(("name",), text)
-    if spec.namespace and not _NAMESPACE.fullmatch(spec.namespace):
+    if spec.namespace and not is_namespace(spec.namespace):
         text = f"{spec.namespace!r} is not an absolute namespace such as '/robot1'"
         yield Complaint(("namespace",), text)
     for name, value in spec.parameters.items():

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from rosrm.config.documents import Node, Place, Problems
 from rosrm.extensions.units import ANY_AMOUNT, amount_of
-
-_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
+from rosrm.model.description_checks import name_fault
 
 
 def check_name(node: Node | None, what: str, problems: Problems) -> None:
     """Note a name that is not allowed in file names and topics."""
-    if node is None or not isinstance(node.value, str) or _NAME.fullmatch(node.value):
+    if node is None or not isinstance(node.value, str):
         return
-    problems.add(
-        node.place,
-        f"{node.value!r} cannot be the name of a {what}. Allowed: at most 200 letters, digits, "
-        "'_', '-' and '.', the first of them a letter, digit or '_'",
-    )
+    fault = name_fault(node.value, what)
+    if fault:
+        problems.add(node.place, fault)
 
 
 def refuse_namesakes(nodes: Sequence[Node], what: str, problems: Problems) -> None:

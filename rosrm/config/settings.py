@@ -110,9 +110,11 @@ class QueueSettings:
 
     Attributes:
         backfill: True: processes may be placed before an earlier one that waits for room.
+        max_processes: most processes that have not ended; more are refused.
     """
 
     backfill: bool = _CORE.backfill
+    max_processes: PositiveCount = _CORE.max_processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,6 +206,7 @@ class ClusterConfig:
         record: recording of all events that the master receives, for replay.
         checkpoint: policy that places replicas of snapshots on other hosts, if any.
         delivery_timeout: seconds within which a slave must accept an assignment.
+        max_hosts: most hosts, also of those that left or are lost; more are refused.
     """
 
     name: str = "rosrm"
@@ -219,6 +222,7 @@ class ClusterConfig:
     record: RecordSettings = field(default_factory=RecordSettings)
     checkpoint: CheckpointPolicySettings = field(default_factory=CheckpointPolicySettings)
     delivery_timeout: PositiveSeconds = _CORE.delivery_timeout
+    max_hosts: PositiveCount = _CORE.max_hosts
 
     def __post_init__(self) -> None:
         """Set the default of the state directory, which depends on the name."""
@@ -241,6 +245,8 @@ class ClusterConfig:
             automatic=self.migration.automatic,
             order_retry=self.control.order_retry,
             keep_ended=self.journal.keep_ended,
+            max_hosts=self.max_hosts,
+            max_processes=self.queue.max_processes,
         )
 
     def to_json(self) -> str:

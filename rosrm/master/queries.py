@@ -13,8 +13,11 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.records import StoredRecord
 from rosrm.model.rows import EventRow, Listing, PluginRow
+from rosrm.model.values import LARGEST_NUMBER
 
+#: Events in an answer, if the request names no number, and at most.
 _DEFAULT_EVENTS: Final = 1000
+_MOST_EVENTS: Final = 10_000
 
 
 class MasterQueries:
@@ -65,8 +68,8 @@ class MasterQueries:
 
     def _events(self, request: Any) -> list[EventRow]:
         stored = self._journal.records(
-            after=request.after_sequence, process=request.process, host=request.host,
-            newest=request.max_events or _DEFAULT_EVENTS,
+            after=min(request.after_sequence, LARGEST_NUMBER), process=request.process,
+            host=request.host, newest=min(request.max_events or _DEFAULT_EVENTS, _MOST_EVENTS),
         )  # fmt: skip
         return [_event_row(one) for one in stored]
 

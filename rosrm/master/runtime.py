@@ -272,9 +272,9 @@ class MasterRuntime:
         self._endpoint.poll_readings()
         self._endpoint.links.expire(now)
         self._endpoint.events.append(happened.TimePassed())
-        rival = self._endpoint.rival
+        self._endpoint.rivals.expire(now)
+        rival = self._endpoint.rivals.take_found()
         if rival is not None:
-            self._endpoint.rival = None
             self._judge_rival(rival, now)
 
     def _judge_rival(self, rival: Any, now: float) -> None:
@@ -285,7 +285,7 @@ class MasterRuntime:
         older_by = now - self._started - rival.uptime
         if abs(older_by) < _AT_ONCE:
             older_by = self._endpoint.incarnation - rival.incarnation
-        if older_by > 0:
+        if not older_by <= 0.0:  # also for a rival whose uptime is no number
             return
         reason = (
             f"refused: a master runs already: {rival.name!r}, pid {rival.pid} on {rival.hostname}"

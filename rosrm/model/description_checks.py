@@ -8,9 +8,39 @@ from typing import Final
 
 from rosrm.model.values import RESOURCE_SLOTS, HostDescription, ResourceDescription
 
+_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
+_NAMESPACE: Final = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
+_LONGEST_NAMESPACE: Final = 255
 _RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
+#: Seconds: the longest period of readings.
+_LONGEST_PERIOD: Final = 3600.0
 #: Examples of fields in the description of a resource.
 _EXAMPLES: Final = {"unit": '"B", "core", "B/s" or "1"', "scope": '"machine"'}
+
+
+def name_fault(name: str, what: str) -> str:
+    """Return why a text cannot be a name, which becomes a part of files and topics; "" if it can.
+
+    Args:
+        name: the text.
+        what: "host", "process", "cluster".
+    """
+    if _NAME.fullmatch(name):
+        return ""
+    return (
+        f"{name!r:.250} cannot be the name of a {what}. Allowed: at most 200 letters, digits, "
+        "'_', '-' and '.', the first of them a letter, digit or '_'"
+    )
+
+
+def is_namespace(text: str) -> bool:
+    """Return True for an absolute ROS namespace such as "/robot1"."""
+    return len(text) <= _LONGEST_NAMESPACE and _NAMESPACE.fullmatch(text) is not None
+
+
+def is_resource_name(name: str) -> bool:
+    """Return True for a name that a resource may have."""
+    return _RESOURCE_NAME.fullmatch(name) is not None
 
 
 def description_fault(description: HostDescription) -> str:
@@ -18,6 +48,9 @@ def description_fault(description: HostDescription) -> str:
     resources = description.resources
     if not description.name:
         return "a host needs a name"
+    fault = name_fault(description.name, "host")
+    if fault:
+        return fault
     if not description.incarnation:
         return f"{description.name}: the incarnation of a slave is not 0"
     if len(resources) > RESOURCE_SLOTS:
@@ -25,6 +58,17 @@ def description_fault(description: HostDescription) -> str:
     names = [resource.name for resource in resources]
     if len(set(names)) < len(names):
         return f"{description.name} names a resource twice: {', '.join(names)}"
+    if not 0.0 < description.period <= _LONGEST_PERIOD:
+        return (
+            f"{description.name} reports every {description.period} s; allowed: above 0, at most "
+            f"{_LONGEST_PERIOD:g}"
+        )
+    words = (description.hostname, description.software_version, *description.executors,
+             *description.absent,
+             *description.labels, *description.labels.values())  # fmt: skip
+    unprintable = next((word for word in words if not word.isprintable()), None)
+    if unprintable is not None:
+        return f"{description.name} has {unprintable!r:.200} in its description: no printable text"
     fault = next(filter(None, map(resource_fault, resources)), "")
     return fault and f"{description.name} {fault}"
 
@@ -34,14 +78,14 @@ def resource_fault(resource: object) -> str:
     if not isinstance(resource, ResourceDescription):
         return f"describes a resource by {resource!r}, which is not a ResourceDescription"
     name: object = resource.name
-    if not (isinstance(name, str) and _RESOURCE_NAME.fullmatch(name)):
+    if not (isinstance(name, str) and is_resource_name(name)):
         return (
             f"names a resource {name!r}. Allowed: at most 64 letters, digits, '_', '-' and '.', "
             "the first of them a letter"
         )
     for field in ("unit", "scope"):
         word: object = getattr(resource, field)
-        if not isinstance(word, str):
+        if not (isinstance(word, str) and word.isprintable()):
             return f"gives {name!r} the {field} {word!r}; text is required, as {_EXAMPLES[field]}"
     capacity: object = resource.capacity
     numeric = isinstance(capacity, (int, float)) and not isinstance(capacity, bool)

@@ -16,10 +16,12 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.errors import Refused
+from rosrm.ros.bounds import MOST_LETTERS, check_bounds
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.version import PROTOCOL_VERSION
 from rosrm.wording import sendable
-from rosrm_msgs.msg import Answer, Envelope
+from rosrm_msgs.msg import Answer, Envelope, MasterBeat
+from rosrm_msgs.srv import Handshake
 
 #: Ids that are remembered at least, for late repetitions, and at most. An id is never forgotten
 #: while a copy of its request is young enough to be admitted.
@@ -45,16 +47,22 @@ def version_refusal(version: int, who: str) -> str:
 def accepted(message: str = "", epoch: int = 0) -> Answer:
     """Return the answer to a request that was carried out."""
     return Answer(
-        protocol_version=PROTOCOL_VERSION, accepted=True, message=sendable(message), epoch=epoch
-    )
+        protocol_version=PROTOCOL_VERSION, accepted=True,
+        message=sendable(message)[:MOST_LETTERS], epoch=epoch,
+    )  # fmt: skip
 
 
 def refused(code: str, message: str, epoch: int = 0) -> Answer:
     """Return the answer to a request that changed nothing."""
     return Answer(
-        protocol_version=PROTOCOL_VERSION, accepted=False, code=code, message=sendable(message),
-        epoch=epoch,
+        protocol_version=PROTOCOL_VERSION, accepted=False, code=code,
+        message=sendable(message)[:MOST_LETTERS], epoch=epoch,
     )  # fmt: skip
+
+
+def master_identity(message: MasterBeat | Handshake.Response) -> tuple[str, int, int]:
+    """Return the identity of a master, as far as a greeting contains it, too."""
+    return message.hostname, message.pid, message.epoch
 
 
 def check_answer(answer: Answer, who: str) -> None:
@@ -202,6 +210,12 @@ class ControlServer:
         self._participant.serve(service_type, name, take)
 
 
+def _bounded(response: Any) -> Any:
+    """Return a received response; raise `Refused` for one that exceeds its bounds."""
+    check_bounds(response)
+    return response
+
+
 @dataclass(slots=True)
 class Call:
     """A request without an answer yet.
@@ -252,7 +266,7 @@ class ControlClient:
         if call in self._calls:
             self._calls.remove(call)
             guard = self.participant.guard
-            if guard.call(lambda: call.done(call.future.result())):
+            if guard.call(lambda: call.done(_bounded(call.future.result()))):
                 guard.call(call.done, None)  # an unusable response counts as none
 
     def expire(self, now: float) -> None:

@@ -4,18 +4,34 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from functools import cache, partial
 from operator import attrgetter
 from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 from rosrm.errors import Refused
 from rosrm.model import values
+from rosrm.model.description_checks import (
+    description_fault,
+    is_namespace,
+    is_resource_name,
+    name_fault,
+)
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
-from rosrm.wording import sendable
+from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
+from rosrm.wording import printable, sendable
 from rosrm_msgs import msg
 
-_INFINITE: Final = float("inf")
+#: Greatest amount of a resource that a process may need, in base units.
+_MOST_NEEDED: Final = 1e18
+#: Greatest factor by which the delay of restarts may grow.
+_MOST_GROWTH: Final = 1e6
+#: Greatest values in the status of an instance, in base units.
+_MOST_REPORTED: Final = {
+    "peak_memory": values.MOST_USED["memory"],
+    "cpu_time": values.LONGEST_TIME * values.MOST_USED["cpu"],
+    "run_time": values.LONGEST_TIME,
+}
 _STATES: Final = frozenset(state.value for state in values.InstanceState)
 
 # --- pairs, instances, JSON -------------------------------------------------------------------
@@ -136,7 +152,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     """Return the inverse of `spec_to_msg`; raises `Refused` for an invalid spec."""
     fault = _spec_fault(message)
     if fault:
-        raise Refused(f"process {message.name!r}: {fault}")
+        raise Refused(f"process {message.name!r:.60}: {fault}")
     return _from_msg(
         values.ProcessSpec, message,
         parameters={
@@ -153,20 +169,36 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
 
 def _spec_fault(message: msg.ProcessSpec) -> str:
     """Return a fault that rosrm's own clients would not send, though others might; "": none."""
+    fault = _name_fault(message) or _size_fault(message)
+    if fault:
+        return fault
     forms = [bool(message.package), bool(message.module), bool(message.command)]
-    if not message.name:
-        return "it has no name"
     if sum(forms) != 1:
         return "give exactly one of package + executable, module, command"
     if bool(message.package) != bool(message.executable):
         return "package and executable go together"
-    fault = _word_fault(message)
-    if fault:
-        return fault
+    return _word_fault(message) or _needs_fault(message) or _times_fault(message)
+
+
+def _name_fault(message: msg.ProcessSpec) -> str:
+    namespace = message.ros_namespace
+    if namespace and not is_namespace(namespace):
+        return f"{namespace!r:.250} is not an absolute namespace such as '/robot1'"
+    return name_fault(message.name, "process")
+
+
+def _size_fault(message: msg.ProcessSpec) -> str:
+    size = check_bounds(message)
+    return f"its texts have {size} letters; at most {LARGEST_SPEC}" if size > LARGEST_SPEC else ""
+
+
+def _needs_fault(message: msg.ProcessSpec) -> str:
     for need in message.needs:
-        if not 0.0 <= need.amount < _INFINITE:
-            return f"it needs {need.amount} of {need.resource}; allowed: 0 and more"
-    return _times_fault(message)
+        if not is_resource_name(need.resource):
+            return f"it needs {need.resource!r:.100}, which is no name of a resource"
+        if not 0.0 <= need.amount <= _MOST_NEEDED:
+            return f"it needs {need.amount} of {need.resource}; allowed: 0 to {_MOST_NEEDED:g}"
+    return ""
 
 
 def _word_fault(message: msg.ProcessSpec) -> str:
@@ -197,8 +229,8 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "health.timeout": message.health.timeout,
     }
     for name, seconds in times.items():
-        if not 0.0 <= seconds < _INFINITE:
-            return f"{name} is {seconds}; allowed: 0 and more"
+        if not 0.0 <= seconds <= values.LONGEST_TIME:
+            return f"{name} is {seconds}; allowed: 0 to {values.LONGEST_TIME:g}"
     return ""
 
 
@@ -219,11 +251,14 @@ def _restart_fault(message: msg.RestartPolicy) -> str:
     allowed = get_args(values.RestartCondition)
     if message.when not in allowed:
         return f"restart {message.when!r}; allowed: {', '.join(allowed)}"
-    if not 1.0 <= message.factor < _INFINITE:
-        return f"the factor of its restarts is {message.factor}; allowed: 1 and more"
+    if not 1.0 <= message.factor <= _MOST_GROWTH:
+        return f"the factor of its restarts is {message.factor}; allowed: 1 to {_MOST_GROWTH:g}"
     for name in ("delay", "max_delay", "window"):
-        if not 0.0 <= getattr(message, name) < _INFINITE:
-            return f"restart.{name} is {getattr(message, name)} s; allowed: 0 and more"
+        if not 0.0 <= getattr(message, name) <= values.LONGEST_TIME:
+            return (
+                f"restart.{name} is {getattr(message, name)} s; allowed: 0 to "
+                f"{values.LONGEST_TIME:g}"
+            )
     return ""
 
 
@@ -250,8 +285,8 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
 
 def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
     """Return the inverse of `assignment_to_msg`; raises `Refused`."""
-    for name in ("fence_after", "fence_grace"):
-        if not 0.0 <= getattr(message, name) < _INFINITE:
+    for name in ("fence_after", "fence_grace"):  # a lease and a delay, each at most this long
+        if not 0.0 <= getattr(message, name) <= 2.0 * values.LONGEST_TIME:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
     fence = None
     if message.fence_after:
@@ -279,17 +314,14 @@ def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
     """Return the inverse of `host_to_msg`; raises `Refused` for an invalid host."""
     resources = sorted(message.resources, key=lambda resource: int(resource.slot))
     if [resource.slot for resource in resources] != list(range(len(resources))):
-        raise Refused(f"host {message.name!r}: its resources do not fill the slots 0, 1, 2, …")
-    if len(resources) > values.RESOURCE_SLOTS or not message.name or not message.incarnation:
-        raise Refused(f"host {message.name!r}: no name, no incarnation or too many resources")
-    for resource in resources:
-        if not 0.0 < resource.capacity < _INFINITE:
-            raise Refused(
-                f"host {message.name!r}: {resource.name} has capacity {resource.capacity}"
-            )
-    if not 0.0 < message.period < _INFINITE:
-        raise Refused(f"host {message.name!r}: it reports every {message.period} s")
-    return _description(message, resources)
+        raise Refused(f"host {message.name!r:.250}: its resources do not fill the slots 0, 1, 2, …")
+    described = _description(message, resources)
+    absent = {probe: printable(reason) for probe, reason in described.absent.items()}
+    description = replace(described, absent=absent)
+    fault = description_fault(description)
+    if fault:
+        raise Refused(fault)
+    return description
 
 
 def _description(
@@ -301,17 +333,24 @@ def _description(
 
 def status_to_msg(status: values.InstanceStatus) -> msg.ProcessStatus:
     """Return an instance's status as a message."""
-    return _to_msg(msg.ProcessStatus, status, message=sendable(status.message))
+    return _to_msg(msg.ProcessStatus, status, message=sendable(status.message)[:MOST_LETTERS])
 
 
 def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
     """Return the inverse of `status_to_msg`; raises `Refused` for an invalid status."""
+    process = message.instance.process
     if message.state not in _STATES:
-        raise Refused(f"unknown state {message.state!r} of {message.instance.process}")
-    for name in ("peak_memory", "cpu_time", "run_time"):
-        if not 0.0 <= getattr(message, name) < _INFINITE:
-            raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
-    return _from_msg(values.InstanceStatus, message)
+        raise Refused(f"unknown state {message.state!r:.100} of {process!r:.250}")
+    fault = name_fault(process, "process")
+    if fault:
+        raise Refused(fault)
+    for name, most in _MOST_REPORTED.items():
+        if not 0.0 <= getattr(message, name) <= most:
+            raise Refused(f"{process}: {name} is {getattr(message, name)}; at most {most:g}")
+    lines = message.message.split("\n")
+    return _from_msg(
+        values.InstanceStatus, message, message="\n".join(printable(line) for line in lines)
+    )
 
 
 def snapshot_to_msg(kept: values.SnapshotReport) -> msg.KeptState:
@@ -323,7 +362,10 @@ def snapshot_to_msg(kept: values.SnapshotReport) -> msg.KeptState:
 
 
 def snapshot_from_msg(message: msg.KeptState) -> values.SnapshotReport:
-    """Return the inverse of `snapshot_to_msg`."""
+    """Return the inverse of `snapshot_to_msg`; raises `Refused` for an invalid name."""
+    fault = name_fault(message.process, "process")
+    if fault:
+        raise Refused(fault)
     instance = values.InstanceId(message.process, message.number)
     return values.SnapshotReport(instance, message.sequence, message.size)
 
@@ -368,7 +410,10 @@ def host_row_from_msg(message: msg.HostState) -> HostRow:
 def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
     """Return a row of `rosrm ps` as a message."""
     known = row.exit_code is not None
-    return _to_msg(msg.ProcessState, row, exit_code=row.exit_code or 0, exit_code_known=known)
+    return _to_msg(
+        msg.ProcessState, row, exit_code=row.exit_code or 0, exit_code_known=known,
+        reason=row.reason[:MOST_LETTERS],
+    )  # fmt: skip
 
 
 def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
@@ -379,7 +424,7 @@ def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
 
 def plugin_row_to_msg(row: PluginRow) -> msg.PluginState:
     """Return a row of `rosrm plugins` as a message."""
-    return _to_msg(msg.PluginState, row)
+    return _to_msg(msg.PluginState, row, reason=row.reason[:MOST_LETTERS])
 
 
 def plugin_row_from_msg(message: msg.PluginState) -> PluginRow:
@@ -389,7 +434,9 @@ def plugin_row_from_msg(message: msg.PluginState) -> PluginRow:
 
 def event_to_msg(row: EventRow) -> msg.Event:
     """Return a line of the event record as a message."""
-    return _to_msg(msg.Event, row, data=json.dumps(dict(row.facts)))
+    return _to_msg(
+        msg.Event, row, data=json.dumps(dict(row.facts)), message=row.message[:MOST_LETTERS]
+    )
 
 
 def event_from_msg(message: msg.Event) -> EventRow:

@@ -15,6 +15,7 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import Listing, LogPart
 from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names, qos
+from rosrm.ros.bounds import check_bounds
 from rosrm.ros.control import ControlClient, check_answer
 from rosrm.ros.participant import Participant
 from rosrm.version import PROTOCOL_VERSION, __version__
@@ -64,7 +65,9 @@ class _Answers:
     sent: int = 0
 
     def take(self, future: Any) -> None:
-        self.first = self.first or (future.result(),)
+        answer = future.result()
+        check_bounds(answer)
+        self.first = self.first or (answer,)
 
     @property
     def answer(self) -> Any:
@@ -347,7 +350,9 @@ class MasterClient:
         """Send a request until an answer comes; the receiver repeats a lost answer.
 
         Every request may be repeated: it only reads, or carries an id by which it is recognised.
+        One that exceeds its bounds is not sent: `Refused` names the field.
         """
+        check_bounds(request)
         client = self._client(kind, path, who)
         deadline = time.monotonic() + self._timeout
         answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from rosrm.errors import Refused
+from rosrm.model.description_checks import name_fault
 from rosrm.model.orders import (
     DropReplica,
     FenceInstance,
@@ -19,7 +20,7 @@ from rosrm.model.orders import (
     StartInstance,
     StopInstance,
 )
-from rosrm.model.values import InstanceId
+from rosrm.model.values import LONGEST_TIME, InstanceId
 from rosrm.ros import convert
 from rosrm_msgs import srv
 
@@ -64,6 +65,9 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
 def order_from_msg(request: srv.ControlHost.Request) -> Order:
     """Return the inverse of `order_to_msg`; raise `Refused` for an invalid request."""
     instance = convert.instance_from_msg(request.instance)
+    fault = _fault(request)
+    if fault:
+        raise Refused(fault)
     match request.action:
         case _Request.START:
             return StartInstance(convert.assignment_from_msg(request.assignment))
@@ -79,3 +83,13 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
     if request.action not in _OF_INSTANCE:
         raise Refused(f"unknown action {request.action}")
     return _OF_INSTANCE[request.action](instance)
+
+
+def _fault(request: srv.ControlHost.Request) -> str:
+    """Return an impossible name or time in an order; "" for none. Unused fields are empty."""
+    for seconds in (request.timeout, request.keep_every):
+        if not 0.0 <= seconds <= LONGEST_TIME:
+            return f"a time of {seconds} s; allowed: 0 to {LONGEST_TIME:g}"
+    process = request.instance.process
+    faults = [name_fault(host, "host") for host in request.keep_on]
+    return next(filter(None, faults), "") or (process and name_fault(process, "process"))

@@ -21,6 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
+from rosrm.ros.bounds import check_bounds
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.fast_dds import Pace, announcing
 from rosrm.version import PROTOCOL_VERSION
@@ -97,11 +98,14 @@ class Participant:
     # --- the loop ------------------------------------------------------------------------
 
     def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Wrap a callback: `spin` counts its calls to notice activity, and it raises nothing."""
+        """Wrap a callback: `spin` counts its calls to notice activity, and it raises nothing.
+
+        A message of rosrm that exceeds its bounds is dropped, as one whose callback raises.
+        """
 
         def call(*arguments: Any) -> None:
             self._executed += 1
-            self.guard.call(callback, *arguments)
+            self.guard.call(_call_bounded, callback, *arguments)
 
         return call
 
@@ -142,7 +146,7 @@ class Participant:
         def take(request: Any, header: Any) -> None:
             self._executed += 1
             opened = OpenRequest(send, header)
-            fault = self.guard.call(handle, request, opened)
+            fault = self.guard.call(_call_bounded, handle, request, opened)
             if fault and not opened.answered:
                 self.guard.call(opened.answer, failed_response(service_type, fault))
 
@@ -161,6 +165,13 @@ class Participant:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _call_bounded(callback: Callable[..., None], *arguments: Any) -> None:
+    """Call a callback whose first argument may be a received message; raise `Refused` for size."""
+    for received in arguments[:1]:
+        check_bounds(received)
+    callback(*arguments)
 
 
 def failed_response(service_type: Any, reason: str) -> Any:

@@ -82,9 +82,12 @@ class Shutdown:
             )  # fmt: skip
             return 1 if failure else 0
         live = self.state.live()
-        if live and failure and not self.endpoint.superseded and cause != STOP_ALL:
+        if live and failure and cause != STOP_ALL:
             count = counted(live, "process keeps", "processes keep")
-            _log.error("%s running; correct the error and start the slave again", count)
+            _log.error(
+                "%s running, those with a fence until it expires; correct the error and start the "
+                "slave again", count,
+            )  # fmt: skip
             return 1
         if live:
             count = counted(live, "process", "processes")

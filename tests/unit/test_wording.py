@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.wording import amount, counted, duration, size, standing_for
+from rosrm.wording import amount, counted, duration, printable, size, standing_for
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "no hosts"), (1, "1 host"), (2, "2 hosts")])
@@ -54,3 +54,19 @@ def test_spans_have_at_most_two_units(value, text):
 )  # fmt: skip
 def test_amounts_carry_the_unit_of_their_resource(value, unit, text):
     assert amount(value, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ("plain, with ü and …", "plain, with ü and …"),
+        ("\x1b[31mred\x07", "?[31mred?"),
+        ("\x9b2J of C1", "?2J of C1"),
+        ("two\nlines\tand a tab", "two lines and a tab"),
+        ("a reversed \u202e name", "a reversed ? name"),
+        (30 * "x", 19 * "x" + "…"),
+    ],
+)
+def test_a_text_of_any_sender_has_nothing_that_a_terminal_executes(given: str, text: str) -> None:
+    """Control characters are replaced, and the length is bounded."""
+    assert printable(given, 20 if len(given) == 30 else 100) == text

@@ -20,7 +20,14 @@ from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Pro
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import FenceInstance, Order, ReportInstances, StopInstance
 from rosrm.model.plan import Start
-from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, Kind, RestartPolicy
+from rosrm.model.values import (
+    LARGEST_NUMBER,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    Kind,
+    RestartPolicy,
+)
 from rosrm.wording import standing
 
 #: Phase of a process by the state of its owning instance.
@@ -55,7 +62,10 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     if host is None or state.hosts.condition_of(host) is HostCondition.DETACHED:
         return  # the slave's last message had all instances that it left running
     place = state.hosts.note_statuses(host, event.sequence, now)
-    if place == "late":
+    if place == "far ahead":
+        fault = f"a status batch of {host.name} was refused: sequence {event.sequence} is far ahead"
+        state.record_seldom(host, EventKind.PEER_REFUSED, now, fault)
+    if place in ("late", "far ahead"):
         return
     note_on_host(state, host, event.failing_plugins(), now)
     if event.complete:
@@ -172,8 +182,9 @@ def _handle_unknown_instance(
     if readoption.readopt(state, host, status, now):
         _take_status(state, host, status, now)
         return
-    if status.state.ended:
+    if status.state.ended or status.instance.number >= max(LARGEST_NUMBER, state.next_instance):
         return
+    state.skip_numbers(status.instance.number)
     if status.instance.number in state.instances:  # desired, but on another host
         if status.state is not InstanceState.STOPPING:
             state.send(host, StopInstance(status.instance))

@@ -34,8 +34,8 @@ from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record
-from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
-from rosrm.wording import one_line
+from rosrm.model.values import EMPTY, LARGEST_NUMBER, Assignment, InstanceId, ProcessSpec
+from rosrm.wording import one_line, printable
 
 #: Number of the newest records of a process that `explain` shows.
 _HISTORY: Final = 12
@@ -47,8 +47,10 @@ _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING}
 _MOST_REMOVED: Final = 10_000
 #: Faster than `fields_to_plain`: each decision waits until its process is saved.
 _journaled_of: Final = attrgetter(*JOURNALED)
-#: Exclusive upper bound of instance numbers and record sequences.
-_LARGEST: Final = 2**53
+#: Most letters of the message of a record.
+_LONGEST_RECORD: Final = 10_000
+#: Seconds between two records of the same kind about the same host.
+RECORD_PERIOD: Final = 10.0
 
 
 @dataclass(slots=True)
@@ -64,7 +66,7 @@ class JournalGap:
         records_missing: True if records are lost, until one lease after the start.
     """
 
-    newest: int = _LARGEST
+    newest: int = LARGEST_NUMBER
     started: float = 0.0
     machine_rebooted: bool = False
     lost: int = 0
@@ -136,6 +138,8 @@ class MasterState:
         self.held_since = inf
         self.journal_gap = JournalGap()
         self.missing_since: dict[int, float] = {}
+        self.stranger_refused_at = -inf
+        self.ahead_since: dict[int, tuple[float, int]] = {}
         self.reviewed = -inf
         self.demands: dict[Any, Demand] = {}
         self._out: list[Command] = []
@@ -166,13 +170,19 @@ class MasterState:
         """Write a line of the event record; `by` is the client that requested it."""
         if by:
             message, facts = f"{message} (by {by})", {**facts, "by": by}
-        message = one_line(message)
+        message = printable(one_line(message), _LONGEST_RECORD)
         self.emit(Record(kind, process, host, message, facts))
         known = self.processes.get(process)
         if known is not None:
             known.history.append((now, kind, message))
             if len(known.history) > _HISTORY:
                 del known.history[0]
+
+    def record_seldom(self, host: Host, kind: EventKind, now: float, message: str) -> None:
+        """Write a line about a host, unless one of that kind was written a moment ago."""
+        if now - host.recorded_at.get(kind, -inf) >= RECORD_PERIOD:
+            host.recorded_at[kind] = now
+            self.record(now, kind, message, host=host.name)
 
     def save(self, process: Process) -> None:
         """Persist the desired state of a process, as it stands after the current event."""
@@ -349,7 +359,7 @@ class MasterState:
 
         Instances that have ended since may have had later numbers, so a reserve is skipped too.
         """
-        if self.next_instance <= seen < _LARGEST:
+        if self.next_instance <= seen < LARGEST_NUMBER:
             self.next_instance = seen + _RESERVED
             self._reserve_numbers()  # at once, because no slave may report the number again
 

@@ -117,6 +117,12 @@ def _still_stopping(state: MasterState, name: str) -> str:
 
 
 def _submission_fault(state: MasterState, event: happened.SubmissionReceived) -> str:
+    live, most = len(state.processes) - len(state.terminal), state.settings.max_processes
+    if live + len(event.specs) > most:
+        return (
+            f"{live} processes have not ended, and {len(event.specs)} more would exceed "
+            f"`queue.max_processes` ({most}). Nothing was queued"
+        )
     for spec in event.specs:
         strategy = spec.migration.strategy
         if strategy is not None and strategy not in state.strategies:

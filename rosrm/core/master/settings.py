@@ -25,6 +25,8 @@ class CoreSettings:
         automatic: True: the core evicts processes from hosts that are over a limit.
         order_retry: seconds after which an unanswered order is repeated.
         keep_ended: number of the newest terminal processes that are not garbage-collected.
+        max_hosts: most hosts, also of those that left or are lost.
+        max_processes: most processes that have not ended.
     """
 
     backfill: bool = False
@@ -42,3 +44,5 @@ class CoreSettings:
     automatic: bool = True
     order_retry: float = 2.0
     keep_ended: int = 10_000
+    max_hosts: int = 2_000
+    max_processes: int = 10_000

@@ -13,6 +13,7 @@ from rosrm.core.master.commands import Redeliver, Withdraw
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
+from rosrm.core.master.hosts.registration import review_departures
 from rosrm.core.master.lifecycle import stop_instance
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import evict_from_hosts
@@ -25,6 +26,8 @@ from rosrm.model.orders import ReportInstances
 _REVIEW_EVERY: Final = 0.2
 #: Seconds for which a status batch may be missing before the slave must report all statuses.
 _PATIENCE: Final = 1.0
+#: Periods of its readings in which a host reports a status batch that it has sent.
+_READINGS_LATE: Final = 3
 
 
 def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> None:
@@ -35,10 +38,12 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     state.reviewed = now
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
+    review_departures(state, now)
     review_lost_hosts(state, now)
     journal_gap.review(state, now)
     review_standbys(state, now)
     _ask_for_missing_statuses(state, now)
+    _review_forged_batches(state, now)
     capabilities.ask_hosts(state, now)
     images.review(state, now)
     evict_from_hosts(state, now)
@@ -106,3 +111,19 @@ def _ask_for_missing_statuses(state: MasterState, now: float) -> None:
         if now - since >= _PATIENCE:
             state.missing_since[column] = now
             state.send(state.hosts.hosts[column], ReportInstances())
+
+
+def _review_forged_batches(state: MasterState, now: float) -> None:
+    """Ask a host for all statuses if its readings do not know the newest status batch.
+
+    Another sender has sent that batch, and its sequence hides the batches that the host sends.
+    """
+    table, since = state.hosts, state.ahead_since
+    for column in [one for one, (_, batch) in since.items() if table.reported[one] >= batch]:
+        del since[column]
+    for column in map(int, table.statuses_ahead()):
+        began, _ = since.setdefault(column, (now, int(table.status_sequence[column])))
+        if now - began >= max(_PATIENCE, _READINGS_LATE * float(table.period[column])):
+            del since[column]
+            table.status_sequence[column] = table.reported[column]
+            state.send(table.hosts[column], ReportInstances())

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
+#: Seconds by which a beat may be faster than the fastest one before it. The first one is in the
+#: answer to a handshake, which takes at most a few seconds.
+_FASTER: Final = 10.0
 #: Share by which one monotonic clock may run faster than another: twice the limit of `adjtimex`.
 _DRIFT: Final = 1e-3
 
@@ -25,6 +28,13 @@ class BeatClock:
     def restart(self) -> None:
         """Forget the difference of the clocks, because a new master may have another clock."""
         self._ahead = None
+
+    def is_ahead(self, beat: float, now: float) -> bool:
+        """Return True for a beat that the master cannot have sent yet: another has sent it.
+
+        Such a beat would make all later beats look old, and the fences would stop the processes.
+        """
+        return self._ahead is not None and now - beat < self._ahead - _FASTER
 
     def sent_at(self, beat: float, now: float) -> float:
         """Return the send time of a beat by the slave's clock, in seconds.

@@ -5,7 +5,8 @@ Its parts are in files of their own:
 - `subscriptions.py`: messages published by slaves;
 - `services.py`: requests of slaves and clients;
 - `slave_links.py`: orders to slaves;
-- `handoff.py`: reports and signals of handoffs.
+- `handoff.py`: reports and signals of handoffs;
+- `rivals.py`: another master.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
 from rosrm.ros import names, qos
 from rosrm.ros.master.handoff import HandoffEndpoint
+from rosrm.ros.master.refusals import Refusals
+from rosrm.ros.master.rivals import RivalWatch
 from rosrm.ros.master.services import MasterIdentity, MasterServices, Queries
 from rosrm.ros.master.slave_links import HostLinks
-from rosrm.ros.master.subscriptions import Refusals, SlaveSubscriptions
+from rosrm.ros.master.subscriptions import SlaveSubscriptions
 from rosrm.ros.participant import Participant
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
@@ -38,7 +41,7 @@ class MasterEndpoint:
         links: sends orders and assignments to slaves.
         services: answers requests of slaves and clients.
         handoffs: exchanges messages with nodes of handoffs.
-        rival: newest beat of another master; None: none since the last one was judged.
+        rivals: finds another master.
         incarnation: random number of this run of the master.
     """
 
@@ -49,7 +52,6 @@ class MasterEndpoint:
         self._identity = identity
         self._guard = participant.guard
         self.events: list[happened.Event] = []
-        self.rival: msg.MasterBeat | None = None
         self.incarnation = identity.incarnation
         refuse = Refusals(self.events.append)
         self.links = HostLinks(
@@ -62,26 +64,27 @@ class MasterEndpoint:
         self._subscriptions = SlaveSubscriptions(
             participant, self.links, self.events.append, refuse
         )
+        self.rivals = RivalWatch(
+            participant, identity.name, identity.incarnation,
+            lambda who, reason: refuse("master_beat", who, reason),
+        )  # fmt: skip
         self._open_topics(participant)
         self.services = MasterServices(
             participant, self.links, identity, queries,
-            control=control, handle=self.events.append, refuse=refuse,
+            control=control, own_name=self.rivals.own_name, handle=self.events.append,
+            refuse=refuse,
         )  # fmt: skip
 
     def _open_topics(self, participant: Participant) -> None:
         node, path = participant.node, names.Names(participant.settings.namespace)
         topic = path(names.MASTER_BEAT)
         node.create_subscription(
-            msg.MasterBeat, topic, participant.counted(self._take_beat), qos.BEAT
+            msg.MasterBeat, topic, participant.counted(self.rivals.take_beat), qos.BEAT
         )
         self._beats = node.create_publisher(msg.MasterBeat, topic, qos.BEAT)
         self._loads = node.create_publisher(msg.Event, path(names.MASTER_LOAD), qos.LOAD)
         self._load_at = 0.0
         self._oldest: list[float] = []
-
-    def _take_beat(self, message: msg.MasterBeat) -> None:
-        if message.incarnation != self._identity.incarnation:
-            self.rival = message
 
     def poll_readings(self) -> None:
         """Take new readings, even when no other event occurs; called in every tick."""

@@ -11,6 +11,7 @@ from rosrm.core.master.events import Event, HandoffReported, SourceStranded
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.ros import names, qos
 from rosrm.ros.control import version_refusal
+from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.participant import Participant
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
@@ -26,12 +27,12 @@ class HandoffEndpoint:
     Args:
         cluster: the master's name.
         take: called with each event.
-        refuse: called with a refused peer and the reason.
+        refuse: called with the kind of message, its refused sender and the reason.
     """
 
     def __init__(
         self, participant: Participant, cluster: str, epoch: int, take: Callable[[Event], None],
-        refuse: Callable[[str, str], None],
+        refuse: Refuse,
     ) -> None:  # fmt: skip
         self._participant = participant
         self._names = names.Names(participant.settings.namespace)
@@ -86,7 +87,7 @@ class HandoffEndpoint:
         if not fault and report.phase not in set(ReportPhase):
             fault = f"unknown phase {report.phase}"
         if fault:
-            self._refuse(who, fault)
+            self._refuse("handoff", who, fault)
             return
         self._take(
             HandoffReported(

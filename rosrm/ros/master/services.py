@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
@@ -14,12 +14,17 @@ from rosrm.errors import JournalError, Refused
 from rosrm.model.rows import Listing
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlServer, RequestGate, accepted, refused, version_refusal
+from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.version import PROTOCOL_VERSION, __version__
+from rosrm.wording import printable
 from rosrm_msgs import srv
 
 _Respond = Callable[[Any], None]
+
+#: Most letters of the name of a client or peer in records.
+_LONGEST_PEER: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,18 +53,20 @@ class MasterServices:
 
     Args:
         control: greatest age of a request, and the beat period for slaves.
+        own_name: name under which this master itself asks for a handshake; not answered.
         refuse: receives refused peers, and reasons.
     """
 
     def __init__(
         self, participant: Participant, links: HostLinks, identity: MasterIdentity,
         queries: Queries,
-        *, control: ControlSettings,
-        handle: Callable[[happened.Event], None], refuse: Callable[[str, str], None],
+        *, control: ControlSettings, own_name: str,
+        handle: Callable[[happened.Event], None], refuse: Refuse,
     ) -> None:  # fmt: skip
         self._participant = participant
         self._server = ControlServer(participant, RequestGate(time.monotonic_ns, control.max_age))
         self._identity = identity
+        self._own_name = own_name
         self._queries = queries
         self._beat_period = control.beat_period
         self._links = links
@@ -137,10 +144,12 @@ class MasterServices:
     # --- slaves --------------------------------------------------------------------------
 
     def _take_handshake(self, request: srv.Handshake.Request, open_request: OpenRequest) -> None:
-        who = f"{request.role} {request.name}"
+        if request.role == "master" and request.name == self._own_name:
+            return
+        who = printable(f"{request.role} {request.name}", _LONGEST_PEER)
         fault = version_refusal(request.protocol_version, who)
         if fault:
-            self._refuse(who, fault)
+            self._refuse("handshake", who, fault)
         open_request.answer(
             srv.Handshake.Response(
                 protocol_version=PROTOCOL_VERSION, software_version=__version__,
@@ -271,4 +280,4 @@ def _pruned(request: srv.Prune.Request, token: int) -> happened.Event:
 
 def _requester(request: Any) -> str:
     """Return the name of the client that sent a request, for records."""
-    return str(request.envelope.sender).removeprefix("client ")
+    return printable(request.envelope.sender.removeprefix("client "), _LONGEST_PEER)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign, OrderId, Redeliver, SendOrder, Withdraw
@@ -23,6 +23,9 @@ from rosrm.ros.master.reading_stats import ReadingStats
 from rosrm.ros.orders import order_to_msg
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
+
+#: Most orders and requests that wait for the next reading of one slave.
+_MOST_DEFERRED: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +151,8 @@ class HostLinks:
             self._wait(link, _Deferred(deadline, send, done))
 
     def _wait(self, link: HostLink, order: _Deferred) -> None:
+        if len(link.deferred) >= _MOST_DEFERRED:
+            link.deferred.pop(0).done(None)
         link.deferred.append(order)
         self._waiting.add(link.host_id)
 

@@ -12,33 +12,16 @@ from rosrm.core.master import events as happened
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import version_refusal
+from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLinks
 from rosrm.ros.participant import Participant
 from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
+from rosrm.wording import printable
 from rosrm_msgs import msg
 
-#: Seconds between two records of the same refusal, and most different refusals remembered.
-_REFUSED_EVERY: Final = 10.0
-_MOST_REFUSALS: Final = 1000
-
-
-class Refusals:
-    """Records refused peers, but not ten times a second."""
-
-    def __init__(self, handle: Callable[[happened.Event], None]) -> None:
-        self._handle = handle
-        self._recorded_at: dict[tuple[str, str], float] = {}
-
-    def __call__(self, who: str, reason: str) -> None:
-        """Record a refusal, unless the same one was recorded within the last seconds."""
-        now = time.monotonic()
-        if now - self._recorded_at.get((who, reason), -_REFUSED_EVERY) < _REFUSED_EVERY:
-            return
-        if len(self._recorded_at) >= _MOST_REFUSALS:
-            self._recorded_at.clear()
-        self._recorded_at[who, reason] = now
-        self._handle(happened.PeerRefused(who, reason))
+#: Most letters of the name of a failing plugin.
+_LONGEST_PLUGIN: Final = 200
 
 
 class SlaveSubscriptions:
@@ -51,7 +34,7 @@ class SlaveSubscriptions:
 
     def __init__(
         self, participant: Participant, links: HostLinks, handle: Callable[[happened.Event], None],
-        refuse: Callable[[str, str], None],
+        refuse: Refuse,
     ) -> None:  # fmt: skip
         self._links = links
         self._handle = handle
@@ -79,19 +62,19 @@ class SlaveSubscriptions:
             received = self._links.reading_stats.take(batch.runs, time.monotonic())
             self._links.reading_received(received.tolist())
         for refusal in batch.refusals:
-            self._refuse("resource_info", refusal)
+            self._refuse("resource_info", "resource_info", refusal)
         return batch.readings
 
     def _take_statuses(self, message: msg.ProcessStatusBatch) -> None:
         who = f"process_status of host {message.host_id}"
         fault = version_refusal(message.protocol_version, who)
         if fault:
-            self._refuse(who, fault)
+            self._refuse("process_status", who, fault)
             return
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
         except Refused as refusal:
-            self._refuse(who, str(refusal))
+            self._refuse("process_status", who, str(refusal))
             return
         failing = (_failing(message, one) for one in ("probe", "migration", "launcher"))
         self._handle(
@@ -106,7 +89,7 @@ class SlaveSubscriptions:
         who = f"process_usage of host {message.host_id}"
         fault = version_refusal(message.protocol_version, who)
         if fault or len(sizes) > 1:
-            self._refuse(who, fault or "arrays of different lengths")
+            self._refuse("process_usage", who, fault or "arrays of different lengths")
             return
         self._handle(
             happened.UsagesReceived(
@@ -119,11 +102,19 @@ class SlaveSubscriptions:
         who = f"kept_states of host {message.host_id}"
         fault = version_refusal(message.protocol_version, who)
         if fault:
-            self._refuse(who, fault)
+            self._refuse("kept_states", who, fault)
             return
-        states = tuple(convert.snapshot_from_msg(one) for one in message.states)
+        try:
+            states = tuple(convert.snapshot_from_msg(one) for one in message.states)
+        except Refused as refusal:
+            self._refuse("kept_states", who, str(refusal))
+            return
         self._handle(happened.KeptStatesReceived(message.host_id, message.incarnation, states))
 
 
 def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:
-    return {row.name: row.reason for row in message.failing if row.kind == kind}
+    return {
+        printable(row.name, _LONGEST_PLUGIN): printable(row.reason)
+        for row in message.failing
+        if row.kind == kind
+    }

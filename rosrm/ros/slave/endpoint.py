@@ -20,7 +20,8 @@ from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.values import HostDescription, InstanceStatus, SnapshotReport
 from rosrm.ros import convert, names, qos
-from rosrm.ros.control import Call, ControlClient, version_refusal
+from rosrm.ros.bounds import MOST_LETTERS
+from rosrm.ros.control import Call, ControlClient, master_identity, version_refusal
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave.journal_watermark import JournalWatermark, Watermark
 from rosrm.ros.slave.reporter import Reporter
@@ -47,10 +48,12 @@ _NAME_TAKEN: Final = 5.0
 _NAME_TAKEN_BY_FORMER: Final = 60.0
 #: Seconds for the last statuses to reach the master.
 _ACK_PATIENCE: Final = 2.0
-#: Missed beats after which a master counts as gone; and missed beats before another run without a
-#: newer epoch is accepted: of two masters at once the younger gives way.
+#: Missed beats after which a master counts as gone; and missed beats before another run is
+#: accepted: of two masters at once the younger gives way, and a beat alone proves no master.
 _MISSED_BEATS: Final = 10
 _MISSED_BY_ANOTHER: Final = 3
+#: Seconds between two beats that no master exceeds.
+_LONGEST_BEAT_PERIOD: Final = 3600.0
 
 
 class MasterLink(Enum):
@@ -75,7 +78,6 @@ class SlaveEndpoint:
     Attributes:
         link: state of the connection to the master.
         failure: reason to give up; "": there is none.
-        superseded: the reason is another live slave with its name.
         cluster: name of the last master that greeted this slave; "" before the first one.
         epoch: newest known epoch of the master.
         failing: kind and name of each failing plugin on this host, with the reason; sent with the
@@ -94,7 +96,6 @@ class SlaveEndpoint:
         self._seen = seen or JournalWatermark()
         self.link = MasterLink.SEARCHING
         self.failure = ""
-        self.superseded = False
         self.cluster = ""
         self.failing: dict[Plugin, str] = {}
         self.host_id = 0
@@ -194,7 +195,7 @@ class SlaveEndpoint:
     def _register_if_known(self) -> None:
         """Register once a beat identifies the run of the master that greeted this slave."""
         beat = self._newest_beat
-        if beat is None or _master_identity(beat) != _master_identity(self._greeting):
+        if beat is None or master_identity(beat) != master_identity(self._greeting):
             return
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
@@ -225,6 +226,8 @@ class SlaveEndpoint:
         if not answer.accepted:
             self._turned_down(answer, now)
             return
+        if not 0.0 < response.beat_period <= _LONGEST_BEAT_PERIOD:
+            raise Refused(f"the master sends a beat every {response.beat_period} s")
         self._taken_since = None
         self.host_id = response.host_id
         another = self._registered_with not in (0, self._incarnation)
@@ -263,7 +266,6 @@ class SlaveEndpoint:
                 )  # fmt: skip
         if answer.code != "name_taken" or now - self._taken_since >= self._patience():
             self.failure = answer.message
-            self.superseded = answer.code == "name_taken"
             return
         self.link = MasterLink.SEARCHING
 
@@ -284,10 +286,12 @@ class SlaveEndpoint:
             return  # the handshake reports the version mismatch
         now = time.monotonic()
         if self.link is MasterLink.REGISTERED and beat.incarnation != self._incarnation:
-            if beat.epoch <= self.epoch and not self._missed(_MISSED_BY_ANOTHER, now):
+            if not self._missed(_MISSED_BY_ANOTHER, now):
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
+        if not self._is_of_master(beat) or self._beat_clock.is_ahead(beat.beat / 1e9, now):
+            return
         sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))
@@ -295,6 +299,13 @@ class SlaveEndpoint:
             self._take(events.ContactConfirmed(sent_at))
         if self.link is MasterLink.LISTENING:
             self._register_if_known()
+
+    def _is_of_master(self, beat: msg.MasterBeat) -> bool:
+        """Return True if a beat is that of the master with which this slave speaks."""
+        if self.link is MasterLink.LISTENING:
+            return master_identity(beat) == master_identity(self._greeting)
+        registers = self.link in (MasterLink.REGISTERING, MasterLink.REGISTERED)
+        return registers and bool(beat.incarnation == self._incarnation)
 
     def _missed(self, beats: int, now: float) -> bool:
         """Return True if the master has been silent for longer than this number of beats."""
@@ -373,7 +384,10 @@ class SlaveEndpoint:
                 incarnation=self._description.incarnation, sequence=self._status_sequence,
                 complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
                 failing=[
-                    msg.PluginState(kind=kind, name=name, state="failing", reason=sendable(reason))
+                    msg.PluginState(
+                        kind=kind, name=name, state="failing",
+                        reason=sendable(reason)[:MOST_LETTERS],
+                    )
                     for (kind, name), reason in self.failing.items()
                 ],
             )
@@ -443,8 +457,3 @@ class SlaveEndpoint:
         self._control.call(
             self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()
         )
-
-
-def _master_identity(message: msg.MasterBeat | srv.Handshake.Response) -> tuple[str, int, int]:
-    """Return the identity of a master as far as a greeting contains it."""
-    return message.hostname, message.pid, message.epoch

@@ -11,6 +11,8 @@ import os
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from rosrm.model.values import LARGEST_NUMBER
+
 #: Bytes read of the file, at most.
 _LONGEST: Final = 1000
 
@@ -47,6 +49,8 @@ class JournalWatermark:
     def note(self, newest: Watermark) -> None:
         """Store the journal's watermark from the master that this slave is registered with."""
         known = self._newest
+        if newest.sequence >= LARGEST_NUMBER:
+            return  # a forged beat
         if newest.incarnation == known.incarnation and newest.sequence <= known.sequence:
             return
         self._newest = newest

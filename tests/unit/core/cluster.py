@@ -285,7 +285,7 @@ class Cluster(World[Machine]):
         machine.begin_to_register()
         reply = self.join(machine, self.now, machine.slave.statuses(), journal_seen, kept)
         if reply.accepted:
-            machine.fresh = False
+            machine.fresh = machine.leaves = False
             machine.polled.clear()
         return reply
 
@@ -342,6 +342,7 @@ class Cluster(World[Machine]):
     def leave(self, host: str) -> Reply:
         """Stop a slave: it announces its departure and ends all its processes."""
         machine = self.machines[host]
+        machine.leaves = True
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
         machine.shut_down(self.now)
         self.settle()
@@ -350,7 +351,7 @@ class Cluster(World[Machine]):
     def detach(self, host: str) -> Reply:
         """Stop a slave that leaves its processes running; the host then has no slave."""
         machine = self.machines[host]
-        kept = machine.begun()
+        kept, machine.leaves = machine.begun(), True
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, kept)
         machine.connected = False
         return reply

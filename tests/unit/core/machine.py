@@ -57,6 +57,7 @@ class Machine(Host[Program]):
         ships: hosts that receive replicas of a process on this host, by process name.
         connected: True while the wires work.
         takes: False for a slave that accepts no work.
+        leaves: True while its slave stops, from before the master learns it.
     """
 
     memory: float = 16 * GIB
@@ -73,6 +74,7 @@ class Machine(Host[Program]):
     ships: dict[str, tuple[str, ...]] = field(default_factory=dict)
     connected: bool = True
     takes: bool = True
+    leaves: bool = False
     fresh: bool = False
 
     def __post_init__(self) -> None:
@@ -95,7 +97,7 @@ class Machine(Host[Program]):
 
     def reading(self, now: float) -> SimulatedReading:
         reading = super().reading(now)
-        return reading._replace(accepts=self.takes and reading.accepts)
+        return reading._replace(accepts=self.takes and not self.leaves and reading.accepts)
 
     def used_by(self, program: Program, now: float) -> dict[str, float]:
         return self.shown[program.assignment.instance.process]
@@ -222,7 +224,7 @@ class Machine(Host[Program]):
     def restart_slave(self, now: float) -> None:
         """Kill the slave and start it again; its processes keep running."""
         self.incarnation += 1000
-        self.fresh = True
+        self.fresh, self.leaves = True, False
         self.sequence = self.batches = 0
         self.status_batches.clear()
         self.ordered.clear()

@@ -131,7 +131,9 @@ def test_an_invalid_usage_is_refused() -> None:
         cluster.machines["a"].shown["p"] = {"memory": wrong}
         cluster.tell(cluster.machines["a"].usages(cluster.now))
     assert cluster.state.instances[1].seen == {}
-    assert cluster.recorded("reading_refused") == ["a usage of p#1 was refused (NaN or negative)"]
+    assert cluster.recorded("reading_refused") == [
+        "a usage of p#1 was refused (NaN, negative or absurd)"
+    ]
 
 
 # --- registration -----------------------------------------------------------------------------

@@ -541,6 +541,7 @@ class Play(RuleBasedStateMachine):
             machine.restart_slave(self.cluster.now)
             self.register(machine)
         elif what == "leaves" and self.known(machine):
+            machine.leaves = True
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
             for instance in list(machine.programs):
                 machine.tell(events.StopOrdered(instance), self.cluster.now)

@@ -1,4 +1,4 @@
-"""Plugin rows of the master: failing plugins with their last error."""
+"""Queries to the master: failing plugins with their last error, and bounded pages of events."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rosrm.core.master import events as happened
 from rosrm.errors import PluginError
 from rosrm.master.queries import MasterQueries
 from rosrm.model.rows import PluginRow
+from rosrm_msgs import srv
 from tests.unit.core.cluster import Cluster
 
 SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")
@@ -27,6 +28,26 @@ def rows(cluster: Cluster, *, failing: bool = False) -> list[PluginRow]:
 
 def named(cluster: Cluster, name: str) -> PluginRow:
     return next(row for row in rows(cluster) if row.name == name)
+
+
+@pytest.mark.parametrize(
+    ("after", "most", "wanted"),
+    [(3, 7, (3, 7)), (0, 0, (0, 1000)), (2**64 - 1, 2**32 - 1, (2**53, 10_000))],
+)
+def test_a_page_of_events_is_bounded(after: int, most: int, wanted: tuple[int, int]) -> None:
+    """Greater numbers would overflow the journal's, or answer with all events at once."""
+    asked = []
+    journal = SimpleNamespace(
+        last_sequence=0,
+        records=lambda *, after, newest, **_: asked.append((after, newest)) or (),
+    )
+    queries = MasterQueries(
+        "m", Cluster().state, journal, [],
+        uptime=lambda: 0.0, core_now=lambda: 0.0, trouble=lambda: "",
+    )  # fmt: skip
+    request = srv.List.Request(events=True, after_sequence=after, max_events=most)
+    assert queries.snapshot(request).events == []
+    assert asked == [wanted]
 
 
 def test_a_plugin_that_works_is_shown_as_the_registry_has_it() -> None:

@@ -1,4 +1,4 @@
-"""Slow plugins: time spent in them does not count against the time-out of a step."""
+"""Slow plugins do not count against the time-out of a step; the younger of two masters stops."""
 
 from __future__ import annotations
 
@@ -43,3 +43,22 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
     clock.now += 0.05
     assert clock.decided == [100.0]
     assert master._core_now(clock.now) == pytest.approx(100.0 + passed)
+
+
+@pytest.mark.parametrize(
+    ("uptime", "incarnation", "stops"),
+    [
+        (10.0, 1, False), (200.0, 1, True), (100.2, 7, False), (99.8, 9, True),
+        (float("nan"), 9, False), (float("-inf"), 9, False),
+    ],
+)  # fmt: skip
+def test_the_younger_of_two_masters_stops(uptime, incarnation, stops) -> None:
+    """After simultaneous starts the greater incarnation stays. An impossible uptime stops none."""
+    master = MasterRuntime.__new__(MasterRuntime)
+    master._started, master._stopping = 0.0, ""
+    master._endpoint = SimpleNamespace(incarnation=8)
+    rival = SimpleNamespace(
+        uptime=uptime, incarnation=incarnation, name="m", pid=9, hostname="elsewhere"
+    )
+    master._judge_rival(rival, 100.0)
+    assert bool(master._stopping) is stops

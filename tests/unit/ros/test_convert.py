@@ -14,7 +14,7 @@ from rosrm.model import values
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros import control, convert
 from rosrm_msgs import msg
-from tests.drawing import SPECS, drawn
+from tests.drawing import PRINTABLE, SPECS, drawn
 
 #: A fence of 0 s is none.
 FENCES = drawn(values.Fence, after=st.floats(1e-3, 1e6))
@@ -77,8 +77,15 @@ def test_status_survives(status) -> None:
 
 HOSTS = drawn(
     values.HostDescription,
-    resources=st.lists(drawn(values.ResourceDescription), max_size=16).map(tuple),
-)
+    resources=st.lists(
+        drawn(values.ResourceDescription, unit=PRINTABLE, scope=PRINTABLE),
+        max_size=16, unique_by=lambda resource: resource.name,
+    ).map(tuple),
+    labels=st.dictionaries(PRINTABLE, PRINTABLE, max_size=3),
+    absent=st.dictionaries(PRINTABLE, PRINTABLE, max_size=3),
+    executors=st.lists(PRINTABLE, max_size=3).map(tuple),
+    hostname=PRINTABLE, software_version=PRINTABLE,
+)  # fmt: skip
 
 
 @given(HOSTS)
@@ -138,6 +145,19 @@ def value(text: str) -> list[msg.KeyValue]:
 NAN, INF = float("nan"), float("inf")
 NONSENSE_IN_SPECS = {
     "no name": lambda m: setattr(m, "name", ""),
+    "a name with an escape": lambda m: setattr(m, "name", "p\x1b[2J"),
+    "a name of two lines": lambda m: setattr(m, "name", "p\nq"),
+    "a long name": lambda m: setattr(m, "name", 201 * "p"),
+    "a path as a name": lambda m: setattr(m, "name", "../p"),
+    "a namespace": lambda m: setattr(m, "ros_namespace", "/a b"),
+    "a long namespace": lambda m: setattr(m, "ros_namespace", 256 * "/a"),
+    "a long argument": lambda m: setattr(m, "arguments", [131_073 * "x"]),
+    "long arguments": lambda m: setattr(m, "arguments", 10 * [131_000 * "x"]),
+    "many arguments": lambda m: setattr(m, "arguments", 65_537 * [""]),
+    "too much of a resource": lambda m: setattr(m, "needs", amount(1e300)),
+    "a delay of centuries": lambda m: setattr(m.restart, "delay", 1e10),
+    "a grace of centuries": lambda m: setattr(m.stop, "interrupt_grace", 1e10),
+    "a factor of millions": lambda m: setattr(m.restart, "factor", 1e7),
     "two forms": lambda m: setattr(m, "module", "x"),
     "no form": lambda m: setattr(m, "command", []),
     "an executable without a package": lambda m: setattr(m, "executable", "x"),
@@ -175,6 +195,12 @@ def test_spec_that_makes_no_process_is_refused(what) -> None:
 
 NONSENSE_IN_HOSTS = {
     "no name": lambda m: setattr(m, "name", ""),
+    "a name with an escape": lambda m: setattr(m, "name", "h\x9b2J"),
+    "a label with an escape": lambda m: setattr(
+        m, "labels", [msg.KeyValue(key="a", value="\x1b[2J")]
+    ),
+    "a period of hours": lambda m: setattr(m, "period", 1e300),
+    "no period": lambda m: setattr(m, "period", NAN),
     "no incarnation": lambda m: setattr(m, "incarnation", 0),
     "a slot twice": lambda m: setattr(m.resources[1], "slot", 0),
     "a hole": lambda m: setattr(m.resources[1], "slot", 5),
@@ -204,6 +230,45 @@ def test_unknown_state_is_refused() -> None:
     """A status of a state unknown to this version is refused."""
     with pytest.raises(Refused, match="flying"):
         convert.status_from_msg(msg.ProcessStatus(state="flying"))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("peak_memory", 1e300), ("cpu_time", INF), ("run_time", 1e10), ("run_time", NAN)],
+)
+def test_status_with_an_absurd_value_is_refused(field, value) -> None:
+    message = msg.ProcessStatus(state="exited", instance=msg.InstanceId(process="p", number=1))
+    setattr(message, field, value)
+    with pytest.raises(Refused, match=field):
+        convert.status_from_msg(message)
+
+
+@pytest.mark.parametrize("name", ["", "p\x1b[2J", 201 * "p"])
+def test_reports_of_improper_names_are_refused(name) -> None:
+    """The name of a process becomes a part of topics and files."""
+    with pytest.raises(Refused, match="cannot be the name of a process"):
+        convert.status_from_msg(
+            msg.ProcessStatus(state="exited", instance=msg.InstanceId(process=name))
+        )
+    with pytest.raises(Refused, match="cannot be the name of a process"):
+        convert.snapshot_from_msg(msg.KeptState(process=name))
+
+
+def test_control_characters_in_a_reason_are_replaced() -> None:
+    """The lines stay, because listings show the first one."""
+    message = msg.ProcessStatus(
+        state="failed", instance=msg.InstanceId(process="p", number=1),
+        message="no \x1b[31mcolour\tthere\r\nsecond\x9b",
+    )  # fmt: skip
+    assert convert.status_from_msg(message).message == "no ?[31mcolour there \nsecond?"
+
+
+def test_long_texts_for_users_are_cut_by_their_sender() -> None:
+    """The receiver would refuse the whole message."""
+    status = values.InstanceStatus(
+        values.InstanceId("p", 1), values.InstanceState.FAILED, message=100_000 * "x"
+    )
+    assert len(convert.status_to_msg(status).message) == 65_536
 
 
 @pytest.mark.parametrize("text", ["[1]", "1", "nothing", "{", '"a"', "null"])

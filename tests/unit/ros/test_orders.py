@@ -62,3 +62,20 @@ def test_an_unknown_action_is_refused():
     """A newer master may send one."""
     with pytest.raises(Refused, match="unknown action 99"):
         order_from_msg(srv.ControlHost.Request(action=99))
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        RunExecutor("criu_dump", {}, float("nan")),
+        RunExecutor("criu_dump", {}, 1e300),
+        ReplicateSnapshot(ONE, ("b",), float("inf")),
+        ReplicateSnapshot(ONE, ("../b",), 0.5),
+        StopInstance(InstanceId("p\x1b[2J", 7)),
+    ],
+    ids=str,
+)
+def test_an_order_with_an_impossible_name_or_time_is_refused(order):
+    """The time would never pass, and the name would become a part of files and logs."""
+    with pytest.raises(Refused):
+        order_from_msg(order_to_msg(order))

@@ -10,7 +10,7 @@ import pytest
 from rosrm.errors import Refused
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.participant import Participant
-from rosrm_msgs import srv
+from rosrm_msgs import msg, srv
 
 
 class Executor:
@@ -64,12 +64,12 @@ class Node:
         return self.service
 
 
-def asked(kind, handle):
+def asked(kind, handle, request=None):
     """Return the responses of a handler to one request."""
     made, _ = participant(ready=0)
     made.node = node = Node()
     made.serve(kind, "/service", handle)
-    node.service.send_response(kind.Request(), "header")
+    node.service.send_response(request or kind.Request(), "header")
     return [response for response, _ in node.sent]
 
 
@@ -109,3 +109,22 @@ def test_ctrl_c_in_a_callback_ends_the_loop() -> None:
     executor.callback = made.counted(interrupted)
     with pytest.raises(KeyboardInterrupt):
         made.spin(1.0)
+
+
+def test_a_message_beyond_its_bounds_costs_only_itself(caplog) -> None:
+    """A request gets an answer that names the field; the callback of a topic is not called."""
+    taken: list[object] = []
+    made, _ = participant(ready=0)
+    callback = made.counted(taken.append)
+    for name in ("fine", 65_537 * "n"):
+        callback(msg.MasterBeat(name=name))
+    assert [one.name for one in taken] == ["fine"]
+    assert "MasterBeat.name has 65537 letters; at most 65536" in caplog.text
+
+    def handle(request, open_request):
+        raise AssertionError("a request beyond its bounds was handled")
+
+    request = srv.Cancel.Request(processes=[65_537 * "n"])
+    (response,) = asked(srv.Cancel, handle, request)
+    assert (response.answer.accepted, response.answer.code) == (False, "failed")
+    assert "Cancel_Request.processes has 65537 letters" in response.answer.message

@@ -22,7 +22,7 @@ class Slave:
         self.now, self.log = 100.0, log
         self.when_stopped = lambda: None
         self.endpoint = SimpleNamespace(
-            failure="", superseded=False, leave=lambda done, _kept: done(),
+            failure="", leave=lambda done, _kept: done(),
             wait_until_received=lambda: None,
         )  # fmt: skip
         self.state = SlaveState()
@@ -61,6 +61,16 @@ def slave(monkeypatch, caplog) -> Slave:
     slave = Slave(caplog)
     monkeypatch.setattr(shutdown, "time", SimpleNamespace(monotonic=lambda: slave.now))
     return slave
+
+
+@pytest.mark.parametrize("failure", ["a live slave has the name 'h0' already", "another version"])
+def test_a_refused_slave_keeps_its_processes(slave, caplog, failure) -> None:
+    """Another may have taken its name: fences end what may have a successor, and nothing else."""
+    slave.endpoint.failure = failure
+    slave.when_stopped = lambda: pytest.fail("the processes were stopped")
+    assert slave.ending.carry_out("") == 1
+    assert failure in caplog.text
+    assert "2 processes keep running, those with a fence until it expires" in caplog.text
 
 
 def test_an_order_to_stop_that_was_not_taken_is_no_stop(slave, caplog) -> None:

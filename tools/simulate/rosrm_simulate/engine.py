@@ -75,6 +75,11 @@ class Simulation(World[Machine]):
         strategies: Mapping[str, MigrationStrategy],
         declared: Declared | None = None,
     ) -> None:
+        settings = replace(
+            settings,
+            max_hosts=max(settings.max_hosts, len(workload.hosts)),
+            max_processes=max(settings.max_processes, len(workload.processes)),
+        )
         super().__init__(
             MasterState(
                 settings, policy[0], policy[1], strategies, epoch=1,

@@ -168,7 +168,7 @@ def _copy(hosts: Sequence[SimulatedHost], number: int) -> SimulatedHost:
     if not turn:
         return host
     taken = {one.name for one in hosts}
-    name = f"{host.name}+{turn}"
+    name = f"{host.name}.{turn}"
     while name in taken:
-        name += "+"
+        name += "."
     return replace(host, name=name)

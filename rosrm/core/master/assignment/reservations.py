@@ -9,7 +9,7 @@ import numpy as np
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import Instance
 from rosrm.model.records import Intent
-from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
+from rosrm.model.values import MOST_USED, InstanceState, InstanceStatus, ProcessSpec
 
 #: Shortest run, in seconds, that shows the CPU use of a program; before, start-up dominates.
 _TELLING_RUN: Final = 1.0
@@ -44,6 +44,7 @@ def learn_from(
         "memory": max(status.peak_memory, instance.peak.get("memory", 0.0)),
         "cpu": max(cpu, instance.peak.get("cpu", 0.0)),
     }
-    counts = state.learned.learn(spec.program, peaks)
+    plausible = {name: used for name, used in peaks.items() if used <= MOST_USED[name]}
+    counts = state.learned.learn(spec.program, plausible)
     if counts is not None:
         state.emit(Intent("learned", spec.program, counts))

@@ -8,21 +8,25 @@ import numpy as np
 
 from rosrm.core.master.events import ReadingsReceived
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
-from rosrm.core.master.state.hosts import HostTable
+from rosrm.core.master.state.hosts import MOST_AHEAD, HostTable
 from rosrm.model.values import ABSURD_USAGE, RESOURCE_SLOTS
 
+#: Seconds for which every reading of a host is out of order, after which the stored sequence counts
+#: as wrong: a single forged reading must not silence a host for good.
+_WRONG_AFTER: Final = 3.0
 _SLOT_BITS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 
 
 def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> BoolArray:
     """Store a batch of readings.
 
-    A reading older than the stored one arrived late and is dropped. An invalid reading is dropped
-    too, but it renews the last contact of its host and makes the host's stored reading stale.
+    A reading older than the stored one arrived late and is dropped, and so is one far ahead of it.
+    An invalid reading is dropped too, but it renews the last contact of its host and makes the
+    host's stored reading stale.
 
     Returns:
-        (N,) True where a reading was refused: unknown host, former run of its slave, or a value
-        that is NaN, negative or above `ABSURD_USAGE`.
+        (N,) True where a reading was refused: unknown host, former run of its slave, a value that
+        is NaN, negative or above `ABSURD_USAGE`, or a sequence that is far ahead.
     """
     columns = readings.host_id - 1
     known = (columns >= 0) & (columns < len(table))
@@ -33,13 +37,30 @@ def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> B
         (readings.usage >= 0.0) & (readings.usage <= ABSURD_USAGE)
         & (readings.limit >= 0.0) & (readings.limit <= 1.0)
     ).all(axis=1)  # fmt: skip
-    if known.any():
-        fresh = known & (readings.sequence >= table.sequence[at])
-        table.last_contact[at[fresh]] = now
-        table.stale[at[fresh & ~sane]] = _SLOT_BITS.sum()
-        _store(table, readings, at, fresh & sane)
-        table.changed()
-    return np.asarray(~(known & sane))
+    if not known.any():
+        return np.asarray(~known)
+    fresh = known & _in_order(table, readings, at, now)
+    late = known & ~fresh
+    table.refused_since[at[fresh]] = np.inf
+    table.refused_since[at[late]] = np.minimum(table.refused_since[at[late]], now)
+    table.last_contact[at[fresh]] = now
+    table.sequence[at[fresh]] = readings.sequence[fresh]
+    table.reported[at[fresh]] = readings.status_sequence[fresh]
+    table.stale[at[fresh & ~sane]] = _SLOT_BITS.sum()
+    _store(table, readings, at, fresh & sane)
+    table.changed()
+    far_ahead = late & (readings.sequence > table.sequence[at])
+    return np.asarray(~(known & sane) | far_ahead)
+
+
+def _in_order(
+    table: HostTable, readings: ReadingsReceived, columns: IntArray, now: float
+) -> BoolArray:
+    """Return the mask of readings that follow the stored ones, or replace a wrong sequence."""
+    before = table.sequence[columns]
+    step = readings.sequence - before  # unsigned: an older reading is very far ahead
+    is_wrong = now - table.refused_since[columns] >= _WRONG_AFTER
+    return np.asarray((before == 0) | (step <= MOST_AHEAD) | is_wrong)
 
 
 def _store(
@@ -62,8 +83,6 @@ def _store(
         stale = stale & ((limit < 1.0) * _SLOT_BITS).sum(axis=1, dtype=np.uint32)
     table.stale[at] = stale
     table.accepting[at] = readings.accepting[good]
-    table.sequence[at] = readings.sequence[good]
-    table.reported[at] = readings.status_sequence[good]
 
 
 def _store_alike(

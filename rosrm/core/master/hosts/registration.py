@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import inf
 from typing import Final
 
 import numpy as np
@@ -17,7 +16,7 @@ from rosrm.core.master.commands import RefusalCode, Reply
 from rosrm.core.master.hosts import loss
 from rosrm.core.master.hosts.liveness import lease_end, mark_up
 from rosrm.core.master.hosts.readings import take_readings
-from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.master_state import RECORD_PERIOD, MasterState
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.host_arrays import FloatArray
@@ -28,17 +27,19 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import ReportInstances
 from rosrm.model.plan import Execute
 from rosrm.model.records import Intent
-from rosrm.model.values import InstanceStatus
-from rosrm.wording import counted
+from rosrm.model.values import MOST_USED, HostDescription, InstanceStatus
+from rosrm.wording import counted, listed
 
-#: Seconds between two records of the same fault of the same host.
-_RECORD_PERIOD: Final = 10.0
+#: Seconds after its `leave` for which readings that a slave sent before may arrive.
+_STILL_THERE: Final = 3.0
+#: Most different resources of all hosts: each is a row of the table, which never gets smaller.
+_MOST_RESOURCES: Final = 64
 
 
 def host_registered(state: MasterState, event: happened.HostRegistered, now: float) -> None:
     """Register a host, unless a live slave has its name."""
     description = event.description
-    fault = description_fault(description)
+    fault = description_fault(description) or _no_room(state, description)
     if fault:
         raise _refusal(state, event, fault, "invalid", now)
     known = state.hosts.by_name.get(description.name)
@@ -51,6 +52,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     is_new = known is None or known.pruned
     host = state.hosts.register(description, now)
     host.failing.clear()  # the slave reports the plugins that fail in this run
+    state.ahead_since.pop(host.column, None)
     if is_new:
         save_host(state, host)
     state.record(
@@ -76,6 +78,24 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     state.emit(Reply(event.request, host_id=host.host_id))
 
 
+def _no_room(state: MasterState, description: HostDescription) -> str:
+    """Return why the table of hosts has no room for a host; "" if it has."""
+    table, most = state.hosts, state.settings.max_hosts
+    known = table.by_name.get(description.name)
+    if (known is None or known.pruned) and len(table.listed()) >= most:
+        return (
+            f"{description.name} is not registered: the master knows {most} hosts, which is "
+            f"`max_hosts`. Remove hosts that left by `rosrm prune`, or raise `max_hosts`"
+        )
+    new = {resource.name for resource in description.resources}.difference(table.resources)
+    if len(table.resources) + len(new) > _MOST_RESOURCES:
+        return (
+            f"{description.name} is not registered: the hosts of a cluster have at most "
+            f"{_MOST_RESOURCES} different resources, and {listed(sorted(new))} would be more"
+        )
+    return ""
+
+
 def _live(held: Iterable[InstanceStatus]) -> str:
     """Count the instances in a slave's report that have not ended: "2 processes"."""
     return counted(sum(not one.state.ended for one in held), "process", "processes")
@@ -94,10 +114,11 @@ def _refusal(
 ) -> RequestRefused:
     """Return the refusal of a registration, and record it."""
     known = state.hosts.by_name.get(event.description.name)
-    if known is None:
+    if known is not None:  # a slave whose name is taken retries for a moment
+        state.record_seldom(known, EventKind.HOST_REFUSED, now, why)
+    elif now - state.stranger_refused_at >= RECORD_PERIOD:  # strangers may have any number of names
+        state.stranger_refused_at = now
         state.record(now, EventKind.HOST_REFUSED, why, host=event.description.name)
-    else:  # a slave whose name is taken retries for a moment
-        _record_seldom(state, known, EventKind.HOST_REFUSED, now, why)
     return RequestRefused(why, code)
 
 
@@ -160,6 +181,7 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         raise RequestRefused("this host is not registered", "unknown")
+    host.left_since = now
     if event.kept:
         _detach(state, host, event.kept, now)
         state.emit(Reply(event.request))
@@ -186,6 +208,37 @@ def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], no
     loss.detach(state, host, lease_end(state, host), now)
 
 
+def review_departures(state: MasterState, now: float) -> None:
+    """Undo the departure of every host whose slave still accepts work: another sent its `leave`.
+
+    A slave that stops accepts no work from before its own `leave` on.
+    """
+    table = state.hosts
+    departed = np.isin(table.condition, (HostCondition.LEFT, HostCondition.DETACHED))
+    for column in np.flatnonzero(departed & table.accepting):
+        host = table.hosts[column]
+        reports = not host.pruned and table.last_contact[column] - host.left_since >= _STILL_THERE
+        if reports:
+            _undo_departure(state, host, now)
+
+
+def _undo_departure(state: MasterState, host: Host, now: float) -> None:
+    state.hosts.set_condition(host, HostCondition.UP)
+    state.record(
+        now, EventKind.HOST_BACK,
+        f"{host.name} has not left: its slave still accepts work, and another sent its `leave`",
+        host=host.name,
+    )  # fmt: skip
+    for instance in state.instances_of(host):
+        process = state.owned_by(instance)
+        if process is not None and process.wanted is DesiredState.REQUEUE and not instance.stopping:
+            process.wanted = DesiredState.RUN
+            state.save(process)
+    loss.mark_rejoined(state, host, now)
+    state.send(host, ReportInstances())
+    reconsider_set_aside(state, now)
+
+
 def process_requested(state: MasterState, event: happened.ProcessRequested, now: float) -> None:
     """Note the open request of a host; the answer follows when there is work."""
     host = state.hosts.find(event.host_id, event.incarnation)
@@ -204,22 +257,15 @@ def readings_received(state: MasterState, event: happened.ReadingsReceived, now:
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
         if host is not None:
             fault = (
-                f"a reading of {host.name} was refused (NaN, negative, absurd, or a limit outside "
-                f"0..1): usage {_shown(event.usage[row])}, limit {_shown(event.limit[row])}"
+                f"a reading of {host.name} was refused (NaN, negative, absurd, a limit outside "
+                f"0..1, or far ahead): usage {_shown(event.usage[row])}, limit "
+                f"{_shown(event.limit[row])}, sequence {event.sequence[row]}"
             )
-            _record_seldom(state, host, EventKind.READING_REFUSED, now, fault)
+            state.record_seldom(host, EventKind.READING_REFUSED, now, fault)
 
 
 def _shown(values: FloatArray) -> str:
     return "[" + ", ".join(f"{value:.3g}" for value in values[:8]) + ", …]"
-
-
-def _record_seldom(
-    state: MasterState, host: Host, kind: EventKind, now: float, message: str
-) -> None:
-    if now - host.recorded_at.get(kind, -inf) >= _RECORD_PERIOD:
-        host.recorded_at[kind] = now
-        state.record(now, kind, message, host=host.name)
 
 
 def usages_received(state: MasterState, event: happened.UsagesReceived, now: float) -> None:
@@ -231,9 +277,9 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
         instance = state.instances.get(int(number))
         if instance is None or instance.host is not host:
             continue
-        if not (np.isfinite(cpu) and np.isfinite(memory) and cpu >= 0.0 and memory >= 0.0):
-            fault = f"a usage of {instance.id} was refused (NaN or negative)"
-            _record_seldom(state, host, EventKind.READING_REFUSED, now, fault)
+        if not (0.0 <= cpu <= MOST_USED["cpu"] and 0.0 <= memory <= MOST_USED["memory"]):
+            fault = f"a usage of {instance.id} was refused (NaN, negative or absurd)"
+            state.record_seldom(host, EventKind.READING_REFUSED, now, fault)
             continue
         instance.seen = {"cpu": float(cpu), "memory": float(memory)}
         for resource, amount in instance.seen.items():

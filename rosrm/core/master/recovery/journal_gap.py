@@ -24,6 +24,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent
+from rosrm.model.values import LARGEST_NUMBER
 from rosrm.wording import counted
 
 _KEY: Final = "unheard"
@@ -77,7 +78,7 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     """Begin a wait if a host has seen a newer record than the journal has."""
     gap = state.journal_gap
     lost = seen - gap.newest
-    if lost <= gap.lost:
+    if lost <= gap.lost or seen >= LARGEST_NUMBER:
         return
     gap.lost = lost
     state.skip_numbers(state.next_instance + lost)  # each record may be of a new instance

@@ -50,6 +50,7 @@ class HostColumns:
         sequence: (H,) sequence of the newest reading.
         reported: (H,) sequence of the newest status batch that the slave has sent.
         status_sequence: (H,) sequence of the newest status batch that has arrived.
+        refused_since: (H,) time since when every reading is out of order; inf: the last was not.
         row_of_slot: (H, RESOURCE_SLOTS) slot of a message -> row here; -1: not in use.
     """
 
@@ -81,6 +82,7 @@ class HostColumns:
             "sequence": np.zeros(columns, np.uint64),
             "reported": np.zeros(columns, np.uint64),
             "status_sequence": np.zeros(columns, np.uint64),
+            "refused_since": np.full(columns, np.inf),
             "row_of_slot": np.full((columns, RESOURCE_SLOTS), -1, np.int64),
         }
 
@@ -128,6 +130,7 @@ class HostColumns:
         self.sequence: npt.NDArray[np.uint64] = used["sequence"]
         self.reported: npt.NDArray[np.uint64] = used["reported"]
         self.status_sequence: npt.NDArray[np.uint64] = used["status_sequence"]
+        self.refused_since: FloatArray = used["refused_since"]
         self.row_of_slot: IntArray = used["row_of_slot"]
 
     def clear_column(self, column: int) -> None:

@@ -29,6 +29,8 @@ from rosrm.model.values import HostDescription
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
 _MOST_GUESSED: Final = 0.5
+#: Greatest step from one sequence of a host to the next; a greater one is an error or a forgery.
+MOST_AHEAD: Final = 1000
 
 
 class HostCondition(IntEnum):
@@ -69,6 +71,7 @@ class Host:
         pruned: the host is left out of listings until it registers.
         recorded_at: kind of a record to its last time, for records that are not repeated at once.
         blocked: cause of an eviction to the last recorded reason why no process could leave.
+        left_since: for a host that left or is detached: time at which its slave reported its stop.
         detached_since: for a detached host: time at which its slave was stopped.
         lost_since: for a lost host: time of the loss; for a detached host: end of its lease.
         failing: kind and name of each failing plugin to its failure, as the slave reports. A probe
@@ -86,6 +89,7 @@ class Host:
     over_at: dict[str, float] = field(default_factory=dict)
     recorded_at: dict[str, float] = field(default_factory=dict)
     blocked: dict[str, str] = field(default_factory=dict)
+    left_since: float = 0.0
     detached_since: float = 0.0
     lost_since: float = 0.0
     failing: dict[Plugin, Failing] = field(default_factory=dict)
@@ -158,6 +162,7 @@ class HostTable(HostColumns):
         self.period[column] = description.period
         self.incarnation[column] = description.incarnation
         self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
+        self.refused_since[column] = np.inf
         self._labelled.clear()
         self.changed()
         return host
@@ -327,6 +332,11 @@ class HostTable(HostColumns):
         behind = (self.reported > self.status_sequence) | self.report_due
         return np.flatnonzero(behind & (self.condition == HostCondition.UP))
 
+    def statuses_ahead(self) -> IntArray:
+        """Return the columns of hosts that, by their reading, have sent fewer batches than came."""
+        ahead = (self.status_sequence > self.reported) & (self.reported > 0)
+        return np.flatnonzero(ahead & (self.condition == HostCondition.UP))
+
     def set_report_due(self, host: Host, *, report_due: bool) -> None:
         """Set whether a lost host has rejoined without a report of its instances yet."""
         if bool(self.report_due[host.column]) is not report_due:
@@ -335,11 +345,17 @@ class HostTable(HostColumns):
 
     def note_statuses(
         self, host: Host, sequence: int, now: float
-    ) -> Literal["late", "next", "after a gap"]:
-        """Note the sequence of a status batch, and return its place in the order of batches."""
+    ) -> Literal["late", "next", "after a gap", "far ahead"]:
+        """Note the sequence of a status batch, and return its place in the order of batches.
+
+        A batch far ahead of the last one and of the host's readings is not the host's: noted, it
+        would hide all batches that the host sends.
+        """
         newest = int(self.status_sequence[host.column])
         if sequence <= newest:
             return "late"
+        if newest and sequence - max(newest, int(self.reported[host.column])) > MOST_AHEAD:
+            return "far ahead"
         self.status_sequence[host.column] = sequence
         self.last_contact[host.column] = now
         return "next" if sequence == newest + 1 else "after a gap"

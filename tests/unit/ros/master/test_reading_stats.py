@@ -96,3 +96,42 @@ def test_the_books_grow(ledger: ReadingStats) -> None:
     assert ledger.beat[[1, 5000]].tolist() == [4, 4]
     assert (ledger.cycles, ledger.missed) == (3, 0)
     assert ledger.ages(2.0) == (2, 0.5)
+
+
+@pytest.mark.parametrize("forged", [2**62, 2**63 - 1, -1, 10**6])
+def test_a_forged_sequence_spoils_no_statistics(ledger: ReadingStats, forged: int) -> None:
+    """The next messages of the slave count as before."""
+    ledger.take(runs((1, 40, 1)), 0.0)
+    ledger.take(runs((1, forged, 1)), 0.1)
+    ledger.take(runs((1, 41, 1)), 0.2)
+    ledger.take(runs((1, 43, 1)), 0.3)
+    assert ledger.cycles == 4
+    assert ledger.missed in (0, 1)
+
+
+@pytest.mark.parametrize("forged", [2**64 - 1, 2**63, 20 * 10**9])
+def test_a_beat_that_is_still_to_come_is_refused(ledger: ReadingStats, forged: int) -> None:
+    """Orders with that beat would be stale for the slave."""
+    ledger.take(runs((1, 40, 1), beat=10**9), 0.0)
+    ledger.take(runs((1, 41, 1), beat=forged), 0.1)
+    assert ledger.beat[1] == 10**9
+    ledger.take(runs((1, 42, 1), beat=2 * 10**9), 1.0)
+    assert ledger.beat[1] == 2 * 10**9
+
+
+def test_a_beat_after_a_long_silence_counts(ledger: ReadingStats) -> None:
+    """The slave's clock went on in that time; a wrong beat is replaced by an earlier one."""
+    ledger.take(runs((1, 40, 1), beat=10**9), 0.0)
+    ledger.take(runs((1, 41, 1), beat=101 * 10**9), 100.0)
+    assert ledger.beat[1] == 101 * 10**9
+    ledger.take(runs((1, 42, 1), beat=7), 100.1)
+    assert ledger.beat[1] == 7
+
+
+def test_beats_far_ahead_count_after_a_suspension(ledger: ReadingStats) -> None:
+    """The machine of the master was suspended for an hour, and its clock stood still."""
+    ledger.take(runs((1, 40, 1), beat=10**9), 0.0)
+    for cycle in range(1, 17):
+        beat = 3601 * 10**9 + cycle * 2 * 10**8
+        ledger.take(runs((1, 40 + cycle, 1), beat=beat), 0.2 * cycle)
+        assert ledger.beat[1] == (beat if cycle >= 16 else 10**9)

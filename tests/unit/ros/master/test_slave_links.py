@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -93,6 +94,16 @@ def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
     assert client.beats == []
     heard(links, beat=900, sequence=2)
     assert client.beats == [900]
+
+
+def test_waiting_requests_of_one_slave_are_bounded(links):
+    """A sender repeats requests for a host that sends no reading; the oldest get no answer."""
+    links.renew(HOST, DESCRIPTION)
+    link, sent = links.find(HOST, RUN), []
+    for number in range(1200):
+        links.after_first_reading(link, partial(sent.append, number))
+    heard(links, beat=100, sequence=1)
+    assert sent == list(range(200, 1200))
 
 
 @pytest.mark.parametrize("text", ["null", "[1]", "3", "{"])

@@ -9,14 +9,15 @@ import pytest
 from rosrm.core.slave import events
 from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import HostDescription
-from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.slave import endpoint
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.journal_watermark import JournalWatermark, Watermark
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
+from tests.unit.ros.wire import Call, Wire
 
 PERIOD = 0.2
+PERIOD_OF_MASTER = PERIOD
 
 
 class Clock:
@@ -29,71 +30,6 @@ class Clock:
 
     def monotonic_ns(self) -> int:
         return int(self.now * 1e9)
-
-
-class Call:
-    """Request on its way, with its result."""
-
-    def __init__(self, request) -> None:
-        self.request = request
-        self._done = None
-
-    def add_done_callback(self, done) -> None:
-        self._done = done
-
-    def answer(self, response) -> None:
-        self._response = response
-        self._done(self)
-
-    def result(self):
-        return self._response
-
-
-class Peer:
-    """Fake service client and publisher that store what is sent."""
-
-    def __init__(self) -> None:
-        self.sent: list[Call] = []
-
-    def service_is_ready(self) -> bool:
-        return True
-
-    def call_async(self, request) -> Call:
-        self.sent.append(Call(request))
-        return self.sent[-1]
-
-    def remove_pending_request(self, call) -> None:
-        pass
-
-    def publish(self, message) -> None:
-        pass
-
-
-class Wire:
-    """Fake participant, and its node."""
-
-    settings = type("Settings", (), {"namespace": "/rosrm"})
-
-    def __init__(self) -> None:
-        self.node = self
-        self.guard = CallbackGuard()
-        self.to: dict[type, Peer] = {}
-        self.hear = {}
-
-    def create_client(self, kind, _name, *, qos_profile) -> Peer:
-        return self.to.setdefault(kind, Peer())
-
-    def create_publisher(self, _kind, _name, _qos) -> Peer:
-        return Peer()
-
-    def create_subscription(self, kind, _name, callback, _qos) -> None:
-        self.hear[kind] = callback
-
-    def counted(self, callback):
-        return callback
-
-    def serve(self, *_arguments) -> None:
-        pass
 
 
 class Host:
@@ -139,7 +75,9 @@ class Master:
         answer = {"protocol_version": PROTOCOL_VERSION, "accepted": not refusal, **refusal}
         self._slave.newest(srv.RegisterHost).answer(
             srv.RegisterHost.Response(
-                answer=msg.Answer(epoch=self._epoch, **answer), host_id=1, beat_period=PERIOD
+                answer=msg.Answer(epoch=self._epoch, **answer),
+                host_id=1,
+                beat_period=PERIOD_OF_MASTER,
             )
         )
 
@@ -250,14 +188,14 @@ def test_a_run_that_replaces_the_first_is_reported(slave) -> None:
 
 
 def test_of_two_masters_the_running_one_is_kept(slave) -> None:
-    """The younger of two masters stops; the slave switches at once only to a newer epoch."""
+    """The younger of two masters stops. Beats alone, of any epoch, prove no other master."""
     ours = Master(slave, 11, epoch=2)
     slave.join(ours)
-    for epoch in (1, 2):
+    for epoch in (1, 2, 3, 2**64 - 1):
         slave.pass_time(3.0, ours, Master(slave, 12, epoch=epoch, pid=8))
         assert slave.link is MasterLink.REGISTERED
-    Master(slave, 13, epoch=3, pid=9).beat()
-    assert slave.link is MasterLink.SEARCHING
+    slave.pass_time(1.0, Master(slave, 13, epoch=3, pid=9))
+    assert slave.link is MasterLink.GREETING
 
 
 def test_beats_confirm_the_contact_of_this_host(slave) -> None:
@@ -287,6 +225,46 @@ def test_delayed_beats_confirm_the_contact_of_their_time(slave) -> None:
     ours.beat(age=1.1)
     now = slave.clock.now
     assert slave.host.contacts == pytest.approx([now - 1.3, now - 1.1], abs=0.01)
+
+
+@pytest.mark.parametrize("ahead", [20.0, 1e6, 18e9])
+def test_a_beat_that_is_still_to_come_is_refused(slave, ahead) -> None:
+    """Another has sent it: with it, later beats would look old, and fences stop the processes."""
+    ours = Master(slave, 11)
+    slave.join(ours)
+    slave.pass_time(1.0, ours)
+    slave.host.contacts.clear()
+    ours.beat(age=-ahead)
+    slave.pass_time(1.0, ours)
+    assert slave.host.contacts == pytest.approx(
+        [slave.clock.now - PERIOD * n for n in (4, 3, 2, 1, 0)], abs=0.01
+    )
+    slave.pass_time(40.0, ours)
+    beat = slave.newest(srv.RequestProcess).request.envelope.receiver_beat
+    assert beat <= slave.clock.monotonic_ns()
+
+
+def test_beats_of_others_do_not_disturb_a_registration(slave) -> None:
+    """A request with the beat of another master would be stale."""
+    ours, another = Master(slave, 11), Master(slave, 12, pid=8)
+    slave.pass_time(PERIOD)
+    ours.greet()
+    for _ in range(3):
+        another.beat(age=50.0)
+    assert slave.link is MasterLink.LISTENING
+    ours.beat()
+    assert slave.link is MasterLink.REGISTERING
+    envelope = slave.newest(srv.RegisterHost).request.envelope
+    assert envelope.receiver_beat == slave.clock.monotonic_ns()
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, float("nan"), float("inf"), 1e300])
+def test_an_impossible_beat_period_is_refused(slave, monkeypatch, period) -> None:
+    """The slave would never notice the end of its master."""
+    monkeypatch.setattr("tests.unit.ros.slave.test_endpoint.PERIOD_OF_MASTER", period)
+    slave.find(Master(slave, 11))
+    Master(slave, 11).take_in()
+    assert slave.link is MasterLink.SEARCHING
 
 
 def test_a_late_greeting_starts_no_session(slave) -> None:
@@ -417,6 +395,13 @@ def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -
     path.mkdir()
     seen.note(Watermark(5, 1, "m"))
     assert seen.of_former_run("m", 2) == 5
+
+
+def test_an_impossible_journal_position_is_not_remembered(slave) -> None:
+    """A forged beat; the next master would take its journal for damaged."""
+    seen = JournalWatermark()
+    seen.note(Watermark(2**64 - 1, 1, "m"))
+    assert seen.of_former_run("m", 2) == 0
 
 
 def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch, caplog) -> None:

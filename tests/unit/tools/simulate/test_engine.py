@@ -266,7 +266,7 @@ def test_the_same_workload_gives_the_same_run(hosts, plans):
 def test_fewer_and_more_hosts_than_the_workload_has():
     made = simulation([host("a"), host("b")], [plan("p")]).workload
     assert [one.name for one in made.with_hosts(1).hosts] == ["a"]
-    assert [one.name for one in made.with_hosts(5).hosts] == ["a", "b", "a+1", "b+1", "a+2"]
+    assert [one.name for one in made.with_hosts(5).hosts] == ["a", "b", "a.1", "b.1", "a.2"]
 
 
 def test_progress_is_told():

@@ -1,0 +1,126 @@
+"""Bounds of the messages between the parts of rosrm: length of texts, entries of sequences, size.
+
+The receiver checks them. Neither rclpy nor Fast DDS refuses a text or a sequence that is longer
+than its interface allows, and for each publisher and subscription Fast DDS reserves a bounded
+sequence a hundred times in its full length. So `rosrm_msgs` has no bounded types: the comments of
+its fields state the bounds, where they differ from the general ones here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from rosrm.errors import Refused
+from rosrm_msgs import msg
+
+#: Most letters of a text, and most entries of a sequence.
+MOST_LETTERS: Final = 1 << 16
+MOST_ENTRIES: Final = 1 << 16
+#: Most letters and entries of a whole message, and of the spec of one process.
+LARGEST_MESSAGE: Final = 1 << 26
+LARGEST_SPEC: Final = 1 << 20
+
+_OTHER_LETTERS: Final = {
+    "KeyValue.value": 1 << 20,
+    "ProcessSpec.command": 1 << 17,
+    "ProcessSpec.arguments": 1 << 17,
+    "Event.data": 1 << 20,
+    "ControlHost_Request.arguments": 1 << 20,
+    "ControlHost_Response.result": 1 << 20,
+    "Explain_Response.explanation": 1 << 24,
+}
+_OTHER_ENTRIES: Final = {
+    "HostDescription.labels": 256,
+    "HostDescription.resources": 16,
+    "HostDescription.executors": 256,
+    "HostDescription.absent": 256,
+    "ProcessSpec.needs": 64,
+    "ProcessSpec.required_labels": 256,
+    "ProcessSpec.preferred_labels": 256,
+    "ProcessSpec.avoided_labels": 256,
+    "StandbyPolicy.apart_by": 256,
+    "ProcessStatusBatch.failing": 1000,
+    "Submit_Request.processes": 10_000,
+    "List_Response.process_list": 1 << 20,
+    "List_Response.plugin_list": 1 << 20,
+    "KeepState_Request.data": 1 << 20,
+    "ReadKept_Response.data": 1 << 20,
+    "ReadLog_Response.content": 1 << 20,
+}
+
+
+class Bound(NamedTuple):
+    """Bound of a field.
+
+    Attributes:
+        field: its name.
+        entries: most entries; 0: it is no sequence.
+        letters: most letters of the text, or of each text in the sequence; 0: it has none.
+        nested: messages are in it.
+    """
+
+    field: str
+    entries: int
+    letters: int
+    nested: bool
+
+
+def _find_bounds(kind: Any) -> tuple[Bound, ...]:
+    if not kind.__module__.startswith("rosrm_msgs."):
+        return ()
+    found = []
+    for field, declared in kind.get_fields_and_field_types().items():
+        name = f"{kind.__name__}.{field}"
+        is_many = declared.startswith("sequence<")
+        inner = declared.removeprefix("sequence<").removesuffix(">")
+        entries = _OTHER_ENTRIES.get(name, MOST_ENTRIES) if is_many else 0
+        letters = _OTHER_LETTERS.get(name, MOST_LETTERS) if inner == "string" else 0
+        nested = inner.startswith("rosrm_msgs/") and _has_bounds(inner)
+        if entries or letters or nested:
+            found.append(Bound(field, entries, letters, nested))
+    return tuple(found)
+
+
+def _has_bounds(name: str) -> bool:
+    return bool(bounds_of(getattr(msg, name.rpartition("/")[2])))
+
+
+#: Returns the bounds of a message's fields; none for a message that is not of rosrm. Typed, because
+#: mypy does not accept a type as an argument of a cache.
+bounds_of: Final[Callable[[Any], tuple[Bound, ...]]] = cache(_find_bounds)
+
+
+def check_bounds(message: Any) -> int:
+    """Return the number of letters and entries in a message.
+
+    Raises:
+        Refused: the message, or a field of it, exceeds its bound.
+    """
+    size = _size(message)
+    if size > LARGEST_MESSAGE:
+        raise Refused(f"a {type(message).__name__} of {size} letters; at most {LARGEST_MESSAGE}")
+    return size
+
+
+def _size(message: Any) -> int:
+    kind, size = type(message), 0
+    for field, entries, letters, nested in bounds_of(kind):
+        value = getattr(message, field)
+        if entries:
+            _check(kind, field, "entries", len(value), entries)
+            size += len(value)
+        if letters:
+            for text in value if entries else (value,):
+                _check(kind, field, "letters", len(text), letters)
+                size += len(text)
+        elif nested:
+            for part in value if entries else (value,):
+                size += _size(part)
+    return size
+
+
+def _check(kind: type[Any], field: str, what: str, given: int, most: int) -> None:
+    if given > most:
+        raise Refused(f"{kind.__name__}.{field} has {given} {what}; at most {most}")
