@@ -7,5 +7,6 @@ event_kinds.py          the kinds of events in the event record
 rows.py                 the rows of listings
 ros_settings.py         how a part joins the ROS graph
 codec.py                values as JSON
+durations.py            bound of all times
 description_checks.py   checks of what a slave reports about its host
 """

@@ -5,12 +5,8 @@ from __future__ import annotations
 import fcntl
 import os
 import socket
-from typing import Final
 
-from rosrm.supervisor import paths
-
-#: Bytes of the supervisor's own log beyond which the next start empties it.
-MOST_OWN_LOG: Final = 1 << 20
+from rosrm.supervisor import own_log, paths
 
 
 class EndpointError(Exception):
@@ -50,7 +46,7 @@ def let_go_of_terminal(state: str) -> None:
     path = os.path.join(state, paths.OWN_LOG)
     null = os.open(os.devnull, os.O_RDWR)
     log = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-    if os.fstat(log).st_size > MOST_OWN_LOG:
+    if os.fstat(log).st_size > own_log.MOST_BYTES:
         os.ftruncate(log, 0)
     for source, target in ((null, 0), (null, 1), (log, 2)):
         os.dup2(source, target)

@@ -25,7 +25,7 @@ def parse(text: bytes) -> dict[str, Any]:
     """Return the JSON object in one line. Raises ProtocolError."""
     try:
         fields = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ProtocolError(f"not a line of JSON ({error}): {text[:80]!r}") from None
     if not isinstance(fields, dict):
         raise ProtocolError(f"not a JSON object: {text[:80]!r}")

@@ -23,6 +23,8 @@ BUSY: Final = 0.2
 QUIET: Final = 1.0
 #: Excess of processes at which the logs of the oldest ones are removed.
 PROCESSES_AT_ONCE: Final = 50
+#: Most older files of one instance: a rotation renames each.
+MOST_KEPT: Final = 1000
 #: Suffixes of files that may lie beside a log and are removed with it.
 FILES_BESIDE: Final = (".parameters.yaml",)
 
@@ -41,6 +43,14 @@ class LogLimits(NamedTuple):
     keep: int = 2
     instances: int = 5
     processes: int = 500
+
+    @classmethod
+    def bounded(cls, max_bytes: int, keep: int, instances: int, processes: int) -> LogLimits:
+        """Return received limits, each within the range that the supervisor can hold."""
+        return cls(
+            max(max_bytes, 1), min(max(keep, 0), MOST_KEPT), max(instances, 1),
+            max(processes, 1),
+        )  # fmt: skip
 
 
 class LogKeeper:
