@@ -266,7 +266,7 @@ class LogSettings:
     """
 
     max_bytes: Annotated[int, Quantity("size", low=4096, whole=True)] = 10_000_000
-    keep: Count = 3
+    keep: Annotated[int, Quantity(high=1000, whole=True)] = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
+from rosrm.model.durations import LONGEST
 from rosrm.wording import get_close_matches
 
 _SIZES: Final = {
@@ -76,7 +77,8 @@ class Quantity:
     """Marks a number that may carry a unit and must lie within a range.
 
     Attributes:
-        measures: a key of `UNITS`: the units that may follow the number.
+        measures: a key of `UNITS`: the units that may follow the number. A duration is at most ten
+            years.
         low: least value allowed.
         high: greatest value allowed.
         above: the value must be greater than `low`.
@@ -97,6 +99,8 @@ class Quantity:
         if not math.isfinite(value) or self._outside(value):
             hint = f" ({self.hint})" if self.hint else ""
             raise ValueError(f"{given!r} is not {self.range()}{hint}")
+        if self.measures == "duration" and value > LONGEST:
+            raise ValueError(f"{given!r} is longer than ten years")
         if self.whole and value != int(value):
             raise ValueError(f"{given!r} is not a whole number")
         return int(value) if self.whole else value

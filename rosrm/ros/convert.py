@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar, get_type_hints
 
 from rosrm.errors import Refused
 from rosrm.model import values
+from rosrm.model.durations import LONGEST
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm_msgs import msg
 
@@ -192,12 +193,13 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "stop.terminate_grace": message.stop.terminate_grace,
         "host_loss.delay": message.host_loss.delay,
         "isolation.after": message.isolation.after,
-        "health.rate": message.health.rate,
         "health.timeout": message.health.timeout,
     }
     for name, seconds in times.items():
-        if not 0.0 <= seconds < _INFINITE:
-            return f"{name} is {seconds}; allowed: 0 and more"
+        if not 0.0 <= seconds <= LONGEST:
+            return f"{name} is {seconds}; allowed: 0 and more, at most ten years"
+    if not 0.0 <= message.health.rate < _INFINITE:
+        return f"health.rate is {message.health.rate}; allowed: 0 and more"
     return ""
 
 
@@ -220,8 +222,11 @@ def _restart_fault(message: msg.RestartPolicy) -> str:
     if not 1.0 <= message.factor < _INFINITE:
         return f"the factor of its restarts is {message.factor}; allowed: 1 and more"
     for name in ("delay", "max_delay", "window"):
-        if not 0.0 <= getattr(message, name) < _INFINITE:
-            return f"restart.{name} is {getattr(message, name)} s; allowed: 0 and more"
+        if not 0.0 <= getattr(message, name) <= LONGEST:
+            return (
+                f"restart.{name} is {getattr(message, name)} s; allowed: 0 and more, at most ten "
+                f"years"
+            )
     return ""
 
 
@@ -249,7 +254,7 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
 def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
     """Return the inverse of `assignment_to_msg`; raises `Refused`."""
     for name in ("fence_after", "fence_grace"):
-        if not 0.0 <= getattr(message, name) < _INFINITE:
+        if not 0.0 <= getattr(message, name) <= LONGEST:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
     fence = None
     if message.fence_after:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from rosrm.errors import Refused
+from rosrm.model.durations import LONGEST
 from rosrm.model.orders import (
     DropReplica,
     FenceInstance,
@@ -69,13 +70,21 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
             return StartInstance(convert.assignment_from_msg(request.assignment))
         case _Request.EXECUTE:
             arguments = convert.json_object(request.arguments, "the arguments of an executor")
-            return RunExecutor(request.executor, arguments, request.timeout)
+            return RunExecutor(request.executor, arguments, _seconds("timeout", request.timeout))
         case _Request.REPORT:
             return ReportInstances()
         case _Request.SET_RESTART:
             return SetRestartPolicy(instance, convert.restart_from_msg(request.restart))
         case _Request.KEEP:
-            return ReplicateSnapshot(instance, tuple(request.keep_on), request.keep_every)
+            every = _seconds("keep_every", request.keep_every)
+            return ReplicateSnapshot(instance, tuple(request.keep_on), every)
     if request.action not in _OF_INSTANCE:
         raise Refused(f"unknown action {request.action}")
     return _OF_INSTANCE[request.action](instance)
+
+
+def _seconds(name: str, value: float) -> float:
+    """Return a received time; raise `Refused` for one that would never end, or never begin."""
+    if not 0.0 <= value <= LONGEST:
+        raise Refused(f"{name} is {value}; allowed: 0 and more, at most ten years")
+    return value
