@@ -18,6 +18,7 @@ from typing import Any, Final
 from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.model.event_kinds import EventKind
+from rosrm.runtime.private_files import make_private_directory, make_private_file
 
 #: Version of the tables; a file with another version is refused.
 SCHEMA: Final = 1
@@ -65,7 +66,8 @@ class SqliteJournal:
         self._keep = keep_events
         self._wall = wall
         try:
-            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            make_private_directory(path.parent)
+            self._make_private()
         except OSError as error:
             raise fault_of(path, error) from error
         self._database = self._guarded(lambda: self._open(sync))
@@ -80,6 +82,7 @@ class SqliteJournal:
             raise sqlite3.DatabaseError("it is empty: not even tables are in it")
         database = sqlite3.connect(self._path, isolation_level=None, timeout=2.0)
         database.execute("PRAGMA journal_mode=WAL")
+        self._make_private()  # SQLite creates its files by the umask
         database.execute(f"PRAGMA synchronous={'FULL' if sync == 'full' else 'NORMAL'}")
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version not in (0, SCHEMA):
@@ -92,6 +95,11 @@ class SqliteJournal:
             self._make(database)
         database.execute(f"PRAGMA busy_timeout={_PATIENCE_MS}")
         return database
+
+    def _make_private(self) -> None:
+        """Keep the intents, which hold environments, from other users."""
+        for suffix in ("", "-wal", "-shm"):
+            make_private_file(f"{self._path}{suffix}")
 
     def _make(self, database: sqlite3.Connection) -> None:
         if database.execute("SELECT 1 FROM sqlite_master").fetchone() is not None:

@@ -18,6 +18,7 @@ from typing import Final
 
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress, installed_plugins
+from rosrm.runtime import private_files
 
 _OPTION: Final = "--settings-fd"
 
@@ -93,6 +94,7 @@ def run(role: str, serve: Callable[[Handover], int]) -> int:
         role: "master" or "slave".
         serve: runs until a stop signal; the message of a `RosrmError` that it raises is printed.
     """
+    private_files.set_private_umask()
     # The starting process blocked SIGINT (see `interrupts_held`); from now on it ends this one.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     logging.basicConfig(

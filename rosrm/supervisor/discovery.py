@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import SupervisorError
+from rosrm.runtime import private_files
 from rosrm.supervisor import endpoint
 from rosrm.supervisor.logs import LogLimits
 
@@ -49,6 +50,7 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
+        umask=private_files.user_umask(),  # its processes inherit it
     )
     assert process.stdout is not None
     with process.stdout as output:

@@ -33,6 +33,7 @@ from rosrm.core.supervisor.instance import (
 )
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
+from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
 
@@ -43,7 +44,7 @@ COMPACT_FACTOR: Final = 4
 #: Most faults of the record that are reported one by one.
 MOST_NOTES: Final = 20
 
-_APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+_APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT
 
 
 class InstanceRecordError(Exception):
@@ -299,7 +300,7 @@ class InstanceRecord:
 
     def _replace(self, text: bytes) -> None:
         new = f"{self._path}.new"
-        file = os.open(new, _APPEND | os.O_TRUNC, 0o600)
+        file = open_private(new, _APPEND | os.O_TRUNC)
         try:
             view = memoryview(text)
             while view:
@@ -315,7 +316,7 @@ class InstanceRecord:
     def _open_old(self) -> None:
         """Keep using the existing record, behind a tail that may be torn."""
         if self._file < 0:
-            self._file = os.open(self._path, _APPEND, 0o600)
+            self._file = open_private(self._path, _APPEND)
             self._waiting.insert(0, b"\n")
 
     def _add(self, fields: Mapping[str, Any]) -> None:

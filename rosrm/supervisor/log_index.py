@@ -17,6 +17,8 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from rosrm.runtime.private_files import open_private
+
 if TYPE_CHECKING:
     from typing_extensions import Self
 
@@ -38,8 +40,7 @@ def path_of(log: str) -> str:
 
 def add(log: str, mark: Mark) -> None:
     """Append a record; a start replaces the one before it if nothing was written in between."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
-    index = os.open(path_of(log), flags, 0o600)
+    index = open_private(path_of(log), os.O_RDWR | os.O_CREAT)
     try:
         end = os.fstat(index).st_size // _RECORD.size * _RECORD.size
         if mark.pid and end:
@@ -62,7 +63,7 @@ def size(log: str) -> int:
 def begin(log: str, mark: Mark, rest: bytes = b"") -> None:
     """Replace the index of a log file, as a whole."""
     new = f"{path_of(log)}.new"
-    index = os.open(new, os.O_WRONLY | os.O_TRUNC | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    index = open_private(new, os.O_WRONLY | os.O_TRUNC | os.O_CREAT)
     try:
         os.write(index, _RECORD.pack(*mark) + rest)
     finally:

@@ -15,6 +15,7 @@ from collections.abc import Collection, Container, Iterable
 from typing import Final, NamedTuple
 
 from rosrm.core.supervisor.rules import Key
+from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import log_index, own_log, paths
 from rosrm.supervisor.log_index import Mark
 
@@ -66,11 +67,8 @@ class LogKeeper:
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
         """Open the log of a starting instance; make room, but keep logs of `known` instances."""
-        log = os.open(
-            paths.log_file(self._state, *instance),
-            os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC,
-            0o600,
-        )
+        path = paths.log_file(self._state, *instance)
+        log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         self._opened[instance] = os.fstat(log).st_size
         self._folder.add(instance, known, self.limits)
         self._folder.remove_old_processes(known, self.limits)
@@ -229,7 +227,7 @@ def rotate(path: str, size: int, limits: LogLimits) -> None:
 
 
 def _copy(log: int, target: str, offset: int, end: int) -> None:
-    copy = os.open(target, os.O_WRONLY | os.O_TRUNC | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    copy = open_private(target, os.O_WRONLY | os.O_TRUNC | os.O_CREAT)
     try:
         while offset < end:
             sent = os.sendfile(copy, log, offset, end - offset)

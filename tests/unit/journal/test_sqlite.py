@@ -341,3 +341,34 @@ def test_full_sync_works_the_same(opened) -> None:
     journal = opened(sync="full")
     journal.write([Record("a")], [], 0.0)
     assert journal._database.execute("PRAGMA synchronous").fetchone() == (2,)
+
+
+def test_a_journal_is_private_also_in_a_directory_that_existed(tmp_path):
+    """Its intents hold the environment of each process, and so passwords."""
+    tmp_path.chmod(0o755)
+    before = os.umask(0o022)
+    try:
+        journal = SqliteJournal(tmp_path / "journal.sqlite")
+        journal.write([], [Intent("process", "p", {"environment": {"API_TOKEN": "x"}})], 0.0)
+        files = sorted(path.name for path in tmp_path.iterdir())
+        modes = {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+        journal.close()
+    finally:
+        os.umask(before)
+    assert files == ["journal.sqlite", "journal.sqlite-shm", "journal.sqlite-wal"]
+    assert modes == {0o600}
+    assert tmp_path.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_journal_of_an_earlier_release_becomes_private(tmp_path):
+    SqliteJournal(tmp_path / "journal.sqlite").close()
+    (tmp_path / "journal.sqlite").chmod(0o644)
+    SqliteJournal(tmp_path / "journal.sqlite").close()
+    assert (tmp_path / "journal.sqlite").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_journal_that_is_a_link_is_refused(tmp_path):
+    (tmp_path / "elsewhere").touch()
+    (tmp_path / "journal.sqlite").symlink_to("elsewhere")
+    with pytest.raises(JournalError, match="it is a symbolic link"):
+        SqliteJournal(tmp_path / "journal.sqlite")
