@@ -8,13 +8,15 @@ import sys
 import time
 from typing import Final
 
+from rosrm.wording import printable
+
 #: Bytes beyond which the log is emptied.
 MOST_BYTES: Final = 1 << 20
 
 
 def write(text: str) -> None:
     """Write one line, with the time by this host's clock."""
-    sys.stderr.write(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {text}\n")
+    sys.stderr.write(printable(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {text}\n"))
     sys.stderr.flush()
     _empty_if_full()
 

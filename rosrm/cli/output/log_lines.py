@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import sys
 import time
+from codecs import IncrementalDecoder, getincrementaldecoder
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from rosrm.client.logs import LogChunk
-from rosrm.wording import size
+from rosrm.wording import printable, size
 
 Marks = Sequence[tuple[float, int, int]]
 #: Output, and the unix time by which it was written; 0.0: not known.
@@ -26,6 +27,11 @@ def show(pieces: Iterable[Piece]) -> None:
     sys.stdout.flush()
 
 
+def is_terminal() -> bool:
+    """Return True if standard output is a terminal, which executes control characters."""
+    return sys.stdout.isatty()
+
+
 @dataclass
 class LogStream:
     """Output of one process in pieces.
@@ -34,12 +40,14 @@ class LogStream:
         name: of the process.
         prefix: begins each line; b"": no prefix, and bytes are copied as they are.
         timestamps: each line begins with the time by which it was written, by its host's clock.
+        raw: control characters, e.g. of colours, are left as the process wrote them.
         wrote: there was something to print.
     """
 
     name: str
     prefix: bytes = b""
     timestamps: bool = False
+    raw: bool = True
     wrote: bool = False
     _host: str = ""
     _is_new: bool = False
@@ -47,6 +55,9 @@ class LogStream:
     _when: float = 0.0
     _at_line_start: bool = True
     _pieces: list[Piece] = field(default_factory=list)
+    _decoder: IncrementalDecoder = field(
+        default_factory=lambda: getincrementaldecoder("utf-8")("backslashreplace")
+    )
 
     def take(self) -> list[Piece]:
         """Return the pieces that are ready, each once."""
@@ -112,6 +123,9 @@ class LogStream:
         self._add(self.prefix + stamp + line, when)
 
     def _add(self, text: bytes, when: float = 0.0) -> None:
+        if not self.raw:  # a character may be divided between two pieces
+            shown = self._decoder.decode(text).replace("\r\n", "\n")
+            text = printable(shown).encode()
         self._pieces.append((when, text))
         self._at_line_start = text.endswith(b"\n")
 
