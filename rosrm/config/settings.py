@@ -163,11 +163,13 @@ class JournalSettings:
     Attributes:
         sync: "normal" survives a SIGKILL of the master; "full" a power failure too.
         keep_events: number of newest events kept.
+        keep_bytes: most bytes of the events kept; refusals get a tenth of both at most.
         keep_ended: number of terminal processes that are not garbage-collected, the last to end.
     """
 
     sync: Literal["normal", "full"] = "normal"
     keep_events: PositiveCount = 100_000
+    keep_bytes: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 200_000_000
     keep_ended: PositiveCount = _CORE.keep_ended
 
 
@@ -263,10 +265,13 @@ class LogSettings:
     Attributes:
         max_bytes: size at which a log file is rotated.
         keep: number of rotated files kept beside the current one.
+        keep_bytes: most bytes of all logs on this host; beyond, those of the processes that were
+            started longest ago are removed first. Current files of running processes stay.
     """
 
     max_bytes: Annotated[int, Quantity("size", low=4096, whole=True)] = 10_000_000
     keep: Annotated[int, Quantity(high=1000, whole=True)] = 3
+    keep_bytes: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)

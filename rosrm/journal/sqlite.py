@@ -7,7 +7,6 @@ group and survives a power failure too.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sqlite3
 import time
@@ -17,6 +16,7 @@ from typing import Any, Final
 
 from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
+from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
 from rosrm.runtime.private_files import make_private_directory, make_private_file
 
@@ -36,8 +36,8 @@ CREATE TABLE IF NOT EXISTS intent (
 
 #: Milliseconds for which a write waits while another program holds the file.
 _PATIENCE_MS: Final = 200
-#: Excess of records at which old ones are deleted.
-_PRUNE_EVERY: Final = 1000
+#: Bytes to which the write-ahead log is cut after a checkpoint.
+_LONGEST_LOG: Final = 16 << 20
 
 
 class SqliteJournal:
@@ -47,6 +47,7 @@ class SqliteJournal:
         path: of the file; file and folder are created where missing.
         sync: "normal" or "full".
         keep_events: newest records kept.
+        keep_bytes: most bytes of the records; the file is larger by its intents and indexes.
         wall: unix time, seconds.
 
     Raises:
@@ -60,10 +61,10 @@ class SqliteJournal:
         *,
         sync: str = "normal",
         keep_events: int = 100_000,
+        keep_bytes: int = 200_000_000,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._path = path
-        self._keep = keep_events
         self._wall = wall
         try:
             make_private_directory(path.parent)
@@ -75,7 +76,9 @@ class SqliteJournal:
             lambda: self._database.execute("SELECT max(sequence) FROM record").fetchone()
         )
         self._sequence = int(newest[0] or 0)
-        self._since_pruned = 0
+        self._retention: Retention = self._guarded(
+            lambda: Retention(self._database, keep_events, keep_bytes)
+        )
 
     def _open(self, sync: str) -> sqlite3.Connection:
         if self._path.is_file() and not self._path.stat().st_size:
@@ -83,6 +86,7 @@ class SqliteJournal:
         database = sqlite3.connect(self._path, isolation_level=None, timeout=2.0)
         database.execute("PRAGMA journal_mode=WAL")
         self._make_private()  # SQLite creates its files by the umask
+        database.execute(f"PRAGMA journal_size_limit={_LONGEST_LOG}")
         database.execute(f"PRAGMA synchronous={'FULL' if sync == 'full' else 'NORMAL'}")
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version not in (0, SCHEMA):
@@ -130,38 +134,21 @@ class SqliteJournal:
         first = self._sequence + 1
         stored = [StoredRecord(first + i, wall, now, record) for i, record in enumerate(records)]
         newest = {(intent.table, intent.key): intent.value for intent in intents}
-        self._guarded(lambda: self._write(stored, newest))
+        rows = [_row(one) for one in stored]
+        self._guarded(lambda: self._write(rows, newest))
         self._sequence += len(stored)
-        self._since_pruned += len(stored)
-        if self._since_pruned >= _PRUNE_EVERY:
-            self._prune()
+        self._retention.add(rows)
         return stored
-
-    def _prune(self) -> None:
-        """Delete old records; ignore a failure, because the next call tries again."""
-        self._since_pruned = 0
-        oldest = self._sequence - self._keep
-        with contextlib.suppress(sqlite3.Error):
-            self._database.execute("DELETE FROM record WHERE sequence <= ?", (oldest,))
 
     def _write(
         self,
-        stored: Sequence[StoredRecord],
+        rows: Sequence[Row],
         intents: Mapping[tuple[str, str], Mapping[str, Any] | None],
     ) -> None:
         database = self._database
         database.execute("BEGIN IMMEDIATE")
         try:
-            database.executemany(
-                "INSERT INTO record VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                [
-                    (
-                        s.sequence, s.wall_time, s.elapsed, str(s.record.kind), s.record.process,
-                        s.record.host, s.record.message, json.dumps(s.record.facts, default=_plain),
-                    )
-                    for s in stored
-                ],
-            )  # fmt: skip
+            database.executemany("INSERT INTO record VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
             database.executemany(
                 "INSERT OR REPLACE INTO intent VALUES (?, ?, ?)",
                 [
@@ -222,6 +209,14 @@ class SqliteJournal:
     def close(self) -> None:
         """Flush and release the files."""
         self._guarded(self._database.close)
+
+
+def _row(stored: StoredRecord) -> Row:
+    record = stored.record
+    return (
+        stored.sequence, stored.wall_time, stored.elapsed, str(record.kind), record.process,
+        record.host, record.message, json.dumps(record.facts, default=_plain),
+    )  # fmt: skip
 
 
 def _facts(text: str) -> Mapping[str, Any]:

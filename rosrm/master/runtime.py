@@ -125,6 +125,7 @@ class MasterRuntime:
             self._journal = SqliteJournal(
                 config.state / "journal.sqlite",
                 sync=config.journal.sync, keep_events=config.journal.keep_events,
+                keep_bytes=config.journal.keep_bytes,
             )  # fmt: skip
             opened.callback(self._journal.close)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.

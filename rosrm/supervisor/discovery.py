@@ -41,7 +41,9 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
 def _start(state: Path, log: LogLimits, deadline: float) -> str:
     """Start a supervisor and wait for its first line; return "" if ready, else the error."""
     main = Path(__file__).with_name("__main__.py")
-    names = ("--log-max-bytes", "--log-keep", "--log-instances", "--log-processes")
+    names = (
+        "--log-max-bytes", "--log-keep", "--log-instances", "--log-processes", "--log-keep-bytes"
+    )  # fmt: skip
     limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
     command = [sys.executable, "-I", "-S", str(main), "--state", str(state), *limits]
     process = subprocess.Popen(

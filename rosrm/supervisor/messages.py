@@ -5,7 +5,8 @@ lines. An instance is `[process, number]`. Times are seconds, sizes bytes.
 
 The client sends orders; the key `do` names the order:
 
-    hello        protocol, pid, log             the first order; log: the limits of `LogLimits`
+    hello        protocol, pid, log,            the first order; log: the first four limits of
+                 log_bytes                      `LogLimits`; log_bytes: the last one
     environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
                  heard, memo
@@ -169,7 +170,9 @@ class Status(NamedTuple):
 def encode_order(order: Order) -> bytes:
     """Return an order as one line."""
     fields = order._asdict()
-    if isinstance(order, Environment):
+    if isinstance(order, Hello):
+        fields["log"], fields["log_bytes"] = order.log[:4], order.log.keep_bytes
+    elif isinstance(order, Environment):
         fields["variables"] = dict(order.variables)
     elif isinstance(order, Launch):
         fields = launch_fields(order)
@@ -248,7 +251,7 @@ def _read_amend(fields: Mapping[str, Any]) -> Amend:
 
 _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     "hello": lambda fields: Hello(
-        read_whole(fields["protocol"]), read_whole(fields["pid"]), _limits(fields["log"])
+        read_whole(fields["protocol"]), read_whole(fields["pid"]), _limits(fields)
     ),
     "environment": lambda fields: Environment(
         read_text(fields["id"]), read_texts(fields["variables"])
@@ -345,8 +348,12 @@ def _wait(value: Any) -> float:
     return min(read_amount(value), LONGEST)
 
 
-def _limits(value: Any) -> LogLimits:
-    return LogLimits.bounded(*map(read_whole, value))
+def _limits(fields: Mapping[str, Any]) -> LogLimits:
+    max_bytes, keep, instances, processes = map(read_whole, fields["log"])
+    keep_bytes = read_whole(
+        fields.get("log_bytes", LogLimits().keep_bytes)
+    )  # older slaves do not send it
+    return LogLimits.bounded(max_bytes, keep, instances, processes, keep_bytes)
 
 
 def _changes(value: Any) -> dict[str, str | None]:

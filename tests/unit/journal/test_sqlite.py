@@ -16,6 +16,7 @@ import pytest
 from rosrm.errors import JournalBlocked, JournalError
 from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.event_kinds import EventKind
 
 
 @pytest.fixture
@@ -372,3 +373,48 @@ def test_a_journal_that_is_a_link_is_refused(tmp_path):
     (tmp_path / "journal.sqlite").symlink_to("elsewhere")
     with pytest.raises(JournalError, match="it is a symbolic link"):
         SqliteJournal(tmp_path / "journal.sqlite")
+
+
+def size_of(journal) -> int:
+    return sum(len(one.record.message) for one in journal.records(newest=10**6))
+
+
+def test_old_events_are_pruned_by_their_bytes(path, opened) -> None:
+    """Ten thousand long messages fill no disk, and neither does the write-ahead log."""
+    journal = opened(keep_bytes=1_000_000)
+    for _ in range(300):
+        journal.write([Record("n", message="x" * 10_000)] * 10, [], 0.0)
+    kept = journal.records(newest=10**6)
+    assert 900_000 < size_of(journal) <= 1_000_000
+    assert kept[-1].sequence == 3000
+    assert sum(file.stat().st_size for file in path.parent.iterdir()) < 8_000_000
+    journal.close()
+    assert 900_000 < size_of(opened(keep_bytes=1_000_000)) <= 1_000_000
+
+
+def test_one_event_larger_than_the_bound_is_kept(opened) -> None:
+    """The newest event holds the number at which the next master continues."""
+    journal = opened(keep_bytes=1_000_000)
+    journal.write([Record("n")], [], 0.0)
+    journal.write([Record("n", message="x" * 2_000_000)], [], 0.0)
+    assert [one.sequence for one in journal.records()] == [2]
+    journal.close()
+    assert opened(keep_bytes=1_000_000).last_sequence == 2
+
+
+@pytest.mark.parametrize("long", ["", "x" * 1000])
+@pytest.mark.parametrize(
+    "kind", [EventKind.PEER_REFUSED, EventKind.HOST_REFUSED, EventKind.READING_REFUSED]
+)
+def test_a_flood_of_refusals_does_not_wipe_the_audit_trail(opened, kind, long) -> None:
+    """Anybody can cause refusals: they get a tenth of the record."""
+    journal = opened(keep_events=5000, keep_bytes=5_000_000)
+    trail = [Record(EventKind.SUBMITTED, f"p{number}") for number in range(1000)]
+    journal.write(trail, [], 0.0)
+    for _ in range(200):
+        journal.write([Record(kind, message=f"somebody was refused{long}")] * 100, [], 0.0)
+    kept = journal.records(newest=10**6)
+    submitted = [one for one in kept if one.record.kind is EventKind.SUBMITTED]
+    assert len(submitted) == 1000
+    assert 400 <= len(kept) - 1000 <= 1500 + 100
+    assert journal.last_sequence == 21_000

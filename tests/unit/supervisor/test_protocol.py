@@ -37,7 +37,7 @@ RULES = st.builds(
 )
 CHANGES = st.dictionaries(WORDS, st.none() | WORDS)
 ORDERS = st.one_of(
-    st.builds(messages.Hello, WHOLE, WHOLE, st.just(LogLimits(1, 2, 3, 4))),
+    st.builds(messages.Hello, WHOLE, WHOLE, st.just(LogLimits(1, 2, 3, 4, 5))),
     st.builds(messages.Environment, st.text(), st.dictionaries(WORDS, WORDS)),
     st.builds(
         messages.Launch,
