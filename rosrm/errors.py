@@ -56,7 +56,16 @@ class JournalError(RosrmError):
 
 
 class JournalBlocked(JournalError):
-    """The durable record cannot be written just now; nothing was changed, it may be tried again."""
+    """The durable record cannot be written just now; nothing was changed, it may be tried again.
+
+    Args:
+        message: for who started the master.
+        public: for clients, without paths of the master's machine; "": the message.
+    """
+
+    def __init__(self, message: str, public: str = "") -> None:
+        super().__init__(message)
+        self.public = public or message
 
 
 class RecordError(RosrmError):

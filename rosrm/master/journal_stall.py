@@ -29,7 +29,7 @@ class JournalStall:
 
     Attributes:
         commands: the commands that are not durable yet, in order.
-        reason: of the failure, as text for the user.
+        reason: of the failure, as text for clients.
         since: monotonic time of the first failure, seconds.
         core_now: time of the core's stopped clock.
         tried: monotonic time of the last attempt to write, seconds.

@@ -321,7 +321,7 @@ class MasterRuntime:
         try:
             stored = self._write(commands)
         except JournalBlocked as fault:
-            self._held = JournalStall(commands, str(fault), now, self._core_now(now), now)
+            self._held = JournalStall(commands, fault.public, now, self._core_now(now), now)
             _log.error(
                 "%s. Running processes continue; the master accepts no new work until then", fault
             )
@@ -342,7 +342,7 @@ class MasterRuntime:
         try:
             stored = self._write([back, *held.commands])
         except JournalBlocked as fault:
-            held.reason = str(fault)
+            held.reason = fault.public
             return False
         self._held, self._behind = None, now - held.core_now
         self._endpoint.events[:0] = held.waiting()

@@ -33,14 +33,14 @@ class CallbackGuard:
         self._places: dict[str, tuple[float, int]] = {}
 
     def call(self, callback: Callable[..., Any], *arguments: Any) -> str:
-        """Call a callback; return "" or the exception with file and line."""
+        """Call a callback; return "" or the exception for the peer, without paths of this host."""
         try:
             callback(*arguments)
         except (Exception, SystemExit, GeneratorExit) as fault:  # noqa: BLE001 - the guard
             place = place_in_rosrm(fault)
             reason = f"{describe_fault(fault)} ({place})"
             self._note(place, getattr(callback, "__qualname__", str(callback)), reason)
-            return reason
+            return f"{type(fault).__name__}; its log has the cause"
         except BaseException as interrupt:  # noqa: BLE001 - nothing may reach the executor
             self.interrupted = interrupt  # caused by a signal, which may arrive only once
         return ""

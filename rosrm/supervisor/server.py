@@ -179,7 +179,9 @@ class Server:
         try:
             pid = self._spawn_process(key)
         except spawn.SpawnError as error:
-            self._happened(SpawnFailed(key, str(error), error.transient))
+            # Everybody reads the reason: it names no path of this machine that no user wrote.
+            reason = str(error).replace(self._state, "STATE")
+            self._happened(SpawnFailed(key, reason, error.transient))
             return
         self._trees.add_child(key, pid, birth)
         self._logs.watch(key, time.monotonic(), pid)

@@ -15,6 +15,7 @@ import pytest
 
 from rosrm.errors import JournalBlocked, JournalError
 from rosrm.extensions.contracts import Intent, Record
+from rosrm.journal.errors import fault_of
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
 
@@ -418,3 +419,23 @@ def test_a_flood_of_refusals_does_not_wipe_the_audit_trail(opened, kind, long) -
     assert len(submitted) == 1000
     assert 400 <= len(kept) - 1000 <= 1500 + 100
     assert journal.last_sequence == 21_000
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        sqlite3.OperationalError("database or disk is full"),
+        sqlite3.OperationalError("disk I/O error"),
+        sqlite3.OperationalError("unable to open database file"),
+        sqlite3.OperationalError("database is locked"),
+        PermissionError(13, "Permission denied", "/home/somebody/state/journal.sqlite"),
+    ],
+)
+def test_clients_read_the_cause_of_a_stall_without_a_path(tmp_path, fault) -> None:
+    """Everybody may ask the master; who started it needs the path."""
+    error = fault_of(tmp_path / "journal.sqlite", fault)
+    assert isinstance(error, JournalBlocked)
+    assert str(tmp_path) in str(error)
+    assert str(tmp_path) not in error.public
+    assert "/home" not in error.public
+    assert error.public.startswith("the journal of the master cannot be used (")

@@ -196,11 +196,21 @@ def test_one_answer_is_bounded(tmp_path, log) -> None:
 
 
 def test_a_missing_log_is_refused(tmp_path) -> None:
-    """The refusal names the file."""
-    with pytest.raises(Refused, match="no log of robot/p#3"):
+    """The refusal names no path: everybody may ask."""
+    with pytest.raises(Refused, match="no log of robot/p#3") as refusal:
         read(tmp_path)
+    assert str(tmp_path) not in str(refusal.value)
     with pytest.raises(Refused, match="no log of nobody"):
         newest_instance(tmp_path, "nobody")
+
+
+def test_a_log_that_cannot_be_read_is_refused_without_its_path(tmp_path) -> None:
+    """A name of 300 letters ended the slave by an `OSError`."""
+    (tmp_path / "logs").mkdir()
+    query = LogQuery("p" * 300, 1)
+    with pytest.raises(Refused, match="cannot be read: File name too long") as refusal:
+        read_log(tmp_path, query, ended=True)
+    assert str(tmp_path) not in str(refusal.value)
 
 
 def test_newest_instance(tmp_path, log) -> None:

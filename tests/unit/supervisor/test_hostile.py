@@ -215,6 +215,20 @@ def test_a_process_that_cannot_exist_is_refused_alone(server, order):
         assert not one._client.gone
 
 
+def test_a_reason_names_no_path_of_the_state_directory(server, tmp_path):
+    """The master shows it to everybody."""
+    one = server()
+    one._take_over()
+    (tmp_path / "state/work").rmdir()
+    ours, peer = socket.socketpair()
+    with peer:
+        talk(one, ours, peer, start_fields())
+        one._round()
+    (instance,) = one._core.instances.values()
+    assert "'STATE/work' cannot be entered" in instance.message
+    assert str(tmp_path) not in instance.message
+
+
 def talk(server, ours, peer, order):
     """Connect to a server as its client, and send the base environment and an order."""
     environment = {"PATH": os.environ["PATH"]}
