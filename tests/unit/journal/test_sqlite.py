@@ -413,7 +413,7 @@ def test_a_flood_of_refusals_does_not_wipe_the_audit_trail(opened, kind, long) -
     trail = [Record(EventKind.SUBMITTED, f"p{number}") for number in range(1000)]
     journal.write(trail, [], 0.0)
     for _ in range(200):
-        journal.write([Record(kind, message=f"somebody was refused{long}")] * 100, [], 0.0)
+        journal.write([Record(kind, message=f"a host was refused{long}")] * 100, [], 0.0)
     kept = journal.records(newest=10**6)
     submitted = [one for one in kept if one.record.kind is EventKind.SUBMITTED]
     assert len(submitted) == 1000
@@ -428,7 +428,7 @@ def test_a_flood_of_refusals_does_not_wipe_the_audit_trail(opened, kind, long) -
         sqlite3.OperationalError("disk I/O error"),
         sqlite3.OperationalError("unable to open database file"),
         sqlite3.OperationalError("database is locked"),
-        PermissionError(13, "Permission denied", "/home/somebody/state/journal.sqlite"),
+        PermissionError(13, "Permission denied", "/home/ada/state/journal.sqlite"),
     ],
 )
 def test_clients_read_the_cause_of_a_stall_without_a_path(tmp_path, fault) -> None:

@@ -19,7 +19,7 @@ from rosrm.runtime.private_files import (
 )
 from rosrm.runtime.state_lock import only_one
 
-SOMEBODY = 12345
+OTHER_USER = 12345
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs files of another user")
 
 
@@ -62,7 +62,7 @@ def test_a_tightened_state_directory_is_logged_once(tmp_path, caplog):
 
 
 def test_a_state_directory_that_is_a_link_is_refused(tmp_path):
-    """Its target would be tightened and filled with files, whoever chose it."""
+    """Its target would be tightened and filled with files."""
     (tmp_path / "target").mkdir()
     (tmp_path / "state").symlink_to("target")
     with pytest.raises(OSError, match=f"symbolic link; name its target, {tmp_path}/target"):
@@ -100,8 +100,8 @@ def test_a_directory_below_one_that_all_may_write_is_refused(tmp_path):
 def test_the_directory_of_another_user_is_refused(tmp_path):
     state = tmp_path / "state"
     state.mkdir(0o700)
-    os.chown(state, SOMEBODY, -1)
-    said = f"belongs to user {SOMEBODY}, and this is user 0; give"
+    os.chown(state, OTHER_USER, -1)
+    said = f"belongs to user {OTHER_USER}, and this is user 0; give"
     with pytest.raises(ConfigError, match=said), only_one(state, "master", code="", remedy=""):
         pytest.fail("it was used")
     assert not list(state.iterdir())
@@ -110,12 +110,14 @@ def test_the_directory_of_another_user_is_refused(tmp_path):
 @as_root
 @pytest.mark.parametrize("link", [False, True])
 def test_a_directory_below_that_of_another_user_is_refused(tmp_path, link):
-    """That user could replace it at any time; a link of another user leads anywhere."""
+    """Such a directory can be replaced at any time, and such a link leads anywhere."""
     above, target = tmp_path / "above", tmp_path / "target"
     target.mkdir()
     above.symlink_to(target) if link else above.mkdir()
-    os.chown(above, SOMEBODY, -1, follow_symlinks=False)
-    with pytest.raises(OSError, match=f"{above} belongs to user {SOMEBODY}, who could replace it"):
+    os.chown(above, OTHER_USER, -1, follow_symlinks=False)
+    with pytest.raises(
+        OSError, match=f"{above} belongs to user {OTHER_USER}, who could replace it"
+    ):
         make_private_directory(above / "state")
     assert not (target / "state").exists()
 
@@ -167,8 +169,8 @@ def test_a_file_of_another_user_is_refused(tmp_path):
     """Its owner could open it before, and read everything that is written to it."""
     planted = tmp_path / "planted"
     planted.touch()
-    os.chown(planted, SOMEBODY, -1)
-    with pytest.raises(OSError, match=f"belongs to user {SOMEBODY}"):
+    os.chown(planted, OTHER_USER, -1)
+    with pytest.raises(OSError, match=f"belongs to user {OTHER_USER}"):
         open_private(str(planted), os.O_RDWR)
 
 
