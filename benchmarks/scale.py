@@ -44,7 +44,7 @@ from rosrm.testing.local_cluster import LocalCluster
 from rosrm_msgs import msg
 
 _ROOT = Path(__file__).resolve().parents[1]
-#: Seconds at the full rate before the count: in the first half minute slaves ask for work
+#: Seconds at the full rate before the count: in the first half minute slaves request work
 #: repeatedly, with growing intervals.
 _SETTLE = 30.0
 #: Seconds for a message on `master_load`, which comes once a second.

@@ -1,8 +1,7 @@
 """A resource manager for ROS 2: its Python client, and the names for plugins.
 
 rosrm decides on which host each process of a ROS 2 application runs, starts the process there,
-watches it, and moves it with its state. All that a Python program or a plugin needs comes from
-`rosrm` itself::
+watches it, and moves it with its state. Programs and plugins import all names from `rosrm`::
 
     import rosrm
 
@@ -20,9 +19,9 @@ A plugin marks its hooks with `hookimpl` and returns offers::
     def register_scoring_policies():
         return [ScoringOffer(name="fewest", create=Fewest, options=FewestOptions)]
 
-The public names, by what they are for:
+The public names, by purpose:
 
-Client          Client, load_work, RosSettings; its answers: Listing, ProcessRow, HostRow,
+Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health
@@ -42,12 +41,12 @@ Plugins         hookimpl, NoOptions, SkipPlugin
 Errors          RosrmError, ConfigError, PluginError, Refused, NoMaster
 Version         __version__, PROTOCOL_VERSION
 
-Seconds, bytes and fractions from 0 to 1 are the units everywhere. docs/reference/python.md shows
-the client at work, docs/reference/plugins.md has each hook and offer. Two packages have public
-names of their own: `rosrm.node` for authors of nodes that move with their state, and
-`rosrm.testing` for tests of plugins. All other modules are private and may change.
+All units are seconds, bytes and fractions from 0 to 1. docs/reference/python.md has examples of the
+client, docs/reference/plugins.md each hook and offer. Two packages have their own public names:
+`rosrm.node` for authors of nodes that move with their state, and `rosrm.testing` for tests of
+plugins. All other modules are private and may change.
 
-A name is imported when it is first used: `import rosrm` loads none of them.
+A name is imported at its first use: `import rosrm` loads none of them.
 """
 
 from typing import TYPE_CHECKING, Any, Final
@@ -153,7 +152,7 @@ if TYPE_CHECKING:
         StopPolicy,
     )
 
-# Written out, for the tools that read this file and do not run it. A test compares the three lists.
+# Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
     "PROTOCOL_VERSION", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
@@ -210,7 +209,7 @@ _MODULES: Final = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name at its first use."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module  # noqa: PLC0415 - `import rosrm` has no use for it

@@ -1,35 +1,35 @@
-"""Every error that rosrm raises on purpose."""
+"""Errors of rosrm, with messages for the user."""
 
 from __future__ import annotations
 
 from traceback import walk_tb
 from typing import Final
 
-#: Packages through which a plugin is loaded and called: their frames are never the plugin's own.
+#: Packages that load and call plugins; their frames are never frames of a plugin.
 _LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy"})
 
 
 class RosrmError(Exception):
-    """An error for the user: its text is the whole message, and no traceback is shown."""
+    """Error for the user: its text is the whole message, and no traceback is shown."""
 
     exit_code = 1
 
 
 class ConfigError(RosrmError):
-    """A file or an option that cannot be accepted; nothing of it was used."""
+    """A file or an option is invalid; none of its values were used."""
 
     exit_code = 2
 
 
 class PluginError(RosrmError):
-    """A plugin that does not import, raises, hangs or answers nonsense."""
+    """A plugin cannot be imported, raised, hung or returned an invalid value."""
 
 
 class Refused(RosrmError):
-    """A request that was understood and turned down; nothing was changed.
+    """A valid request was refused; nothing was changed.
 
     Args:
-        message: what, where, what is allowed.
+        message: cause, place, allowed values and remedy.
         code: the reason in one word, as in `rosrm_msgs/Answer`.
     """
 
@@ -45,22 +45,22 @@ class NoMaster(RosrmError):
 
 
 class LaunchError(RosrmError):
-    """A process that cannot be started on this host, and why.
+    """A process cannot be started on this host; the text gives the reason.
 
-    Only the first line is the reason: details such as a whole PATH go into further lines.
+    The first line is the reason; further lines have details, such as the PATH.
     """
 
 
 class JournalError(RosrmError):
-    """The durable record cannot be read or written."""
+    """The journal cannot be read or written."""
 
 
 class JournalBlocked(JournalError):
-    """The durable record cannot be written just now; nothing was changed, it may be tried again.
+    """The journal cannot be written at the moment; nothing was changed, and a retry is safe.
 
     Args:
-        message: for who started the master.
-        public: for clients, without paths of the master's machine; "": the message.
+        message: text for the user who started the master.
+        public: text for clients, without paths of the master's machine; "": the message.
     """
 
     def __init__(self, message: str, public: str = "") -> None:
@@ -69,7 +69,7 @@ class JournalBlocked(JournalError):
 
 
 class RecordError(RosrmError):
-    """The record of a master's run is none, damaged, cut short, or of another version."""
+    """A file is no recording, or the recording is damaged, cut short or of another version."""
 
     exit_code = 2
 
@@ -79,26 +79,26 @@ class SupervisorError(RosrmError):
 
 
 class TransferError(RosrmError):
-    """A directory cannot be offered to another host, or fetched from one; nothing is left of it."""
+    """A directory cannot be sent to another host or fetched from one; no partial copy remains."""
 
 
 class LabError(RosrmError):
-    """A virtual host or its network cannot be made, changed or found."""
+    """A virtual host or its network cannot be created, changed or found."""
 
 
 class CriuError(RosrmError):
-    """There is no CRIU that works here, or it could not dump or restore, and why."""
+    """CRIU does not work on this host, or failed to dump or restore; the text gives the reason."""
 
 
 class PortableError(RosrmError):
-    """A node that cannot be asked to leave the ROS graph or to join it again, or does not do it."""
+    """A portable node cannot be asked to leave or rejoin the ROS graph, or does not do so."""
 
 
 class SkipPlugin(Exception):
-    """Raised by a plugin's `create` to say that it is absent on this host, and why."""
+    """Raised by a plugin's `create` if it is absent on this host; the text gives the reason."""
 
 
-# --- errors of other people's code ------------------------------------------------------------
+# --- exceptions of plugins ----------------------------------------------------------------------
 
 
 def describe_fault(fault: BaseException) -> str:
@@ -113,7 +113,7 @@ def describe_fault(fault: BaseException) -> str:
 def describe_plugin_fault(fault: BaseException) -> str:
     """Return an exception in one line with the place in the plugin that raised it.
 
-    A `PluginError` is rosrm's own sentence about an answer, and is returned as it is.
+    The text of a `PluginError` is rosrm's own sentence, and is returned unchanged.
     """
     if isinstance(fault, PluginError):
         return str(fault)
@@ -122,7 +122,7 @@ def describe_plugin_fault(fault: BaseException) -> str:
 
 
 def place_in_rosrm(fault: BaseException) -> str:
-    """Return file and line of the innermost frame of rosrm itself; "" if there is none."""
+    """Return file and line of the innermost frame of rosrm; "" if there is none."""
     return _innermost(_frames(fault), "rosrm")
 
 

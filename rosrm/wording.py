@@ -1,4 +1,4 @@
-"""Words in messages: near matches ("did you mean ...?"), plurals, states, amounts with units."""
+"""Phrases for messages: near matches ("did you mean ...?"), plurals, states, amounts with units."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 
 _SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
 _BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
-#: Most names that a misspelt one is compared with: the master does so between two cycles.
+#: Highest number of names with which a misspelt name is compared, because the master's loop waits.
 _MOST_COMPARED: Final = 1000
 #: Commands that list the names of a kind.
 _LISTED_BY: Final = {"process": "rosrm ps --all", "host": "rosrm hosts"}
@@ -44,12 +44,12 @@ def get_close_matches(
 
 
 def no_such(kind: str, names: Sequence[str], known: Iterable[str]) -> str:
-    """Return the refusal of names that do not exist: the nearest ones, or those that there are.
+    """Return the refusal of unknown names, with the nearest known names or some of the known ones.
 
     Args:
         kind: "process" or "host".
-        names: that do not exist.
-        known: names of that kind, the likeliest first.
+        names: unknown names.
+        known: known names of that kind, the likeliest first.
     """
     there = list(islice(known, _MOST_COMPARED))
     most = 3 if len(names) == 1 else 1
@@ -74,20 +74,20 @@ def counted(number: int, singular: str, plural: str = "") -> str:
 
 
 def few(names: Iterable[str], most: int = 8) -> list[str]:
-    """Return at most `most` names; the last one is the number of those left out: "3 more"."""
+    """Return at most `most` names; the last item counts the others: "3 more"."""
     first = list(names)
     left_out = len(first) - most + 1
     return first if left_out < 2 else [*first[: most - 1], f"{left_out} more"]
 
 
 def listed(names: Iterable[str], word: str = "and", most: int = 8) -> str:
-    """Return `few` names as a sentence lists them: "none", "a", "a, b and c"."""
+    """Return `few` names as an enumeration: "none", "a", "a, b and c"."""
     *first, last = few(names, most) or ["none"]
     return f"{', '.join(first)} {word} {last}" if first else last
 
 
 def by_reason(reasons: Iterable[tuple[str, str]]) -> str:
-    """Return the reason of each name, an equal one once: "a and b: is lost; c: is full"."""
+    """Return names with their reasons, grouped by reason: "a and b: is lost; c: is full"."""
     names: dict[str, list[str]] = {}
     for name, reason in reasons:
         names.setdefault(reason, []).append(name)
@@ -100,7 +100,7 @@ def first_line(reason: str) -> str:
 
 
 def one_line(reason: str) -> str:
-    """Return a reason with the details of its further lines in one line."""
+    """Return a reason and its details, which are in further lines, as one line."""
     return reason.replace("\n", "; ")
 
 
@@ -110,12 +110,12 @@ def words(name: str) -> str:
 
 
 def standing(state: str) -> str:
-    """Return the state of a process as a sentence has it: "is in back-off", "has failed"."""
+    """Return the state of a process as a predicate: "is in back-off", "has failed"."""
     return _STANDING.get(state, f"is {words(state)}")
 
 
 def standing_for(state: str, time: str) -> str:
-    """Return a state and its time: "has been unreachable for 2 min", "finished 2 min ago"."""
+    """Return a state and its duration: "has been unreachable for 2 min", "finished 2 min ago"."""
     verb, _, rest = standing(state).partition(" ")
     if verb == "is":
         return f"has been {rest} for {time}"

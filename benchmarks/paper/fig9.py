@@ -37,7 +37,7 @@ _FEW: Final = (1, 100, 300)
 _SHARED_BY: Final = 2
 #: Change of a usage in a cycle; so large that each reading is sent at once.
 _STEP: Final = 0.1
-#: Seconds at the full rate before the count (because slaves ask for work repeatedly in the first
+#: Seconds at the full rate before the count (because slaves request work repeatedly in the first
 #: half minute), the same for a small run, and seconds of the count.
 _SETTLE, _SHORTLY, _SECONDS = 30.0, 3.0, 6.0
 #: Seconds after which the measurement of one number of slaves is given up, and for its end then.

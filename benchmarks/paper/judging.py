@@ -100,7 +100,7 @@ def not_to_emptiest(
 
 
 def first_looks(trace: Trace) -> dict[str, tuple[float, HostLook]]:
-    """Return the first look (s of the master's clock) at which each host asked for work."""
+    """Return the first look (s of the master's clock) at which each host requested work."""
     first: dict[str, tuple[float, HostLook]] = {}
     for look in trace.looks:
         for name, host in look.hosts.items():

@@ -142,12 +142,12 @@ class LabCluster:
         self._start(f"the holder on {host}", host, command)
 
     def wait_for_slaves(self, hosts: Sequence[str]) -> None:
-        """Wait until the slaves of some hosts are registered and ask for work."""
+        """Wait until the slaves of some hosts are registered and request work."""
 
         def asking(look: Look) -> bool:
             return all(name in look.hosts and look.hosts[name].accepting for name in hosts)
 
-        self.wait_until(f"slaves of {', '.join(hosts)} asking for work", asking, _START)
+        self.wait_until(f"slaves of {', '.join(hosts)} requesting work", asking, _START)
 
     def stop_master(self) -> None:
         """Shut down the master."""

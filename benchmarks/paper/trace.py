@@ -15,7 +15,7 @@ class HostLook:
         usage: of its memory, fraction; None: not known.
         in_flight: reservations: fraction that was assigned and is not in the reading yet.
         capacity: bytes.
-        accepting: it is under its limits and has asked for work.
+        accepting: it is under its limits and has requested work.
     """
 
     usage: float | None

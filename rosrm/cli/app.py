@@ -1,8 +1,8 @@
 """Entry point of the `rosrm` command.
 
 No module is imported before Ctrl-C is handled, and every command imports its modules when it runs.
-So `rosrm --help` is quick and needs no ROS. A command that asks the master joins ROS before
-anything else (`rosrm.cli.early`).
+So `rosrm --help` is quick and needs no ROS. A command that needs the master first joins ROS
+(`rosrm.cli.early`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Connect closed standard streams to /dev/null; otherwise files get their descriptors."""
+    """Connect closed standard streams to /dev/null, because files would get their descriptors."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             null = os.open(os.devnull, os.O_RDWR)  # takes the stream's number
@@ -59,7 +59,7 @@ def _run() -> None:
 def _leave(code: object) -> None:
     """Exit with a code, or with 1 if the rest of the output cannot be written.
 
-    If ROS was used, end the process at once, because Fast DDS sleeps 0.1 s at a normal exit.
+    If ROS was used, skip the normal exit, in which Fast DDS sleeps 0.1 s.
     """
     if not (code is None or isinstance(code, int)):
         return

@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from rosrm.model.rows import Listing
     from rosrm.ros.master_connection import MasterClient
 
-#: Seconds from the start of the command until the message that there is no master: less than 3,
-#: because leaving ROS takes time too.
-SAID_WITHIN: Final = 2.6
-#: Seconds for finding a master on this machine, counted after the imports.
-LEAST: Final = 1.5
+#: Seconds from the start of the command until the message that no master answers. The command ends
+#: within 3 s, and leaving ROS takes time too.
+REPORT_WITHIN: Final = 2.6
+#: Shortest time, in seconds, for finding a master, counted after the imports.
+SHORTEST_SEARCH: Final = 1.5
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
-    """Return the settings with which to join ROS.
+    """Return the ROS settings of the command.
 
-    The option of the command comes before the common options, and these before the file.
+    An option of the command overrides the common options, which override the file.
     """
     common = ctx.obj if isinstance(ctx.obj, CommonOptions) else CommonOptions()
     chosen = common.domain if domain is None else domain
@@ -52,13 +52,13 @@ def note(text: str) -> None:
     echo(f"rosrm: {text}", err=True)
 
 
-def say_trouble(snapshot: Listing) -> None:
-    """Print beside the listing that the master accepts no new work, and why."""
+def print_trouble(snapshot: Listing) -> None:
+    """Print to standard error why the master accepts no new work, if it does not."""
     if snapshot.trouble:
         note(snapshot.trouble)
 
 
 def connect(settings: RosSettings) -> MasterClient:
-    """Find the master within `SAID_WITHIN` s of the command's start, but in at least `LEAST` s."""
-    timeout = max(LEAST, SAID_WITHIN - (time.monotonic() - BEGUN))
+    """Find the master within `REPORT_WITHIN` of the start, but for at least `SHORTEST_SEARCH`."""
+    timeout = max(SHORTEST_SEARCH, REPORT_WITHIN - (time.monotonic() - BEGUN))
     return connecting.connect(settings, timeout=timeout, joined=early.take(settings), begun=BEGUN)

@@ -1,7 +1,7 @@
 """DDS participant that is created before the command line is parsed.
 
-The discovery of the master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and for
-tables take as long. Both run in parallel, because the participant is created first.
+The discovery of the master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and tables
+take as long. Both run in parallel if the participant is created first.
 """
 
 from __future__ import annotations
@@ -15,24 +15,25 @@ from rosrm.ros import names
 if TYPE_CHECKING:
     from rosrm.ros.participant import Participant
 
-#: Commands that ask the master.
+#: Commands that send requests to the master.
 ASKING: Final = frozenset({
     "submit", "cancel", "restart", "migrate", "checkpoint", "restore", "prune",
     "cordon", "uncordon", "drain", "status", "ps", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip
-#: Options with which a command joins ROS with other settings, or not at all.
+#: Options with which a command joins ROS with other settings or not at all.
 _OTHERWISE: Final = ("-h", "--help", "--domain", "--cluster", "--local")
 
 _made: list[Participant] = []
 
 
 def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Join ROS with the settings of the environment, if the command certainly asks the master.
+    """Join ROS with the settings of the environment, if the command surely needs the master.
 
     Args:
-        arguments: of the command line.
-        environment: if it names a file with ROS settings, `connect` joins ROS instead.
+        arguments: arguments of the command line.
+        environment: environment variables; if they name a file with ROS settings, do nothing,
+            because `connect` joins ROS with that file.
     """
     if not _is_wanted(arguments, environment):
         return
@@ -40,7 +41,7 @@ def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
         from rosrm.ros.participant import Participant  # noqa: PLC0415 - the first import of ROS
 
         _made.append(Participant(RosSettings(), names.client_node()))
-    except Exception:  # noqa: BLE001 - `connect` tries again, and reports the fault to the user
+    except Exception:  # noqa: BLE001 - `connect` retries, and reports the error to the user
         _made.clear()
 
 

@@ -32,13 +32,13 @@ _ELSEWHERE: Final = {
     )
     for word in words.split()
 }
-#: Commands of other distributions.
+#: Command to the distribution that has it.
 DISTRIBUTIONS: Final = {"criu": "rosrm-criu", "lab": "rosrm-lab", "simulate": "rosrm-simulate"}
-#: Wide enough that no summary of a command is cut.
+#: Width in which no summary of a command is cut.
 _UNCUT: Final = 1000
 #: Duplicate marks of repetition, as in "WORK......" and "[NAME...]...".
 _DOTS_TWICE: Final = re.compile(r"(\.\.\.\]?)\.\.\.")
-#: Base of all errors of a command line. typer exports no name for it.
+#: Base class of all errors of a command line, which typer does not export.
 _UsageError: Final = cast(type[Any], BadParameter.__mro__[1])
 _BRACES: Final = str.maketrans("", "", "{}")
 
@@ -65,7 +65,7 @@ class PlainCommand(TyperCommand):
 
 
 class PlainGroup(TyperGroup):
-    """Group of commands whose help prints the whole summary of each command."""
+    """Group of commands with uncut summaries in its help."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
@@ -92,7 +92,7 @@ def add_command(app: Typer, name: str, command: object) -> None:
 
 
 def hint_after(word: str, known: Iterable[str]) -> str:
-    """Return the commands meant by an unknown one, as a question; "" for none.
+    """Return a question with the commands nearest to an unknown one; "" for none.
 
     Args:
         word: a verb of another tool, or a misspelt command.

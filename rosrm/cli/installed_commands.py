@@ -1,7 +1,7 @@
 """Commands of other distributions, found by the entry-point group `rosrm.commands`.
 
-The search for entry points reads the metadata of every installed distribution, and a listing
-imports the commands. Therefore a command of rosrm itself causes neither.
+A search for entry points reads the metadata of every installed distribution, and a listing imports
+the commands. To stay quick, rosrm's own commands do neither.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def load_command(name: str, addresses: Sequence[PluginAddress]) -> Any:
     """Import a command; if that fails, return a command that raises `PluginError` when called.
 
     Args:
-        name: of the command.
-        addresses: of all distributions with a command of that name; at least one.
+        name: name of the command.
+        addresses: addresses of all commands of that name; at least one.
     """
     if len(addresses) > 1:
         brought_by = listed([one.distribution for one in addresses])

@@ -1,4 +1,4 @@
-"""Copies of process logs on standard output, merged by time, for `rosrm logs`."""
+"""Copy of process logs to standard output, merged by time, for `rosrm logs`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def copy_logs(client: Client, streams: Sequence[LogStream], selection: LogSelect
     """
     readers = client.log_readers([stream.name for stream in streams], selection)
     copies = [_Copy(reader, stream) for reader, stream in zip(readers, streams, strict=True)]
-    # `merge` takes the earliest of the next pieces; one without a time follows its predecessor.
+    # `merge` takes the earliest of the next pieces. A piece without a time follows its predecessor.
     show(merge(*(copy.begin() for copy in copies), key=itemgetter(0)))
     if selection.follow:
         _follow([copy for copy in copies if not copy.reader.at_end])
@@ -64,9 +64,9 @@ class _Copy:
     """Copy of the log of one process.
 
     Attributes:
-        reader: of the log.
-        stream: takes the bytes.
-        exit_code: of the error that ended the copy; 0: none.
+        reader: reader of the log.
+        stream: converts the bytes to output.
+        exit_code: exit code of the error that ended the copy; 0: none.
     """
 
     reader: LogReader
@@ -74,7 +74,7 @@ class _Copy:
     exit_code: int = 0
 
     def begin(self) -> Iterator[Piece]:
-        """Copy the existing log, and yield it in pieces."""
+        """Copy the existing log; return it in pieces."""
         try:
             for chunk in self.reader.read():
                 self.stream.write(chunk)
@@ -97,6 +97,6 @@ class _Copy:
         return chunk is not None
 
     def _fail(self, error: RosrmError) -> None:
-        """Report that the log cannot be read any further."""
+        """Report that the log cannot be read any more."""
         self.reader.at_end, self.exit_code = True, error.exit_code
         echo(f"rosrm: {error}", err=True)

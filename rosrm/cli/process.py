@@ -8,5 +8,5 @@ from typing import Final
 #: Monotonic start time of this process, from which the time-outs of a command count.
 BEGUN: Final = time.monotonic()
 
-#: Exit code of a program that was ended by Ctrl-C, as in a shell.
+#: Exit code of a program that Ctrl-C has ended, as in a shell.
 INTERRUPTED: Final = 130

@@ -26,7 +26,7 @@ def longest(text: str) -> float | None:
 
 @contextmanager
 def interruptible(what_follows: str) -> Iterator[None]:
-    """Return a context in which Ctrl-C ends only the wait, with a message about the rest."""
+    """Return a context in which Ctrl-C ends only the wait; print what continues."""
     try:
         yield
     except KeyboardInterrupt:

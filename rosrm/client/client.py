@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Union, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
 from rosrm.client.connecting import connect, ros_settings, row_of
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 Work = Union[str, "os.PathLike[str]", Mapping[str, Any], ProcessSpec]
 #: One name or several.
 Names = str | Iterable[str]
+#: Number of events in one listing that leaves out none, as in `List.srv`.
+_ALL_NEW: Final = 2**32 - 1
 
 
 def _warn(text: str) -> None:
@@ -58,6 +60,7 @@ class Client:
     Raises:
         NoMaster: no master answered in time.
         Refused: the master is of another version.
+        ConfigError: ROS cannot use a setting, or `cluster` is wrong.
         RosrmError: ROS 2 cannot be imported.
     """
 
@@ -75,11 +78,11 @@ class Client:
         """Queue processes, all or none, and return the master's message.
 
         Args:
-            work: the path of a work file, one process as a work file has it (a mapping with
-                `name`, `command` and so on), a `ProcessSpec`, or several of these.
+            work: path of a work file, a process as in a work file (a mapping with `name`, `command`
+                and so on), a `ProcessSpec`, or several of these.
 
         Raises:
-            ConfigError: a file or a mapping is wrong; nothing was sent.
+            ConfigError: a file or a mapping is invalid; nothing was sent.
         """
         return self._master.submit(_specs(work))
 
@@ -88,35 +91,32 @@ class Client:
         return self._master.cancel(_list(processes))
 
     def restart(self, processes: Names) -> str:
-        """Restart processes where they run; queue those that have ended. Return the message."""
+        """Restart processes on their hosts, or queue ended ones; return the master's message."""
         return self._master.restart(_list(processes))
 
     def migrate(self, process: str, host: str | None = None) -> str:
         """Begin to move a process, and return the master's message.
 
         Args:
-            process: by its name.
-            host: the destination; None: the master chooses.
+            process: name of the process.
+            host: name of the destination; None: the master chooses one.
         """
         return self._master.migrate(process, host)
 
     def checkpoint(self, process: str) -> str:
-        """Begin to stop a process with its memory in an image on its host; return the message."""
+        """Begin to checkpoint a process into an image on its host; return the master's message."""
         return self._master.checkpoint(process)
 
     def restore(self, process: str) -> str:
-        """Begin to restore a process from its image, on the host of the image.
-
-        Return the message.
-        """
+        """Begin to restore a process on the host of its image; return the master's message."""
         return self._master.restore(process)
 
     def cordon(self, host: str) -> str:
-        """Give a host no new work; return the master's message."""
+        """Stop assigning processes to a host; return the master's message."""
         return self._master.set_host_state(host, "cordon")
 
     def uncordon(self, host: str) -> str:
-        """Give a host work again; return the master's message."""
+        """Allow new processes on a host again; return the master's message."""
         return self._master.set_host_state(host, "uncordon")
 
     def drain(self, host: str) -> str:
@@ -140,17 +140,17 @@ class Client:
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
         host: str = "", after: int = 0, newest: int = 0,
     ) -> Listing:  # fmt: skip
-        """Return the listings that are asked for, in one request.
+        """Return the requested listings; one request reads all of them.
 
         Args:
-            hosts: list them.
-            processes: list them.
-            plugins: list them all, or those that are "failing".
-            events: list them, the oldest first.
-            process: list no other process, and only its events.
-            host: list only the events of this host.
-            after: list only events after this sequence.
-            newest: list so many events at most; 0: 1000.
+            hosts: True: list the hosts.
+            processes: True: list the processes.
+            plugins: True: list all plugins; "failing": only the failing ones.
+            events: True: list events, the oldest first.
+            process: limit processes and events to this process; "": all.
+            host: limit events to this host; "": all.
+            after: limit events to those after this sequence.
+            newest: most events; 0: 1000.
         """
         return self._master.list(
             hosts=hosts, processes=processes, plugins=plugins, events=events, process=process,
@@ -158,7 +158,7 @@ class Client:
         )  # fmt: skip
 
     def list_processes(self) -> Sequence[ProcessRow]:
-        """Return all processes, those that have ended too."""
+        """Return all processes, including ended ones."""
         return self.list(processes=True).processes
 
     def list_hosts(self) -> Sequence[HostRow]:
@@ -170,15 +170,15 @@ class Client:
         return self.list(plugins=True).plugins
 
     def get_process(self, name: str) -> ProcessRow:
-        """Return a process; raise `Refused` if there is none of that name."""
+        """Return a process; raise `Refused` for an unknown name."""
         return row_of("process", name, {row.name: row for row in self.list_processes()})
 
     def get_host(self, name: str) -> HostRow:
-        """Return a host; raise `Refused` if there is none of that name."""
+        """Return a host; raise `Refused` for an unknown name."""
         return row_of("host", name, {row.description.name: row for row in self.list_hosts()})
 
     def explain(self, process: str) -> Mapping[str, Any]:
-        """Return why a process is where it is, or why it waits: JSON as of `rosrm explain`."""
+        """Return the reasons for a process's placement or wait, as `rosrm explain --json`."""
         try:
             return self._master.explain(process)
         except Refused as refusal:
@@ -195,12 +195,12 @@ class Client:
         """Yield events of the cluster, the oldest first.
 
         Args:
-            process: only its events; "": of all.
-            host: only its events; "": of all.
-            after: only events after this sequence, which the last event had, for example.
-            newest: at most so many of those that there are; 0: 1000.
-            follow: then yield what is new, until the time-out.
-            timeout: seconds for which to follow; None: without end.
+            process: name of the process of the events; "": all.
+            host: name of the host of the events; "": all.
+            after: sequence before the first event, for example that of the last received one.
+            newest: most existing events; 0: 1000.
+            follow: True: then yield new events until the time-out.
+            timeout: seconds of following; None: no limit.
         """
         deadline = deadline_after(timeout)
         while True:
@@ -212,28 +212,28 @@ class Client:
             yield from view.events
             if not follow or time.monotonic() >= deadline:
                 return
-            after, newest = view.last_sequence, 0
+            after, newest = view.last_sequence, _ALL_NEW
             time.sleep(PERIOD)
 
     def logs(
         self, process: str, *, tail: int = 0, since: float = 0.0, host: str = "",
         follow: bool = False, timeout: float | None = None,
     ) -> Iterator[LogChunk]:  # fmt: skip
-        """Yield what a process wrote, over restarts and migrations, the oldest first.
+        """Yield the output of a process over restarts and migrations, the oldest first.
 
         Args:
-            process: by its name.
-            tail: the last lines only, so many; 0: all.
-            since: unix time: only what was written then or later; 0: all.
-            host: only what was written there; "": everywhere.
-            follow: then yield what is new, until the process has ended or the time-out passes.
-            timeout: seconds for which to follow; None: no limit.
+            process: name of the process.
+            tail: number of last lines; 0: all lines.
+            since: unix time of the oldest output; 0: all output.
+            host: name of the host of the output; "": all hosts.
+            follow: True: then yield new output until the process has ended, or until the time-out.
+            timeout: seconds of following; None: no limit.
 
         Raises:
             Refused: the process has no log, or its host is not up.
             NoMaster: master or slave did not answer.
         """
-        from rosrm.client import logs  # noqa: PLC0415 - for those who read logs
+        from rosrm.client import logs  # noqa: PLC0415 - only for logs
 
         deadline = deadline_after(timeout)
         selection = logs.LogSelection(tail, since, host, follow)

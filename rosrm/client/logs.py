@@ -34,10 +34,10 @@ class LogSelection:
     """Selects a part of a log.
 
     Attributes:
-        tail: the last lines only, so many; 0: all.
-        since: unix time (s): only what was written then or later; 0.0: all.
-        host: only what was written there; "": everywhere.
-        follow: until the process has ended.
+        tail: number of last lines; 0: all lines.
+        since: unix time (s) of the oldest output; 0.0: all output.
+        host: name of the host of the output; "": all hosts.
+        follow: True: read until the process has ended.
     """
 
     tail: int = 0
@@ -297,7 +297,7 @@ def _hosts_of(listed: Listing) -> list[str]:
 
 
 def _why_away(row: HostRow | None, host: str) -> str:
-    """Say why a host cannot be asked; "" if it can."""
+    """Return why a host cannot be asked; "" if it can."""
     if row is None:
         return f"the master knows no host {host}"
     if row.state == "up":

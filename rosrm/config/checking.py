@@ -1,4 +1,4 @@
-"""Validation of a document against a dataclass by pydantic, with error messages of our own."""
+"""Validation of a document against a dataclass by pydantic, with rosrm's error messages."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ _BOUNDS: Final = {
 
 
 def validated(wanted: type[T], node: Node, problems: Problems, where: str = "") -> T | None:
-    """Return the value of a document, or None if there are problems, all of which are noted.
+    """Return the value of a document, or note all problems and return None.
 
     Args:
         wanted: a dataclass; its annotations define the allowed values.
@@ -106,8 +106,8 @@ def salvaged(wanted: type[T], node: Node, problems: Problems) -> tuple[T | None,
     """Read the correct members of a document, and note every problem.
 
     Returns:
-        The value, with the defaults of wrong members (None: a member without a default is wrong),
-        and the keys of the wrong members. An unknown key counts as the one that its message names.
+        The value, with defaults for wrong members (None: a member without a default is wrong), and
+        the keys of the wrong members. An unknown key counts as the key that its message suggests.
     """
     faults = Problems()
     value = validated(wanted, node, faults)
@@ -126,7 +126,7 @@ def salvaged(wanted: type[T], node: Node, problems: Problems) -> tuple[T | None,
 
 
 def _lies_in(node: Node, place: Place) -> bool:
-    """Return True if a place is that of the value, of its key, or of anything in the value."""
+    """Return True if a place is that of a value, of its key, or of a member of the value."""
     inner = node.value if isinstance(node.value, tuple) else node.items.values()
     return place in (node.place, node.key_place) or any(_lies_in(one, place) for one in inner)
 
@@ -149,21 +149,21 @@ def near(given: str, allowed: Mapping[str, Any] | list[str] | tuple[str, ...]) -
 
 
 def _closest_key(given: str, allowed: list[str]) -> list[str]:
-    """Return the key that an unknown one stands for, as a list of one; [] if there is none."""
+    """Return the known key nearest to an unknown key, as a list of one item; [] if none is."""
     misspelt = get_close_matches(given, allowed, 1, _MISSPELT)
     equivalent = [key for key in allowed if key == _ELSEWHERE.get(given)]
     return misspelt or equivalent or get_close_matches(given, allowed, 1)
 
 
 def _meant(close: list[str], allowed: Iterable[str]) -> str:
-    """Return the text after an unknown name: the name that is meant, and the allowed ones."""
+    """Return the text after an unknown name: a suggestion, and the allowed names."""
     meant = f"; did you mean {close[0]!r}?" if close else "."
     return f"{meant} Allowed: {', '.join(allowed) or 'none'}"
 
 
 @cache
 def _holder(wanted: type[Any]) -> type[BaseModel]:
-    """Return a model around the dataclass, through which strictness applies to all nested types."""
+    """Return a model with the dataclass as a field, which makes all nested types strict."""
     return create_model("Holder", __config__=_STRICT, value=(wanted, ...))
 
 
@@ -180,18 +180,18 @@ def _note(
         problems.add(target.key_place or target.place, note)
         return
     prefix = _named(path, where)
-    problems.add(target.place, (f"{prefix}: " if prefix else "") + _said(error))
+    problems.add(target.place, (f"{prefix}: " if prefix else "") + _message_of(error))
 
 
 def _named(path: tuple[str | int, ...], where: str) -> str:
-    """Return a path in readable form after its section: `options of X: many[2].delay`."""
+    """Return a section and a path as text: `options of X: many[2].delay`."""
     text = ""
     for step in path:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
     return ": ".join(part for part in (where, text) if part)
 
 
-def _said(error: Mapping[str, Any]) -> str:
+def _message_of(error: Mapping[str, Any]) -> str:
     kind, given = error["type"], error.get("input")
     if kind == "value_error":
         return _cause(error["ctx"]["error"], error["loc"])
@@ -218,7 +218,7 @@ def _not_one_of(given: Any, expected: str) -> str:
 
 
 def _is_known(wanted: type[Any], error: Mapping[str, Any]) -> bool:
-    """Return True if an error reports an unknown key that some type at its place has."""
+    """Return True if an error reports an unknown key that another type at its place has."""
     path = _path(wanted, error["loc"][1:])
     return error["type"] in _UNKNOWN_KEY and path[-1] in _keys(wanted, path[:-1])
 
@@ -230,9 +230,9 @@ def _keys(wanted: Any, path: tuple[str | int, ...]) -> list[str]:
 
 
 def _path(wanted: Any, steps: Iterable[str | int]) -> tuple[str | int, ...]:
-    """Return the path of an error in the document, from that of pydantic.
+    """Return the path of an error in the document, converted from pydantic's path.
 
-    That has "[key]" before a key, and below a union the member that was tried.
+    pydantic's path also has "[key]" before a key, and below a union the type that was tried.
     """
     path: tuple[str | int, ...] = ()
     is_member = False
@@ -252,7 +252,7 @@ def _types_at(wanted: Any, path: tuple[str | int, ...]) -> list[Any]:
 
 
 def _inside(wanted: Any, step: str | int) -> Iterator[Any]:
-    """Yield the unwrapped types that are allowed under a key or index of a type."""
+    """Return the unwrapped types that are allowed under a key or index of a type."""
     if is_dataclass(wanted) and isinstance(wanted, type):
         hint = get_type_hints(wanted, include_extras=True).get(str(step))
         yield from _unwrapped(hint)

@@ -16,9 +16,9 @@ from rosrm.config.settings import ClusterConfig
 from rosrm.extensions.registry import Registry
 from rosrm.model.rows import PluginKind
 
-#: Sections that the rules on times read.
+#: Sections that `_check_times` reads.
 _OF_TIME: Final = ("liveness", "control")
-#: Beat periods that `liveness.suspect` must cover; a slave without news sends one message in each.
+#: Beat periods in `liveness.suspect`; a slave without changes sends one message in each period.
 _BEATS: Final = 3
 #: Tolerance for floating point: three times 0.2 s is slightly more than 0.6 s.
 _ROUNDING: Final = 1e-9
@@ -28,9 +28,8 @@ def load_cluster(path: str | Path, registry: Registry | None = None) -> ClusterC
     """Read a master's settings; raises one `ConfigError` with all problems.
 
     Args:
-        path: of the file.
-        registry: the installed plugins; without it the names and options of plugins are not
-            checked.
+        path: path of the file.
+        registry: the installed plugins; None: names and options of plugins are not checked.
     """
     return checked_cluster(read(path), path, registry)
 
@@ -41,7 +40,7 @@ def default_cluster(registry: Registry | None = None) -> ClusterConfig:
 
 
 def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> ClusterConfig:
-    """Return a master's settings from a parsed document; otherwise as `load_cluster`."""
+    """Return a master's settings from a parsed document, with the checks of `load_cluster`."""
     problems = Problems()
     check_kind(root, "cluster")
     config, wrong = salvaged(ClusterConfig, root, problems)

@@ -17,7 +17,7 @@ import yaml
 
 from rosrm.errors import ConfigError
 
-#: Most values in one file; values behind an alias count at each use of the alias.
+#: Highest number of values in one file; values behind an alias count at each use of the alias.
 MOST_VALUES: Final = 200_000
 
 
@@ -35,7 +35,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """Value of a document with its place and the place of its key, if any."""
+    """Value of a document, with its place and the place of its key, if any."""
 
     value: Value
     place: Place
@@ -93,7 +93,7 @@ class Problems:
         return bool(self.found)
 
     def add(self, place: Place, text: str) -> None:
-        """Note a problem; duplicates at the same place are dropped."""
+        """Note a problem; drop a duplicate at the same place."""
         self.found[place, text] = None
 
     def raise_any(self) -> None:
@@ -136,7 +136,7 @@ def parse(text: str, file: str) -> Node:
         root = _Loader(text).get_single_node()
         return Node({}, Place(file, 1, 1)) if root is None else _Builder(file).build(root)
     except yaml.MarkedYAMLError as error:
-        raise ConfigError(f"{_place_of(error, file)}: unreadable YAML: {_said(error)}") from None
+        raise ConfigError(f"{_place_of(error, file)}: unreadable YAML: {_text_of(error)}") from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         column = error.position - (text.rfind("\n", 0, error.position) + 1) + 1
@@ -187,7 +187,7 @@ def _place_of(error: yaml.MarkedYAMLError, file: str) -> Place:
     return Place(file, mark.line + 1, mark.column + 1) if mark else Place(file, 1, 1)
 
 
-def _said(error: yaml.MarkedYAMLError) -> str:
+def _text_of(error: yaml.MarkedYAMLError) -> str:
     return " ".join(part for part in (error.context, error.problem) if part)
 
 
@@ -231,7 +231,7 @@ _SCALARS: Final[Mapping[str, Any]] = {
 
 
 class _Builder:
-    """Conversion of PyYAML's nodes into ours, which collects all errors of form."""
+    """Conversion of PyYAML's nodes to `Node`, which collects all errors of form."""
 
     def __init__(self, file: str) -> None:
         self._file = file
@@ -248,7 +248,7 @@ class _Builder:
         place = self._place(node)
         self._count += 1
         if id(node) in self._open:
-            raise ConfigError(f"{place}: an alias that stands for itself")
+            raise ConfigError(f"{place}: an alias that contains itself")
         if self._count > MOST_VALUES:
             raise ConfigError(f"{place}: more than {MOST_VALUES} values")
         self._open.add(id(node))

@@ -19,13 +19,15 @@ from typing import Final
 from rosrm.config.checking import described, near
 from rosrm.config.documents import Node, Problems
 
-#: Most processes that one entry may expand to.
+#: Highest number of processes to which one entry may expand.
 MOST: Final = 10_000
 
 Scalar = bool | int | float | str
 Row = Mapping[str, Scalar]
 
-_RANGE: Final = re.compile(r"range\(\s*(-?\d+)\s*(?:,\s*(-?\d+)\s*)?(?:,\s*(-?\d+)\s*)?\)")
+_RANGE: Final = re.compile(
+    r"range\(\s*(-?\d{1,18})\s*(?:,\s*(-?\d{1,18})\s*)?(?:,\s*(-?\d{1,18})\s*)?\)"
+)
 _PIECE: Final = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
 _TOO_WIDE: Final = re.compile(r"\d{4}")
 _WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
@@ -47,7 +49,7 @@ def expanded(entry: Node, problems: Problems) -> Iterator[Node]:
 
 
 def _checked_rows(foreach: Node, problems: Problems) -> list[Row]:
-    """Return the values for each process; none if there are problems, all of which are noted."""
+    """Return the values of each process, or note all problems and return none."""
     faults = Problems()
     rows = _rows(foreach, faults)
     if not rows and not faults:
@@ -87,7 +89,7 @@ def _substituted(node: Node, row: Row, problems: Problems) -> Node:
 
 def _row(item: Node, problems: Problems) -> Row:
     if not item.items:
-        problems.add(item.place, "foreach: each of a list is a mapping from names to values")
+        problems.add(item.place, "foreach: each entry of a list must map names to values")
     return {name: value for name, node in item.items.items() for value in _one(node, problems)}
 
 
@@ -97,8 +99,8 @@ def _check_same_names(foreach: Node, rows: list[Row], problems: Problems) -> Non
         if set(row) != set(rows[0]):
             problems.add(
                 node.place,
-                f"foreach: gives {', '.join(row)}, and the first of the list "
-                f"{', '.join(rows[0])}: all must give the same names",
+                f"foreach: this entry has the names {', '.join(row)}, and the first entry "
+                f"{', '.join(rows[0])}; all must have the same names",
             )
 
 
@@ -168,6 +170,6 @@ def _piece(found: re.Match[str], row: Row) -> str:
 
 def _formatted(value: Scalar, form: str) -> str:
     if not _TOO_WIDE.search(form):
-        with suppress(ValueError):
+        with suppress(ValueError, OverflowError):
             return format(value, form)
     raise ValueError(f"{form!r} is no format for {described(value)}")

@@ -21,11 +21,15 @@ def load_host(path: str | Path, registry: Registry | None = None) -> HostConfig:
     """Read a slave's settings; raises one `ConfigError` with all problems.
 
     Args:
-        path: of the file.
-        registry: the installed plugins; without it the names and options of plugins are not
-            checked.
+        path: path of the file.
+        registry: the installed plugins; None: names and options of plugins are not checked.
     """
-    root, problems = read(path), Problems()
+    return checked_host(read(path), path, registry)
+
+
+def checked_host(root: Node, path: str | Path, registry: Registry | None) -> HostConfig:
+    """Return a slave's settings from a parsed document; otherwise as `load_host`."""
+    problems = Problems()
     check_kind(root, "host")
     config = validated(HostConfig, root, problems)
     _check_rules(root, problems)

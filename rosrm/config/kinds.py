@@ -13,8 +13,8 @@ from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import ConfigError
 from rosrm.wording import get_close_matches
 
-#: Keys of a simulation's workload. The distribution `rosrm-simulate` reads such a file. The keys
-#: are here so that other commands recognise such a file without that distribution.
+#: Keys of a simulation's workload. The distribution `rosrm-simulate` reads such a file, but other
+#: commands must recognise it without that distribution.
 SIMULATION_KEYS: Final = (
     "name", "seed", "until", "hosts", "processes", "model", "cluster", "variants",
 )  # fmt: skip
@@ -42,7 +42,7 @@ def kind_of(root: Node) -> str:
     """Return the kind of file: "cluster", "host", "work" or "simulation".
 
     Raises:
-        ConfigError: its keys fit no kind, or several equally, and its name fits none either.
+        ConfigError: its keys fit no kind, or several equally, and its name fits no kind.
     """
     best = _best(set(root.items))
     if len(best) == 1:

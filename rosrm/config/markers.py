@@ -1,6 +1,6 @@
-"""Annotations of settings whose form in a file differs from their value.
+"""Annotations of settings with another form in a file than as a value.
 
-Only pydantic calls the hooks below, when it reads a file. So the settings import without pydantic.
+Only pydantic calls these hooks, when it validates a file. So the settings do not import pydantic.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Final
 
 @dataclass(frozen=True)
 class NullIsEmpty:
-    """Mark of options that may be left out after the colon; null means no options."""
+    """Annotation of options that a file may leave empty; null means no options."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema that replaces null by `{}`."""
@@ -27,7 +27,7 @@ class NullIsEmpty:
 
 @dataclass(frozen=True)
 class OptionsByName:
-    """Mark of plugins given as a list of names, or as a mapping from name to options."""
+    """Annotation of plugins given as a list of names, or as a mapping from name to options."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema that converts a list of names into a mapping to no options."""
@@ -51,7 +51,7 @@ class OptionsByName:
 
 @dataclass(frozen=True)
 class RosSection:
-    """Mark of the section `ros`, which is nested in a file and flat as a value."""
+    """Annotation of the section `ros`, which is nested in a file and flat as a value."""
 
     def in_file(self) -> type[Any]:
         """Return the type of the section as written in a file."""
@@ -71,7 +71,7 @@ class RosSection:
 
 @dataclass(frozen=True)
 class PlainWord:
-    """Mark of text that needs no quotes even if YAML reads a number or a boolean."""
+    """Annotation of text that needs no quotes, even if YAML reads it as a number or boolean."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema that converts a scalar into text."""
@@ -89,7 +89,7 @@ class PlainWord:
 
 @dataclass(frozen=True)
 class Words:
-    """Mark of a list of words, or of one text that is split as a shell splits it."""
+    """Annotation of a list of words, or of one text that is split by the rules of a shell."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema that splits a text into words."""

@@ -21,7 +21,7 @@ def written_out(entry: Node) -> Node:
 
 
 def merged(defaults: Node, entry: Node) -> Node:
-    """Return an entry with defaults for missing keys, mappings merged deeply; both written out."""
+    """Return an entry with defaults for missing keys, mappings merged deeply; both in long form."""
     under = dict(defaults.items)
     if any(name in entry.items for name in _PROGRAM):
         under = {name: node for name, node in under.items() if name not in _PROGRAM}
@@ -46,7 +46,7 @@ def _without_options(node: Node) -> Node:
 
 
 def _word(name: str) -> Callable[[Node], Node]:
-    """Return the conversion of `restart: always` to `restart: {when: always}`, for any key."""
+    """Return a conversion such as `restart: always` to `restart: {when: always}`, for any key."""
 
     def long_form(node: Node) -> Node:
         if isinstance(node.value, Mapping):

@@ -1,4 +1,4 @@
-"""Check of the plugins that a file names, and of their options, against the installed ones."""
+"""Check of plugin names and options in a file against the installed plugins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rosrm.model.codec import to_plain
 from rosrm.model.rows import PluginKind
 from rosrm.model.values import ProcessSpec
 
-#: Entry of `probes` that selects all probes that are read by default.
+#: Entry of `probes` that selects all default probes.
 DEFAULT_PROBES: Final = "default"
 
 
@@ -41,7 +41,7 @@ class PluginCheck:
         return self._registry is None or name in self._registry.names(kind)
 
     def standby_fault(self, spec: ProcessSpec) -> str:
-        """Return why a process cannot have the standby that it asks for; "": it can, or may."""
+        """Return why a process cannot have its requested standby; "": no reason is known."""
         strategy = spec.migration.strategy
         if not spec.standby.wanted or (strategy and self._registry is None):
             return ""
@@ -58,10 +58,10 @@ class PluginCheck:
         """Return the options of one chosen plugin.
 
         Args:
-            kind: of the plugin.
-            name: of the offer.
-            named: value that names the plugin in the file.
-            options: as given in the file; None: none.
+            kind: kind of the plugin.
+            name: name of the offer.
+            named: node of the name in the file.
+            options: node of the options in the file; None: no options.
             own: True for the options of one process.
         """
         given = options if options is not None and options.value is not None else None
@@ -102,9 +102,9 @@ class PluginCheck:
         """Note names of resources that no installed probe reads, or none of the chosen ones.
 
         Args:
-            named: a mapping from resources, or a list of them.
+            named: a mapping from resources, or a list of resources.
             where: prefix of each message.
-            probes: the chosen ones; None: all installed ones.
+            probes: names of the chosen probes; None: all installed probes.
         """
         if self._registry is None or named is None:
             return
@@ -114,7 +114,7 @@ class PluginCheck:
             reads = self._registry.probes_of(name)
             if not reads:
                 note = f"unknown resource {name!r}{near(name, self._registry.resources())}"
-                note += " (what the probes that are installed here read)"
+                note += " (resources of the probes that are installed here)"
             elif probes is not None and not set(reads) & set(probes):
                 note = f"{name!r} is read by the probe {reads[0]!r}, which is not among `probes`"
             else:
@@ -124,7 +124,7 @@ class PluginCheck:
     def by_name(self, kind: PluginKind, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
         """Return the options of each plugin in a list of names or a mapping from name to options.
 
-        For probes, the name `default` selects the default ones.
+        The name `default` selects the default probes.
         """
         if chosen is None:
             return {}

@@ -42,7 +42,7 @@ ListOfWords = Annotated[tuple[Text, ...], Words()]
 
 @dataclass(frozen=True, slots=True)
 class RestartInFile:
-    """Policy for restarts of an ended process on its host; `kind` gives the default of `when`."""
+    """Policy for restarts of an ended process on its host; `kind` determines the default `when`."""
 
     when: RestartCondition | None = None
     delay: Seconds = _RESTART.delay
@@ -87,7 +87,7 @@ class HostLossInFile:
 
 @dataclass(frozen=True, slots=True)
 class IsolationInFile:
-    """Reaction of a host that cannot reach the master; 0 s: before the process runs elsewhere."""
+    """Reaction of a host that cannot reach the master; 0 s: before a successor starts elsewhere."""
 
     then: IsolationAction = "keep"
     after: Seconds = 0.0
@@ -122,7 +122,7 @@ class LabelsInFile:
 
 @dataclass(frozen=True, slots=True)
 class ProcessInFile:
-    """One process, with the keys of ROS 2 launch; shorthands are written out already."""
+    """One process, with the keys of ROS 2 launch; shorthands are in long form."""
 
     name: str
     namespace: str = ""
@@ -152,8 +152,8 @@ class ProcessInFile:
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
 
-        By default a service restarts on failure, as after a power cut. A job never restarts,
-        because it may not be repeatable.
+        By default a service restarts on failure, for example after a power failure. A job does not
+        restart, because it may not be repeatable.
         """
         when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
         return _same(
@@ -176,7 +176,7 @@ class ProcessInFile:
 
 
 def _same(wanted: type[_Value], of: Any, **others: Any) -> _Value:
-    """Return a value of the core with the fields of its form in the file, except `others`."""
+    """Return a value of the core with the fields of its counterpart in the file, and `others`."""
     names = [f.name for f in fields(wanted) if f.name not in others]  # type: ignore[arg-type]
     return wanted(**{name: getattr(of, name) for name in names}, **others)
 
@@ -234,18 +234,18 @@ def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
     if standby.wanted and spec.kind == "job":
         yield Complaint(("standby",), "a job runs to completion; only a service has a standby")
     if standby.apart_by and not standby.wanted:
-        yield Complaint(("standby", "apart_by"), "standby.apart_by goes with `wanted: true`")
+        yield Complaint(("standby", "apart_by"), "standby.apart_by requires `wanted: true`")
     if spec.isolation.after and spec.isolation.then == "keep":
-        yield Complaint(("isolation", "after"), "isolation.after goes with `then: stop`")
+        yield Complaint(("isolation", "after"), "isolation.after requires `then: stop`")
     if spec.host_loss.delay and spec.host_loss.then == "wait":
-        text = "host_loss.delay goes with `then: elsewhere` or `stop`"
+        text = "host_loss.delay requires `then: elsewhere` or `then: stop`"
         yield Complaint(("host_loss", "delay"), text)
 
 
 def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
     health = spec.health
     if bool(health.topic) != bool(health.rate):
-        text = "health.topic and health.rate (Hz, above 0) go together"
+        text = "health.topic and health.rate (Hz, above 0) must be given together"
         yield Complaint(("health",), text)
     if health.topic and not _TOPIC.fullmatch(health.topic):
         text = f"health.topic {health.topic!r} is no ROS topic; for example /scan, scan or ~/scan"

@@ -9,11 +9,10 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator
 
 from rosrm.extensions.units import Quantity
-from rosrm.model.ros_settings import RosSettings
+from rosrm.model.ros_settings import HIGHEST_DOMAIN, NAMESPACE, RosSettings
 
 _DEFAULT: Final = RosSettings()
 _SERVER: Final = re.compile(r"[^\s:;]+:\d{1,5}(;[^\s:;]*(:\d{1,5})?)*|[^\s:;]+")
-_NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _TRANSPORTS: Final = ("DEFAULT", "DEFAULTv6", "SHM", "UDPv4", "UDPv6", "LARGE_DATA", "P2P")
 
 
@@ -24,7 +23,7 @@ def _server(given: str) -> str:
 
 
 def _namespace(given: str) -> str:
-    if not _NAMESPACE.fullmatch(given):
+    if not NAMESPACE.fullmatch(given):
         raise ValueError(f'{given!r} is not an absolute ROS namespace such as "/rosrm"')
     return given
 
@@ -47,7 +46,7 @@ class DiscoveryInFile:
 class RosInFile:
     """Section `ros` as written in a file."""
 
-    domain: Annotated[int, Quantity(high=232, whole=True)] | None = _DEFAULT.domain
+    domain: Annotated[int, Quantity(high=HIGHEST_DOMAIN, whole=True)] | None = _DEFAULT.domain
     discovery: DiscoveryInFile = field(default_factory=DiscoveryInFile)
     transports: Annotated[str, AfterValidator(_transports)] = _DEFAULT.transports
     namespace: Annotated[str, AfterValidator(_namespace)] = _DEFAULT.namespace

@@ -15,7 +15,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 
 
 def check_name(node: Node | None, what: str, problems: Problems) -> None:
-    """Note a name that cannot become a part of file names and topics."""
+    """Note a name that is not allowed in file names and topics."""
     if node is None or not isinstance(node.value, str) or _NAME.fullmatch(node.value):
         return
     problems.add(
@@ -42,7 +42,7 @@ def refuse_namesakes(nodes: Sequence[Node], what: str, problems: Problems) -> No
         if before is None:
             first[name.value] = name.place
         elif before == name.place:
-            text = f"foreach gives every {what} the name {name.value!r}; put one of its names in"
+            text = f"foreach gives every {what} the name {name.value!r}; use one of its names in it"
             problems.add(name.place, text)
         else:
             where = f"first given at line {before.line}, column {before.column}"
@@ -52,12 +52,12 @@ def refuse_namesakes(nodes: Sequence[Node], what: str, problems: Problems) -> No
 def check_amounts(
     node: Node | None, where: str, problems: Problems, *, above: bool = False
 ) -> None:
-    """Note amounts whose unit does not fit their resource; with `above`, also those not above 0."""
+    """Note amounts with a unit of another resource; with `above`, also amounts that are not > 0."""
     for resource, amount in (node.items if node else {}).items():
         try:
             ANY_AMOUNT.parse(amount.plain())
         except ValueError:
-            continue  # not an amount at all, which was noted before
+            continue  # not an amount, which was noted before
         try:
             value = amount_of(resource, amount.plain())
         except ValueError as error:

@@ -84,13 +84,14 @@ class MigrationSettings:
     """Migration strategies and the limits on migrations.
 
     Attributes:
-        strategies: those that specs may name, each with its options; the first is preferred.
+        strategies: names that specs may use, with their options; the first is preferred.
         cooldown: seconds after a migration in which the master does not migrate the process again
             without a request.
-        hysteresis: seconds that a host must be over a limit before the master evicts a process.
+        hysteresis: seconds for which a host must be over a limit before the master evicts a
+            process.
         headroom: fraction by which a destination stays under each of its limits.
-        max_in_flight: most migrations at a time.
-        automatic: the master evicts processes from hosts that are over a limit.
+        max_in_flight: highest number of migrations in flight.
+        automatic: True: the master evicts processes from hosts that are over a limit.
     """
 
     strategies: Annotated[Mapping[str, Options], OptionsByName()] = field(
@@ -108,7 +109,7 @@ class QueueSettings:
     """Order of the queue.
 
     Attributes:
-        backfill: processes may overtake a process that waits for room.
+        backfill: True: processes may be placed before an earlier one that waits for room.
     """
 
     backfill: bool = _CORE.backfill
@@ -119,9 +120,8 @@ class ProcessDefaults:
     """Default demand of processes.
 
     Attributes:
-        needs: amounts by resource, for a process that declares none and for which none were
-            learned.
-        settle: seconds after which such an estimate no longer counts as load of its host.
+        needs: amounts by resource, for a process without declared or learned needs.
+        settle: seconds after which an estimate no longer counts as load of its host.
     """
 
     needs: Mapping[str, Amount] = field(default_factory=lambda: dict(_CORE.default_needs))
@@ -143,7 +143,7 @@ class LivenessSettings:
 
 @dataclass(frozen=True, slots=True)
 class ControlSettings:
-    """Times of the requests between master and slaves.
+    """Times of the messages between master and slaves.
 
     Attributes:
         max_age: seconds, by the receiver's clock, after which a request is refused as stale.
@@ -161,10 +161,10 @@ class JournalSettings:
     """Durable journal of events and intents.
 
     Attributes:
-        sync: "normal" survives a SIGKILL of the master; "full" a power failure too.
-        keep_events: number of newest events kept.
-        keep_bytes: most bytes of the events kept; refusals get a tenth of both at most.
-        keep_ended: number of terminal processes that are not garbage-collected, the last to end.
+        sync: "normal" survives a SIGKILL of the master, "full" also a power failure.
+        keep_events: number of the newest events that are not deleted.
+        keep_bytes: most bytes of the events; refusals get a tenth of both bounds at most.
+        keep_ended: number of the newest terminal processes that are not garbage-collected.
     """
 
     sync: Literal["normal", "full"] = "normal"
@@ -178,9 +178,9 @@ class RecordSettings:
     """Recording of a master's run, for `rosrm simulate`.
 
     Attributes:
-        directory: for the files, one for each run; empty: no recording.
-        max_size: most bytes of one file; there the recording ends, and the master continues.
-        keep: number of newest files kept.
+        directory: directory of the files, one for each run; empty: no recording.
+        max_size: largest size of a file in bytes; then the recording ends, and the master runs on.
+        keep: number of the newest files that are not deleted.
     """
 
     directory: Path = Path()
@@ -193,18 +193,18 @@ class ClusterConfig:
     """Settings of a master (`cluster.yaml`).
 
     Attributes:
-        name: of the cluster and its master.
+        name: name of the cluster and its master.
         ros: domain, discovery and transports.
-        state: the master's directory; by default under XDG_STATE_HOME.
-        scoring: the policy that orders the hosts that fit.
+        state: state directory of the master; by default under XDG_STATE_HOME.
+        scoring: policy that orders the hosts that fit.
         migration: strategies and limits of migrations.
         queue: order of the queue.
-        defaults: of processes.
+        defaults: default needs of processes.
         liveness: time limits for silent hosts.
-        control: times of requests.
-        journal: of events and intents.
+        control: times of messages.
+        journal: journal of events and intents.
         record: recording of all events that the master receives, for replay.
-        checkpoint: the policy that places replicas of snapshots on other hosts, if any.
+        checkpoint: policy that places replicas of snapshots on other hosts, if any.
         delivery_timeout: seconds within which a slave must accept an assignment.
     """
 
@@ -264,9 +264,9 @@ class LogSettings:
 
     Attributes:
         max_bytes: size at which a log file is rotated.
-        keep: number of rotated files kept beside the current one.
-        keep_bytes: most bytes of all logs on this host; beyond, those of the processes that were
-            started longest ago are removed first. Current files of running processes stay.
+        keep: number of rotated files beside the current one.
+        keep_bytes: most bytes of all logs on this host; beyond, logs of the processes that were
+            started longest ago are removed. Current files of running processes stay.
     """
 
     max_bytes: Annotated[int, Quantity("size", low=4096, whole=True)] = 10_000_000
@@ -279,9 +279,9 @@ class KeepSettings:
     """Snapshots of stateful processes, and replicas for other hosts.
 
     Attributes:
-        every: most seconds by which a node's snapshot on this host may be behind its state.
-        max_bytes: most bytes of all replicas of other hosts' processes on this host.
-        max_rate: most bytes a second sent to other hosts, in total.
+        every: seconds by which a node's snapshot on this host may be older than its state.
+        max_bytes: largest total size, in bytes, of replicas of other hosts' processes on this host.
+        max_rate: highest total rate of transfers to other hosts, in bytes a second.
     """
 
     every: Seconds = 1.0
@@ -291,7 +291,7 @@ class KeepSettings:
 
 @dataclass(frozen=True, slots=True)
 class HostControlSettings:
-    """Requests that a slave accepts.
+    """Times of the requests to a slave.
 
     Attributes:
         max_age: seconds, by the slave's clock, after which a request is refused as stale; at
@@ -308,21 +308,21 @@ class HostConfig:
     Attributes:
         host: name of the host; each name has at most one live slave.
         ros: domain, discovery and transports.
-        state: the slave's directory; by default under XDG_STATE_HOME.
-        labels: that processes may require, prefer or avoid.
-        scope: what the probes measure: the machine, the cgroup that the slave runs in, or the
-            slave's own process tree against `budget`.
+        state: state directory of the slave; by default under XDG_STATE_HOME.
+        labels: labels that processes may require, prefer or avoid.
+        scope: scope of the probes: the machine, the cgroup of the slave, or the process trees of
+            the slave's processes against `budget`.
         budget: amounts by resource that correspond to usage 1.0 in the scope "slice".
-        limits: upper limits, fractions by resource; resources that are not named keep the default.
-        rate: of `resource_info`, Hz.
-        probes: names of the chosen probes, each with its options; None: the default ones.
-        max_processes: most processes held at a time; 0: no limit.
-        max_starting: most processes that start at a time, until they are ready; 0: no limit.
-        logs: of the processes.
-        control: of requests.
-        keep: of snapshots.
-        on_stop: "stop": a slave that is stopped stops its processes; "keep": the supervisor keeps
-            them running.
+        limits: upper limits, fractions by resource; a resource without a limit has the default.
+        rate: rate of `resource_info` in Hz.
+        probes: names of the chosen probes, with their options; None: the default ones.
+        max_processes: highest number of running processes; 0: no limit.
+        max_starting: highest number of processes that are starting and not ready; 0: no limit.
+        logs: logs of the processes.
+        control: times of requests.
+        keep: snapshots and replicas.
+        on_stop: "stop": a slave that is stopped stops its processes; "keep": it leaves them running
+            under the supervisor.
     """
 
     host: str = field(default_factory=socket.gethostname)

@@ -28,11 +28,11 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
     """Read the processes of a file; raises one `ConfigError` with all problems.
 
     Args:
-        path: of the file.
-        registry: the installed plugins, to check the migration strategies against; without it the
-            strategies are checked by the master only.
+        path: path of the file.
+        registry: the installed plugins, for a check of the migration strategies; None: only the
+            master checks them.
     """
-    return _specs(read(path), path, registry)
+    return checked_work(read(path), path, registry)
 
 
 def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
@@ -41,12 +41,15 @@ def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
     Relative paths start at the current directory. Raises one `ConfigError` with all problems.
     """
     if "processes" in work:
-        return _specs(node_of(work, Place("work", 0, 0)), "work", None)
+        return checked_work(node_of(work, Place("work", 0, 0)), "work", None)
     place = Place(f"process {work.get('name')!r}", 0, 0)
-    return _specs(node_of({"processes": [work]}, place), "work", None)
+    return checked_work(node_of({"processes": [work]}, place), "work", None)
 
 
-def _specs(root: Node, path: str | Path, registry: Registry | None) -> tuple[ProcessSpec, ...]:
+def checked_work(
+    root: Node, path: str | Path, registry: Registry | None
+) -> tuple[ProcessSpec, ...]:
+    """Return the processes of a parsed document; otherwise as `load_work`."""
     problems = Problems()
     check_kind(root, "work")
     entries = _entries(root, problems)
@@ -75,14 +78,14 @@ def _entries(root: Node, problems: Problems) -> Sequence[Node]:
             problems.add(place, f"unknown key {name!r}{near(name, _SECTIONS)}")
     processes = root.get("processes")
     if processes is None and any(get_close_matches(name, ["processes"]) for name in root.items):
-        return ()  # misspelt, and noted above
+        return ()  # a misspelt key, noted above
     if processes is None or not isinstance(processes.value, tuple) or not processes.value:
         place = (processes or root).place
         problems.add(place, "processes: a list of at least one process is required")
         return ()
     for entry in processes.value:
         if not isinstance(entry.value, Mapping):
-            problems.add(entry.place, "processes: each of the list is a mapping, with a `name`")
+            problems.add(entry.place, "processes: each entry must be a mapping, with a `name`")
     return [entry for entry in processes.value if isinstance(entry.value, Mapping)]
 
 
@@ -93,7 +96,8 @@ def _defaults(root: Node, problems: Problems) -> Node:
     for name in _NOT_IN_DEFAULTS:
         node = defaults.get(name)
         if node is not None:
-            problems.add(node.key_place or node.place, f"defaults: {name} belongs to one process")
+            text = f"defaults: {name} is allowed in a process only"
+            problems.add(node.key_place or node.place, text)
     return written_out(defaults)
 
 
@@ -119,10 +123,10 @@ def _process(
 
 
 def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] | None:
-    """Return the checked options that a process gives; None if the process names no strategy.
+    """Return the checked options of a process; None if the process names no strategy.
 
-    Options that the process does not give have the cluster's values. Name and options are checked
-    even if there are other errors in `migration`.
+    Options that the process omits have the cluster's values. Name and options are checked even if
+    there are other errors in `migration`.
     """
     strategy, given = node.get("migration", "strategy"), node.get("migration", "options")
     if strategy is None or not isinstance(strategy.value, str):
@@ -134,7 +138,7 @@ def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] 
 
 
 def _on_host(spec: ProcessSpec, path: str | Path) -> ProcessSpec:
-    """Return the spec with its program and directory as `settled_on_host` writes them."""
+    """Return the spec with its program and directory resolved by `settled_on_host`."""
     directory, command = spec.working_directory, spec.command
     if directory:
         spec = replace(spec, working_directory=settled_on_host(directory, path))

@@ -1,1 +1,4 @@
-"""Pure logic of master, slave and supervisor: no ROS, clock, thread, file or log; time is given."""
+"""Pure logic of master, slave and supervisor: no ROS, clock, thread, file or log.
+
+The caller passes the time.
+"""

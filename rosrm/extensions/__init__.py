@@ -1,13 +1,14 @@
 """Plugins: contracts, hooks, and the registry of installed plugins.
 
 hookspecs.py         every hook, in one list
-contracts.py         Protocols of probes, policies, strategies and ports, and their offers
-options.py           the options of a process, merged over those of the cluster
+contracts.py         protocols of probes, policies, strategies and launchers, and their offers
+options.py           options of a process, merged over those of the cluster
 units.py             numbers with units in options
-installed.py         the installed plugins, as entry points
-discovery.py         loads the installed plugins, and calls their hooks
-registry.py          selects plugins by name, and checks their options
-declared_fields.py   the fields of a process that an offer declares to read
-plugin_calls.py      the guard around every call of a plugin
-time_limit.py        the deadline of a call
+installed.py         addresses of the installed plugins (entry points)
+discovery.py         import of the installed plugins, call of their hooks
+registry.py          selection of plugins by name, creation of their objects
+made.py              created objects, and checks of them
+declared_fields.py   fields of a spec that an offer declares to read
+plugin_calls.py      guard of every call of a plugin
+time_limit.py        time-out of a call
 """

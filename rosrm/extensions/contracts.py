@@ -1,8 +1,9 @@
 """Plugin contracts: Protocols that plugins and adapters implement, and the values they exchange.
 
-A plugin registers an *offer* of each thing it brings (`ProbeOffer`, `ScoringOffer`, ...): a name, a
-frozen dataclass of options, and a function that makes the object. The configuration chooses offers
-by name; their options are checked against the dataclass's annotations before anything is made.
+A plugin registers an *offer* for each of its objects (`ProbeOffer`, `ScoringOffer`, ...): a name, a
+frozen dataclass of options, and a function that creates the object. The configuration chooses
+offers by name. Their options are checked against the dataclass's annotations before the object is
+created.
 """
 
 from __future__ import annotations
@@ -11,12 +12,11 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
     EMPTY,
@@ -33,7 +33,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NoOptions:
-    """Options of a plugin that has nothing to set."""
+    """Options of a plugin without settings."""
 
 
 # --- probes (slave) ---------------------------------------------------------------------------
@@ -42,8 +42,8 @@ class NoOptions:
 class Probe(Protocol):
     """Reads the utilisation of one or more resources of a host.
 
-    `read` may block: it runs in a thread of its own with a deadline. A late or raising probe makes
-    its readings *stale*, never zero.
+    `read` may block, because it runs in a separate thread with a deadline. If a probe is late or
+    raises, its readings become stale, not zero.
     """
 
     @property
@@ -51,10 +51,10 @@ class Probe(Protocol):
         """Return the resources that `read` reports; fixed, with names unique on a host."""
 
     def read(self) -> Iterable[Reading]:
-        """Return the utilisation now: one reading per resource, fractions of the capacity."""
+        """Return the current utilisation: one reading per resource, fractions of the capacity."""
 
     def close(self) -> None:
-        """Release what the probe holds; called once, at the slave's end."""
+        """Release the probe's files, threads and devices; called once, at the slave's end."""
 
 
 class Sessions(Protocol):
@@ -64,7 +64,7 @@ class Sessions(Protocol):
         """Return the pids of all processes in the slave's sessions; up to 1 s old."""
 
     def ended_cpu_time(self) -> float:
-        """Return the CPU seconds that ended processes used; never falls."""
+        """Return the CPU seconds that ended processes used; the value never decreases."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class ProbeContext:
     """Facts about the host, for the creation of a probe.
 
     Attributes:
-        scope: "machine", "cgroup" or "slice", as the host's configuration says; a probe's own
-            option may override it.
+        scope: "machine", "cgroup" or "slice", from the host's configuration; an option of the probe
+            may override it.
         budget: for the scope "slice", base units by resource name ("memory": bytes, "cpu": cores).
-        data_directory: where the slave keeps its files (the disk that counts).
+        data_directory: directory of the slave's files, on the disk that a disk probe measures.
         sessions: the slave's process trees.
     """
 
@@ -90,15 +90,14 @@ class ProbeOffer:
     """Registers a probe.
 
     Attributes:
-        name: by which the configuration chooses it.
-        create: makes it; raises `SkipPlugin` with the reason where its hardware or driver is
-            absent.
+        name: name by which the configuration chooses it.
+        create: creates it; raises `SkipPlugin` with the reason if its hardware or driver is absent.
         options: a frozen dataclass of its settings, each with a default.
         summary: one line for `rosrm plugins`.
-        period: seconds between reads.
+        period: seconds between two reads.
         deadline: seconds after which a read counts as late.
-        default: chosen where the configuration names no probes.
-        resources: names of all that it may read; (): one with the name of the probe.
+        default: True: chosen if the configuration names no probes.
+        resources: names of all resources that it may read; (): one with the name of the probe.
     """
 
     name: str
@@ -127,10 +126,10 @@ class HostView:
         resources: R resource names, the columns.
         usage: (N, R) reading + reservations, fractions of the capacity; NaN where a host does
             not measure such a resource. `column` has no NaN.
-        limit: (N, R) upper limits, fractions; 1 where a host sets none.
-        capacity: (N, R) base units for usage 1.0; NaN as in `usage`.
-        processes: (N,) processes held or reserved.
-        labels: N mappings, the labels of each host.
+        limit: (N, R) upper limits, fractions; 1 where a host has none.
+        capacity: (N, R) base units at usage 1.0; NaN as in `usage`.
+        processes: (N,) number of processes on the host or reserved for it.
+        labels: (N,) mappings, the labels of each host.
     """
 
     names: Sequence[str]
@@ -145,13 +144,13 @@ class HostView:
         """Return the usage of one resource, (N,), as a new array without NaN.
 
         Args:
-            resource: its name.
-            missing: value for a host that does not measure it.
+            resource: name of the resource.
+            missing: value for a host that does not measure the resource.
         """
         if resource not in self.resources:
             return np.full(len(self.usage), missing)
         column = self.usage[:, self.resources.index(resource)]
-        # One product shows any NaN, in a tenth of the time that a replacement takes.
+        # One dot product finds any NaN, in a tenth of the time of a replacement.
         if math.isnan(column.dot(column)):
             return np.nan_to_num(column, nan=missing)
         return np.array(column)
@@ -163,8 +162,8 @@ class ProcessView:
 
     Attributes:
         spec: as submitted. A policy gets the standard fields (program, `namespace`, `kind`,
-            `priority`, `needs` and labels) and those that its offer declares in `reads`; to read
-            another one raises `UndeclaredField`.
+            `priority`, `needs` and labels) and those that its offer declares in `reads`; any other
+            field raises `UndeclaredField`.
         need: (N, R) demand of the process on each host, fractions of that host's capacity.
     """
 
@@ -174,13 +173,13 @@ class ProcessView:
 
 @dataclass(frozen=True)
 class Scores:
-    """A policy's judgement of N hosts: the lowest value goes first.
+    """A policy's scores of N hosts; the host with the lowest value is chosen.
 
     Attributes:
-        value: (N,) finite where not vetoed.
-        veto: (N,) True: this host may not take it; None: no vetoes.
-        veto_reason: returns the reason of the veto on the host at a row.
-        reason: returns the origin of the value of the host at a row.
+        value: (N,) scores, finite where not vetoed.
+        veto: (N,) True: the host must not run the process; None: no vetoes.
+        veto_reason: returns the reason for the veto on the host of a row.
+        reason: returns the origin of the score of the host of a row.
     """
 
     value: FloatArray
@@ -190,10 +189,10 @@ class Scores:
 
 
 class ScoringPolicy(Protocol):
-    """Orders the hosts that fit. Pure and deterministic: the same arguments, the same scores."""
+    """Orders the hosts that fit. Pure: equal arguments give equal scores."""
 
     def score(self, hosts: HostView, process: ProcessView) -> Scores:
-        """Judge each row of `hosts` separately: no row's score may depend on the other rows.
+        """Score each row of `hosts` separately; no score may depend on another row.
 
         The core calls this once for all hosts, and again for single rows that have changed.
         """
@@ -205,7 +204,7 @@ class ScoringOffer:
 
     Attributes:
         reads: fields of the spec that it reads beyond the standard ones, as `("name",)`. Processes
-            that differ in none of these fields are judged together.
+            with equal fields are scored together.
     """
 
     name: str
@@ -219,7 +218,7 @@ class ScoringOffer:
 
 
 class MigrationStrategy(Protocol):
-    """Proposes the migration of a process, as data. Pure; the core carries the plan out."""
+    """Proposes the plan of a migration, as data. Pure; the core executes the plan."""
 
     def propose(self, move: Move) -> Plan:
         """Return the plan of a migration; raise `ValueError` with the reason if there is none."""
@@ -229,77 +228,82 @@ class SpecChecking(Protocol):
     """A migration strategy that checks, before a spec is queued, that it can move the process."""
 
     def spec_fault(self, spec: ProcessSpec) -> str:
-        """Return the fault of a spec, its own `migration.options` included; "": none. Pure."""
+        """Return the fault of a spec, including its `migration.options`; "": none. Pure."""
 
 
 class HostChecking(Protocol):
-    """A migration strategy that does not work on every host, or not between all of them."""
+    """A migration strategy that works only on some hosts, or only between some hosts."""
 
     @property
-    def ability(self) -> str:
-        """Return the executor that checks on a host that the strategy works there.
+    def host_check(self) -> str:
+        """Return the name of the executor that checks whether the strategy works on a host.
 
-        The core runs it once after each registration of a host, without arguments. It answers with
-        the properties that must match on another host, text to text. It raises where the strategy
-        does not work.
+        The core runs the executor once after each registration of a host, without arguments. The
+        executor returns the properties that must match between two hosts, as text to text. It
+        raises if the strategy does not work on the host.
         """
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
-        """Return why nothing can move between hosts with these answers; "": it can. Pure."""
+        """Return why no process can move between hosts with these properties; "": it can. Pure."""
 
 
 class Imaging(Protocol):
     """A migration strategy that dumps a process into an image, and restores it on the same host."""
 
     def checkpoint(self, move: Move) -> Plan:
-        """Return the plan that ends the source and gives its name to its image. Pure.
+        """Return the plan that stops the source and makes its image the owner of the name. Pure.
 
-        The steps name one host, start nothing, and stop the source after the commit: it must not
-        run again. Raises `ValueError` with the reason where no image of the process can be made.
+        The steps name one host, start no instance, and stop the source after the commit, because it
+        must not run again. Raises `ValueError` with the reason if the process cannot be dumped.
         """
 
     def restore(self, move: Move) -> Plan:
         """Return the plan that restores the destination from the image of the source. Pure.
 
         The source does not run. Before the commit, each step has an undo that leaves the image in
-        its place. An undo that finds the destination running already answers `active: true`, and
-        the plan goes forward from there. Raises `ValueError` as `checkpoint`.
+        its place. An undo executor that finds the destination running returns `active: true`; the
+        plan then goes forward again. Raises `ValueError` as `checkpoint` does.
         """
 
 
 class PeriodicImaging(Protocol):
-    """A migration strategy that dumps running processes periodically, for a start after a crash."""
+    """A migration strategy that dumps running processes periodically, for crash recovery."""
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
-        """Return the seconds between two dumps that the process asks for; 0.0: none. Pure."""
+        """Return the requested seconds between two dumps of a process; 0.0: no dumps. Pure."""
 
     def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
         """Return the step that dumps an instance and resumes it. Pure.
 
-        Its answer may have `size` (bytes) and `seconds` (of each part, by its name). The process
-        must resume after any failure. `now` is unix time, whole seconds.
+        The executor's result may have `size` (bytes) and `seconds` (duration by name of the part).
+        The process must resume after any failure. `now`: unix time in whole seconds.
         """
 
     @property
     def discard(self) -> str:
-        """Return the executor that removes such images of ended instances from its host.
+        """Return the name of the executor that removes such images of ended instances from a host.
 
-        It runs without arguments, not for each of them, and possibly with nothing to remove.
+        One call without arguments removes the images of all ended instances; there may be none.
         """
+
+
+#: Function on a slave that an `Execute` step calls: arguments and answer are JSON objects.
+Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """Declares what a migration strategy can do for a process; by default it only moves it.
+    """Capabilities of a migration strategy for a process; by default it moves the process only.
 
     Attributes:
-        state: what outlives an instance. "topics": its node publishes its state by the handoff
-            protocol, so rosrm keeps snapshots and replicas of it. "memory": an image of its memory.
-        shadow: a second instance follows the state before it takes over, so a process may have a
+        state: state that survives an instance. "topics": the node publishes its state by the
+            handoff protocol, and rosrm stores snapshots and replicas of it. "memory": an image of
+            the process's memory.
+        shadow: True: a shadow follows the state before it takes over, so a process may have a
             standby.
-        restart_from_image: the strategy implements `PeriodicImaging`, and its launcher starts an
-            instance that has crashed from its newest image.
-        launcher: name of the launcher of its processes; "": a plain command.
+        restart_from_image: True: the strategy implements `PeriodicImaging`, and its launcher
+            restarts a crashed instance from its newest image.
+        launcher: name of the launcher of its processes; "": they start by their command.
     """
 
     state: Literal["none", "topics", "memory"] = "none"
@@ -313,21 +317,19 @@ class MigrationOffer:
     """Registers a migration strategy; the fields are as in `ProbeOffer`.
 
     Attributes:
-        capabilities: what it can do; where that depends on options, a pure function of the options
-            that hold for one process. It must not change `launcher`.
-        executors: those that the open step of its plans may name; each runs on a slave with the
-            step's arguments (a JSON object) and answers with one.
-        own_options: options of one process, where they are more than those for all: a dataclass
-            that derives from `options`.
+        capabilities: capabilities of the strategy; if they depend on options, a pure function of
+            the options of one process. The function must not change `launcher`.
+        executors: executors that `Execute` steps of its plans may name; each runs on a slave with
+            the step's arguments (a JSON object) and returns a JSON object.
+        own_options: a dataclass derived from `options`, if one process may have more options than
+            the cluster.
     """
 
     name: str
     create: Callable[[Any], MigrationStrategy]
     options: type[Any] = NoOptions
     summary: str = ""
-    executors: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any]]] = field(
-        default_factory=lambda: EMPTY
-    )
+    executors: Mapping[str, Executor] = field(default_factory=lambda: EMPTY)
     own_options: type[Any] | None = None
     capabilities: Capabilities | Callable[[Any], Capabilities] = Capabilities()
 
@@ -337,12 +339,12 @@ class MigrationOffer:
 
 @dataclass(frozen=True)
 class LauncherContext:
-    """The facts about its host that a launcher gets when it is made.
+    """Facts about the host, for the creation of a launcher.
 
     Attributes:
         state: directory of the slave; executors get it as `here.state`.
-        python: interpreter of the slave.
-        slave: random number of this run of the slave.
+        python: path of the slave's Python interpreter.
+        slave: incarnation of the slave.
     """
 
     state: Path
@@ -352,13 +354,14 @@ class LauncherContext:
 
 @dataclass(frozen=True)
 class Launch:
-    """The start of one instance, as the supervisor is about to carry it out.
+    """The start of one instance, before the supervisor executes it.
 
     Attributes:
-        assignment: what is to run; `assignment.restored`: from an image on this host.
-        cluster: name of the cluster whose master gives the order.
+        assignment: assignment of the instance; `assignment.restored`: start from an image on this
+            host.
+        cluster: name of the cluster of the master that sent the order.
         argv: command line, with all ROS arguments.
-        environment: all variables of the process.
+        environment: all environment variables of the process.
     """
 
     assignment: Assignment
@@ -368,26 +371,26 @@ class Launch:
 
 
 class Launcher(Protocol):
-    """Starts instances in another way than by their plain command. Called in the slave's loop."""
+    """Replaces the command line or environment of instances. Called in the slave's main loop."""
 
     def prepare(self, launch: Launch) -> Launch | None:
         """Return the launch with another command line or environment.
 
-        None: there is no image of this instance here. A restored instance whose strategy has no
-        launcher is offered to each launcher in turn. An error of `rosrm.errors`, or a `ValueError`,
-        says why the instance cannot be started here.
+        None: this host has no image of the instance. If the strategy of a restored instance names
+        no launcher, each launcher is called in turn. Raises an error of `rosrm.errors` or a
+        `ValueError` with the reason if the instance cannot be started on this host.
         """
 
 
 class ProcessTreeLauncher(Protocol):
-    """A launcher whose program stays the leader of the session, with the process below it.
+    """A launcher whose program stays the session leader, as the parent of the process.
 
-    The process may have a session and a pid namespace of its own. Each call takes the pid of an
-    instance's leader, whichever launcher has started it.
+    The process may have its own session and pid namespace. Each call takes the pid of an instance's
+    session leader, which any launcher may have started.
     """
 
     def leads(self, leader: int) -> bool | None:
-        """Return True if it runs this launcher's program; None: not yet, but it may in a moment."""
+        """Return True if the leader runs this launcher's program; None: it may begin to soon."""
 
     def members(self, leader: int) -> Sequence[int]:
         """Return the leader and all processes of the instance."""
@@ -400,14 +403,14 @@ class GraphDepartureLauncher(Protocol):
     """A launcher of nodes that leave the ROS graph for a while."""
 
     def has_departed(self, leader: int) -> bool:
-        """Return True while a node is out of the graph; its health is not watched then."""
+        """Return True while a node is out of the graph, which pauses its health checks."""
 
 
 class ImageLauncher(Protocol):
     """A launcher that starts an instance from its newest image after a crash."""
 
     def discard_images(self, instance: InstanceId) -> None:
-        """Have the next start begin from nothing: a user restarts the instance."""
+        """Discard the images of an instance, because a user restarts it without its old memory."""
 
 
 @dataclass(frozen=True)
@@ -415,10 +418,10 @@ class LauncherOffer:
     """Registers a launcher.
 
     Attributes:
-        name: by which `Capabilities.launcher` chooses it.
-        create: makes it, once for each run of a slave; raises `SkipPlugin` where it cannot work.
+        name: name by which `Capabilities.launcher` chooses it.
+        create: creates it once for each run of a slave; raises `SkipPlugin` if it cannot work.
         summary: one line for `rosrm plugins`.
-        variables: environment variables that it sets; no process inherits them from the slave.
+        variables: environment variables that it sets; processes do not inherit them from the slave.
     """
 
     name: str
@@ -436,11 +439,11 @@ class CheckpointView:
 
     Attributes:
         spec: as submitted.
-        host: of the process; its own snapshot is there whatever the policy decides.
-        age: seconds since another host got a newer replica; None: no other host ever had one.
-        size: bytes of its newest snapshot.
+        host: host of the process, which always has the process's own snapshot.
+        age: seconds since another host got a newer replica; None: no other host has one.
+        size: size of its newest snapshot in bytes.
         kept_on: other hosts with a replica now, the newest first.
-        hosts: every host that is up, this one included, by name, with its labels.
+        hosts: name of each host that is up, including the host of the process, to its labels.
     """
 
     spec: ProcessSpec
@@ -456,8 +459,8 @@ class CheckpointChoice:
     """Placement of the replicas of a snapshot from now on.
 
     Attributes:
-        hosts: other than the process's own; (): none.
-        every: seconds between two transfers to a host, at least.
+        hosts: hosts of replicas, other than the process's own; (): none.
+        every: shortest time between two transfers to a host, in seconds.
     """
 
     hosts: tuple[str, ...]
@@ -477,10 +480,10 @@ class MemoryView:
 
     Attributes:
         spec: as submitted.
-        host: of the process.
-        asked: seconds between two checkpoints of its memory that the process asks for.
-        size: bytes of the last one; 0: there is none yet.
-        pause: seconds for which the dump paused the process.
+        host: host of the process.
+        asked: seconds between two checkpoints that the process requests.
+        size: size of the last checkpoint in bytes; 0: there is none yet.
+        pause: seconds for which the last dump paused the process.
     """
 
     spec: ProcessSpec
@@ -494,7 +497,7 @@ class MemoryPacing(Protocol):
     """A checkpoint policy that also sets the period of memory dumps."""
 
     def pace(self, process: MemoryView) -> float | None:
-        """Return the seconds from the last checkpoint of its memory to the next one; None: none."""
+        """Return the seconds from the last checkpoint to the next one; None: no checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -505,79 +508,3 @@ class CheckpointOffer:
     create: Callable[[Any], CheckpointPolicy]
     options: type[Any] = NoOptions
     summary: str = ""
-
-
-# --- the durable record -----------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """One line of the event record, and the intent that it changes.
-
-    Attributes:
-        process: name; "" for none.
-        host: name; "" for none.
-        message: one sentence for logs and listings.
-        facts: JSON-able particulars.
-    """
-
-    kind: EventKind
-    process: str = ""
-    host: str = ""
-    message: str = ""
-    facts: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
-
-
-@dataclass(frozen=True, slots=True)
-class StoredRecord:
-    """A record as the journal keeps it.
-
-    Attributes:
-        sequence: 1, 2, 3, ... without a gap.
-        wall_time: unix time by the master's clock, seconds.
-        elapsed: seconds since this master's start, by its monotonic clock.
-    """
-
-    sequence: int
-    wall_time: float
-    elapsed: float
-    record: Record
-
-
-@dataclass(frozen=True, slots=True)
-class Intent:
-    """A desired value, durable: the newest value under a key replaces the older ones.
-
-    Attributes:
-        table: "process", "migration", "host", "learned", "cluster", "removed".
-        key: within the table.
-        value: JSON-able; None: the key is removed.
-    """
-
-    table: str
-    key: str
-    value: Mapping[str, Any] | None
-
-
-@runtime_checkable
-class Journal(Protocol):
-    """Stores intents and the event record; data survives a SIGKILL once `write` has returned."""
-
-    def write(
-        self, records: Sequence[Record], intents: Sequence[Intent], now: float
-    ) -> Sequence[StoredRecord]:
-        """Append records and replace intents in one atomic group; raises `JournalError`."""
-
-    def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
-        """Return all intents of a table by key."""
-
-    def records(
-        self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
-    ) -> Sequence[StoredRecord]:
-        """Return the newest matching records after a sequence, oldest first.
-
-        Those of a host include migrations from it: their facts name the host as `from`.
-        """
-
-    def close(self) -> None:
-        """Flush and release the files."""

@@ -1,7 +1,7 @@
-"""Declarations of the selected plugins' offers, and the view of a spec that follows from them.
+"""Declarations of the selected plugins' offers, and the view of a spec for a scoring policy.
 
-Processes that no policy can tell apart share one ranking. A scoring policy therefore reads only the
-fields by which demands are compared: the standard ones, and those that its offer declares.
+Processes with equal demands share one ranking. So a scoring policy may read only the fields by
+which demands are compared: the standard ones, and those that its offer declares.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from rosrm.extensions.contracts import Capabilities
 from rosrm.model.values import EMPTY, ProcessSpec
 from rosrm.wording import listed
 
-#: Fields of a spec that a policy may always read: `Demand.key` holds them.
+#: Fields of a spec that every policy may read, because `Demand.key` includes them.
 STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
     "required_labels", "preferred_labels", "avoided_labels",
 )  # fmt: skip
-#: All fields of a spec: each of them may be declared.
+#: All fields of a spec, which an offer may declare.
 SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec))
 
 
@@ -45,7 +45,7 @@ class DeclaredSpec:
         if name in SPEC_FIELDS:
             raise UndeclaredField(
                 f"the policy reads {name!r} of the spec, which its offer does not declare: "
-                f"say ScoringOffer(..., reads={(*self._reads, name)!r})"
+                f"write ScoringOffer(..., reads={(*self._reads, name)!r})"
             )
         derived = getattr(ProcessSpec, name, None)
         if isinstance(derived, property) and derived.fget is not None:
@@ -63,21 +63,21 @@ def declared_spec(spec: ProcessSpec, reads: tuple[str, ...]) -> ProcessSpec:
 
 
 def no_options(_strategy: str, _spec: ProcessSpec) -> Any:
-    """Return None: no offer declares the options of a strategy."""
+    """Return None, because no offer declares the options of a strategy."""
     return None
 
 
 def no_capabilities(_spec: ProcessSpec) -> Capabilities:
-    """Return the defaults: no offer says what the strategy of a process can do."""
+    """Return the default capabilities, because no offer declares any."""
     return Capabilities()
 
 
 def no_standby(strategy: str | None, known: Mapping[str, Capabilities]) -> str:
-    """Return why a process has no standby, and which strategies of the known ones give it one."""
+    """Return why a process can have no standby, and the known strategies that support one."""
     able = [f"`migration: {name}`" for name, it in known.items() if it.shadow]
-    why = f"{strategy} cannot do that" if strategy else "without a migration strategy none can"
-    remedy = f"say {listed(able, 'or')}" if able else "install a strategy that can"
-    return f"a standby follows the state of its process, and {why}: {remedy}"
+    why = f"{strategy} has no standby" if strategy else "no migration strategy is given"
+    remedy = f"write {listed(able, 'or')}" if able else "install a strategy with standbys"
+    return f"a standby needs a migration strategy that copies state, and {why}: {remedy}"
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,11 @@ class Declared:
         reads: fields of a spec that scoring policies read beyond the standard ones.
         options_of: returns the options of a strategy for a spec, merged and parsed; raises
             `ValueError` for an option that the strategy does not accept.
-        executors: names by strategy, of the offers that are known.
-        brought_by: the distribution by strategy, where it is known.
-        capabilities_of: returns what the strategy of a process can do for it; never raises.
-        capabilities: of each installed strategy, selected or not, with its options for all.
+        executors: strategy to the names of its executors, for known offers.
+        brought_by: strategy to its distribution, if known.
+        capabilities_of: returns the capabilities of the strategy of a process; never raises.
+        capabilities: each installed strategy, selected or not, to its capabilities with the options
+            of the cluster.
     """
 
     reads: tuple[str, ...] = ()
@@ -102,5 +103,5 @@ class Declared:
     capabilities: Mapping[str, Capabilities] = field(default_factory=lambda: EMPTY)
 
     def has_snapshots(self, spec: ProcessSpec) -> bool:
-        """Return True if the node of a process publishes a state of which snapshots are kept."""
+        """Return True if the node of a process publishes state that is stored in snapshots."""
         return bool(spec.ros) and self.capabilities_of(spec).state == "topics"

@@ -1,7 +1,7 @@
-"""Discovery of installed plugins: import, hooks, checks of their offers.
+"""Discovery of installed plugins: import, call of the hooks, checks of the offers.
 
-A plugin that does not import, raises in a hook or misspells one is reported as broken, with its
-distribution, the hook and the place of its definition. It does not affect the other plugins.
+A plugin that cannot be imported, raises in a hook or misspells a hook is broken. It is listed with
+its distribution and with name and place of the hook, and does not affect other plugins.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from rosrm.model.rows import PluginKind
 from rosrm.wording import get_close_matches
 
 T = TypeVar("T")
-#: What the configuration chooses by name, with options.
+#: Offers that the configuration chooses by name, with options.
 ChosenOffer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
 Offer: TypeAlias = "ChosenOffer | LauncherOffer"
 
@@ -48,9 +48,9 @@ HOOKS: Final[Mapping[str, tuple[PluginKind, type[Any]]]] = {
     "register_launchers": ("launcher", LauncherOffer),
 }
 
-#: Seconds after which a plugin that is still being loaded is named in the log.
+#: Seconds after which a warning names a plugin that is still being loaded.
 SLOW_LOADING: Final = 5.0
-#: Seconds for the import of a plugin, and for each of its hooks.
+#: Time-out of the import of a plugin, and of each of its hooks; seconds.
 LOADING_LIMIT: Final = 30.0
 
 #: Exceptions of a faulty plugin; a plugin that calls `sys.exit` must not end the master.
@@ -72,7 +72,7 @@ class PluginSource:
 
 @dataclass(frozen=True)
 class Offered:
-    """One offer."""
+    """One offer of a plugin."""
 
     kind: PluginKind
     offer: Offer
@@ -81,7 +81,7 @@ class Offered:
 
 @dataclass(frozen=True)
 class Broken:
-    """A fault of a plugin or offer; `kind` and `name` are "" where unknown."""
+    """A fault of a plugin or offer; `kind` and `name`: "" if unknown."""
 
     source: PluginSource
     reason: str
@@ -124,7 +124,7 @@ def definition(function: object) -> str:
 
 
 def _in_time(source: PluginSource, what: str, call: Callable[[], T]) -> T:
-    """Return the answer of plugin code; name it in the log when it is slow, end it when it hangs.
+    """Return the answer of plugin code; warn when it is slow, and interrupt it when it hangs.
 
     Raises:
         TimeoutError: the code took longer than `LOADING_LIMIT`.
@@ -139,7 +139,7 @@ def _in_time(source: PluginSource, what: str, call: Callable[[], T]) -> T:
     timer = threading.Timer(SLOW_LOADING, say)
     timer.daemon = True
     timer.start()
-    late = f"it did not return within {LOADING_LIMIT:g} s; do in `create` what takes long"
+    late = f"it did not return within {LOADING_LIMIT:g} s; move slow work into `create`"
     try:
         return limited(LOADING_LIMIT, call, lambda: late)
     finally:
@@ -210,12 +210,12 @@ def _take(loaded: Loaded, source: PluginSource, hook: str, function: Callable[..
 
 
 def _call(hook: str, function: Callable[..., Any]) -> Any:
-    """Call one hook through pluggy, which checks the arguments, apart from all other plugins."""
+    """Call one hook through pluggy, which checks the arguments; other plugins are not involved."""
     alone = pluggy.PluginManager(GROUP)
     alone.add_hookspecs(hookspecs)
     alone.register(SimpleNamespace(**{hook: function}))
     answers = getattr(alone.hook, hook)()
-    return answers[0] if answers else None  # pluggy leaves an answer of None out
+    return answers[0] if answers else None  # pluggy omits an answer of None
 
 
 def _fault_of(offer: object, wanted: type[Any]) -> str:
@@ -228,7 +228,7 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     if not callable(getattr(offer, "create", None)):
         return f"{name!r}: `create` cannot be called"
     if isinstance(offer, LauncherOffer):
-        return ""  # the configuration does not choose it, so it has no options
+        return ""  # the configuration does not choose launchers, so they have no options
     options: object = getattr(offer, "options", None)
     if not (isinstance(options, type) and is_dataclass(options)):
         return f"{name!r}: `options` is not a dataclass but {options!r}"

@@ -1,8 +1,8 @@
 """Every hook that a plugin may implement.
 
-A plugin is a module or object under the entry-point group `rosrm`. Its hooks are called once, at
-start, and return offers; after that the core calls the typed objects under its own guard and
-never goes through pluggy again. Example::
+A plugin is a module or object under the entry-point group `rosrm`. rosrm calls its hooks once, at
+start. They return offers, from which rosrm creates objects. Later calls go directly to these
+objects, not through pluggy. Example::
 
     from rosrm import ScoringOffer, hookimpl
 
@@ -26,7 +26,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.installed import GROUP
 
-# The group of the entry points is the name of the pluggy project, too.
+# The group of the entry points is also the name of the pluggy project.
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 
@@ -48,9 +48,9 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:  # type: ignore
 
 @hookspec
 def register_checkpoint_policies() -> Sequence[CheckpointOffer]:  # type: ignore[empty-body]
-    """Offer checkpoint policies, which place replicas and time checkpoints (master)."""
+    """Offer checkpoint policies, which place replicas and schedule checkpoints (master)."""
 
 
 @hookspec
 def register_launchers() -> Sequence[LauncherOffer]:  # type: ignore[empty-body]
-    """Offer launchers, which start instances in another way than by a command (slaves)."""
+    """Offer launchers, which replace the command line of an instance (slaves)."""

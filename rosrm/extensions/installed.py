@@ -1,4 +1,4 @@
-"""Addresses of the installed plugins, commands and file checks; none of them is loaded."""
+"""Addresses of the installed plugins, commands and file checks, without loading them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Final
 
 #: Entry-point group of the plugins.
 GROUP: Final = "rosrm"
-#: Entry-point group of further commands of `rosrm`: name of the command, function or `typer.Typer`.
+#: Entry-point group of additional commands of `rosrm`: name to function or `typer.Typer`.
 COMMANDS: Final = "rosrm.commands"
-#: Entry-point group of the checks of `rosrm config check`: kind of file, function.
+#: Entry-point group of additional checks of `rosrm config check`: kind of file to function.
 CHECKS: Final = "rosrm.checks"
 
 
@@ -18,9 +18,9 @@ class PluginAddress:
     """Address of an installed plugin.
 
     Attributes:
-        name: of its entry point.
+        name: name of its entry point.
         target: "module" or "module:object".
-        distribution: name and version of the package that brings it.
+        distribution: name and version of its Python distribution.
     """
 
     name: str
@@ -29,8 +29,8 @@ class PluginAddress:
 
 
 def installed_plugins(group: str = GROUP) -> list[PluginAddress]:
-    """Return each entry point once, by name, even where a folder is twice on the path."""
-    # Entry points are read as e-mail headers in zip files. A runtime must not load those readers.
+    """Return each entry point once, by name, even if a folder is on the path twice."""
+    # Imported here, because a runtime must not load this module's readers of e-mail and zip files.
     from importlib.metadata import entry_points  # noqa: PLC0415 - see above
 
     found: dict[tuple[str, str], PluginAddress] = {}

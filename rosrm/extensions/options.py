@@ -25,13 +25,13 @@ def options_of(spec: ProcessSpec, cluster: Any, own: type[Own]) -> Own: ...
 
 
 def options_of(spec: ProcessSpec, cluster: Any, own: type[Any] | None = None) -> Any:
-    """Return the options that hold for one process, as `Move.options` has them.
+    """Return the options for one process, as in `Move.options`.
 
     Args:
-        spec: its `migration.options` are given by name, as in the work file, because the client may
-            have no plugin that knows their units.
+        spec: its `migration.options` are unparsed, as in the work file, because the client may lack
+            the plugin that knows their units.
         cluster: the strategy's options for all processes.
-        own: type of the options of one process, where they are more.
+        own: type of the options of one process, if it differs from that of `cluster`.
 
     Raises:
         ValueError: for an unknown option, or an invalid value.
@@ -43,7 +43,7 @@ def options_of(spec: ProcessSpec, cluster: Any, own: type[Any] | None = None) ->
 
 
 def merged_options(wanted: type[T], cluster: Mapping[str, Any], own: Mapping[str, Any]) -> T:
-    """Return options of a type from those of the cluster, checked, and a process's own, as text.
+    """Return checked options of a type: those of the cluster, overridden by unparsed own ones.
 
     Raises:
         ValueError: as `options_of`.
@@ -52,7 +52,7 @@ def merged_options(wanted: type[T], cluster: Mapping[str, Any], own: Mapping[str
 
 
 def _in_base_units(wanted: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options with numbers in place of "5s" and the like; refuse values out of range."""
+    """Return the options with numbers instead of text such as "5s"; refuse values out of range."""
     hints = get_type_hints(wanted, include_extras=True) if given else {}
     return {name: _number(name, hints.get(name), value) for name, value in given.items()}
 

@@ -1,13 +1,15 @@
-"""Guarded calls of plugins by the core: a failed call costs one decision, and is counted.
+"""Guarded calls of plugins by the core: a failed call affects one decision and is recorded.
 
-============  ============================================================================
-plugin state  recorded event, and the next state
-============  ============================================================================
-selected      a call raises, is late, or breaks the contract by its answer: `failing`
-failing       a call fails with an error other than the last recorded one: at most one record in
-              `RECORD_PERIOD` seconds
-failing       a call is good, and no call has failed for `WORKS_AFTER` seconds: `selected`
-============  ============================================================================
+========  ==========================================  =====================================
+state     event                                       consequence
+========  ==========================================  =====================================
+selected  a call raises, is late, or answers in       `failing`; a record
+          breach of the contract
+failing   a call fails with another error             a record, at most one in
+                                                      `RECORD_PERIOD` seconds
+failing   a call succeeds, and none has failed for    `selected`; a record
+          `WORKS_AFTER` seconds
+========  ==========================================  =====================================
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from rosrm.wording import counted
 T = TypeVar("T")
 #: Kind and name of an offer.
 Plugin = tuple[PluginKind, str]
-#: Carries a call out; may raise `TimeoutError` when the call takes too long.
+#: Function that executes a call; raises `TimeoutError` if the call takes too long.
 Limit = Callable[[Plugin, Callable[[], Any]], Any]
 
 #: Names of the kinds of offers in messages.
@@ -37,10 +39,10 @@ TITLES: Final[Mapping[PluginKind, str]] = {
     "launcher": "launcher",
 }
 
-#: Seconds without a failure after which a good answer ends the state "failing". Otherwise a plugin
-#: that fails for every second process would be recorded with each of them.
+#: Seconds without a failure after which a valid answer ends the state "failing". Otherwise a plugin
+#: that fails for every second process would cause a record with each of them.
 WORKS_AFTER: Final = 10.0
-#: Seconds between two records of one plugin's errors. An error may name what differs in each call.
+#: Seconds between two records of one plugin's errors, because the text may differ in each call.
 RECORD_PERIOD: Final = 60.0
 
 
@@ -49,8 +51,8 @@ class Failing:
     """A plugin that fails.
 
     Attributes:
-        error: of the last failure: the hook, the exception and its place.
-        count: failures since the plugin worked last.
+        error: last failure: the hook, the exception and its place.
+        count: number of failures since the plugin worked last.
         last: time of the last failure.
     """
 
@@ -61,7 +63,7 @@ class Failing:
     _recorded_at: float = -inf
 
     def note(self, error: str, count: int, now: float) -> bool:
-        """Note the newest error; return True if it is to be recorded."""
+        """Note the newest error; return True if it must be recorded."""
         self.error, self.count, self.last = error, self.count + count, now
         if error == self._recorded or now - self._recorded_at < RECORD_PERIOD:
             return False
@@ -80,11 +82,11 @@ def _without_limit(_plugin: Plugin, call: Callable[[], Any]) -> Any:
 
 @dataclass(slots=True)
 class PluginCalls:
-    """The one guard around the plugins of a master.
+    """The guard of all plugin calls of a master.
 
     Attributes:
-        limit: carries each call out; the master sets one with a deadline.
-        failing: the plugins that fail.
+        limit: executes each call; the master sets a function with a time-out.
+        failing: the failing plugins.
     """
 
     limit: Limit = _without_limit
@@ -96,10 +98,10 @@ class PluginCalls:
         """Return the answer of a plugin.
 
         Args:
-            kind: of the offer.
-            name: of the offer.
-            hook: that is called, for messages.
-            call: calls the hook and checks the answer; raises `PluginError` for a bad answer.
+            kind: kind of the offer.
+            name: name of the offer.
+            hook: name of the called method, for messages.
+            call: calls the method and checks the answer; raises `PluginError` for an invalid one.
 
         Raises:
             PluginError: the call failed; the text has the error and its place.
@@ -107,9 +109,9 @@ class PluginCalls:
         plugin = (kind, name)
         try:
             answer: T = self.limit(plugin, call)
-        except KeyboardInterrupt:  # Ctrl-C of a simulation; a master turns it into a flag
+        except KeyboardInterrupt:  # Ctrl-C of a simulation; a master handles the signal itself
             raise
-        except BaseException as fault:  # whatever a plugin raises, even SystemExit
+        except BaseException as fault:  # a plugin may raise anything, even SystemExit
             reason = describe_plugin_fault(fault)
             noted = self._failed.setdefault(plugin, Failing())
             noted.error, noted.count = f"{hook}: {reason}", noted.count + 1
@@ -119,12 +121,12 @@ class PluginCalls:
         return answer
 
     def changes(self, now: float) -> list[tuple[Plugin, str]]:
-        """Return the plugins that fail, or work again (""), since the last call."""
+        """Return the plugins that began to fail, or to work (""), since the last call."""
         found: list[tuple[Plugin, str]] = []
         for plugin, noted in self._failed.items():
             if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):
                 found.append((plugin, noted.error))
-        for plugin in self._worked - self._failed.keys():
+        for plugin in sorted(self._worked - self._failed.keys()):
             if now - self.failing[plugin].last >= WORKS_AFTER:
                 del self.failing[plugin]
                 found.append((plugin, ""))
@@ -134,9 +136,10 @@ class PluginCalls:
 
 
 def implements(plugin: object, contract: Callable[..., T]) -> TypeGuard[T]:
-    """Return True if a plugin has every member of a protocol; no code of the plugin runs.
+    """Return True if a plugin has every member of a protocol, without running plugin code.
 
-    `isinstance` evaluates the properties of the plugin, because Python before 3.12 asks `hasattr`.
+    `isinstance` would evaluate the plugin's properties, because it calls `hasattr` before Python
+    3.12.
     """
     return all(
         name.startswith("_") or getattr_static(plugin, name, None) is not None

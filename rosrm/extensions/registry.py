@@ -1,14 +1,13 @@
-"""Registry of plugins: selection by name, creation, outcome of each.
+"""Registry of plugins: selection by name, creation of their objects, states for listings.
 
-This module does not import pydantic, because the runtimes of master and slave use it too. They get
-checked options; `rosrm.config.options` checks those of a file against the same offers.
+This module does not import pydantic, because the runtimes of master and slave import it. They get
+checked options; `rosrm.config.options` checks the options in a file against the same offers.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, Final, TypeVar, cast
 
@@ -17,13 +16,11 @@ from rosrm.extensions.contracts import (
     Capabilities,
     CheckpointPolicy,
     HostChecking,
-    Launcher,
     LauncherContext,
     LauncherOffer,
     MigrationOffer,
     MigrationStrategy,
     PeriodicImaging,
-    Probe,
     ProbeContext,
     ProbeOffer,
     ScoringOffer,
@@ -43,32 +40,30 @@ from rosrm.extensions.discovery import (
     load_objects,
 )
 from rosrm.extensions.installed import PluginAddress, installed_plugins
+from rosrm.extensions.made import (
+    MadeLauncher,
+    MadeLaunchers,
+    MadeProbe,
+    OfferedExecutor,
+    Probes,
+    close_quietly,
+    failed_probe,
+    fault_of_resources,
+    missing_method,
+)
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import from_plain
-from rosrm.model.description_checks import resource_fault
 from rosrm.model.rows import PluginKind, PluginRow, PluginState
 from rosrm.model.values import (
     EMPTY,
-    RESOURCE_SLOTS,
     MigrationPolicy,
     ProcessSpec,
-    Reading,
-    ResourceDescription,
 )
 from rosrm.wording import counted, get_close_matches
 
-#: Members that the object of each kind must have.
-_METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
-    "probe": ("resources", "read", "close"),
-    "scoring": ("score",),
-    "migration": ("propose",),
-    "checkpoint": ("choose",),
-    "launcher": ("prepare",),
-}
-
-#: Distribution with rosrm's own plugins of a kind, for an installation without any.
+#: Distribution with rosrm's own plugins of each kind, for messages if none is installed.
 _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "probe": "rosrm-resources",
     "scoring": "rosrm-scoring",
@@ -76,101 +71,20 @@ _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "checkpoint": "rosrm-checkpoint",
 }
 
-#: Seconds for a `create`, which may load a large library.
+#: Time-out of `create` in seconds; it may load a large library.
 CREATE_LIMIT: Final = 30.0
 
-#: Seconds between two reads of a `FailedProbe`.
-_FAILED_PERIOD: Final = 10.0
-#: Most broken plugins in a message where it is unclear which one is meant.
+#: Highest number of broken plugins in a message if the intended one is unknown.
 _MOST_BROKEN: Final = 3
 
 _NO_CAPABILITIES: Final = Capabilities()
 
-Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NameToOptions = Mapping[str, Mapping[str, Any]]
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class MadeProbe:
-    """A probe that is present on this host; period and deadline are of its offer, seconds."""
-
-    name: str
-    probe: Probe
-    resources: tuple[ResourceDescription, ...]
-    period: float
-    deadline: float
-
-
-@dataclass(frozen=True)
-class Probes:
-    """The probes of a host.
-
-    Attributes:
-        made: those present, and a `FailedProbe` for each that could not be made.
-        absent: name to the reason, of probes that declare themselves absent here.
-    """
-
-    made: tuple[MadeProbe, ...]
-    absent: Mapping[str, str]
-
-
-class FailedProbe:
-    """Stands for a chosen probe that could not be made: each read fails with the reason.
-
-    So its resources are stale, and a limit on one of them stops new work, as it does where a probe
-    fails in reading.
-
-    Attributes:
-        resources: declared by the offer and read by no other probe, of unknown capacity.
-        reason: why there is no probe, with the plugin and the place.
-    """
-
-    def __init__(self, resources: Sequence[ResourceDescription], reason: str) -> None:
-        self.resources = resources
-        self.reason = reason
-
-    def read(self) -> Iterable[Reading]:
-        """Raise `PluginError` with the reason."""
-        raise PluginError(self.reason)
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-@dataclass(frozen=True)
-class MadeLauncher:
-    """A launcher of this host, and the environment variables that it sets."""
-
-    launcher: Launcher
-    variables: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class MadeLaunchers:
-    """The launchers of a host.
-
-    Attributes:
-        made: by name.
-        absent: name to the reason, of those that say that they are absent here.
-        broken: name to the reason, of those that could not be made.
-    """
-
-    made: Mapping[str, MadeLauncher]
-    absent: Mapping[str, str]
-    broken: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class OfferedExecutor:
-    """An executor, and the name of the migration strategy whose offer has it."""
-
-    strategy: str
-    call: Executor
-
-
 class Registry:
-    """The plugins of this installation; made by `discover`."""
+    """The plugins of this installation; `discover` creates it."""
 
     def __init__(self, loaded: Loaded) -> None:
         self._offers: dict[Plugin, Offered] = {}
@@ -183,7 +97,7 @@ class Registry:
     def discover(cls) -> Registry:
         """Find and load the installed plugins.
 
-        Broken plugins are kept with their reason, and raise nothing.
+        A broken plugin raises nothing and is listed with its reason.
         """
         return cls.load(installed_plugins())
 
@@ -205,7 +119,7 @@ class Registry:
         return tuple(self._broken)
 
     def names(self, kind: PluginKind) -> tuple[str, ...]:
-        """Return the offered names of one kind."""
+        """Return the names of all offers of one kind."""
         return tuple(sorted(name for of_kind, name in self._offers if of_kind == kind))
 
     def offer(self, kind: PluginKind, name: str) -> ChosenOffer:
@@ -235,10 +149,10 @@ class Registry:
         return chosen
 
     def rows(self, *kinds: PluginKind, host: str = "") -> list[PluginRow]:
-        """Return one row for each offer and each fault of these kinds (of all where none is given).
+        """Return one row for each offer and each fault of these kinds (without kinds: of all).
 
-        State and reason depend on the calls below: "available" until the object was made, then
-        "selected", "absent" or "broken".
+        The state is "available" until the object was created, then "selected", "absent" or
+        "broken".
         """
         rows = []
         for (kind, name), offered in sorted(self._offers.items()):
@@ -254,19 +168,19 @@ class Registry:
     # --- creation -----------------------------------------------------------------------------
 
     def scoring(self, name: str, options: Mapping[str, Any] = EMPTY) -> ScoringPolicy:
-        """Make a scoring policy; raises `ConfigError` or `PluginError`."""
+        """Create a scoring policy; raises `ConfigError` or `PluginError`."""
         return cast(ScoringPolicy, self._required("scoring", name, options))
 
     def checkpoint(
         self, name: str | None, options: Mapping[str, Any] = EMPTY
     ) -> CheckpointPolicy | None:
-        """Make a checkpoint policy, None for none; raises `ConfigError` or `PluginError`."""
+        """Create a checkpoint policy, None for none; raises `ConfigError` or `PluginError`."""
         if name is None:
             return None
         return cast(CheckpointPolicy, self._required("checkpoint", name, options))
 
     def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
-        """Make migration strategies by name, in this order; raises as `scoring` does."""
+        """Create migration strategies by name, in this order; raises as `scoring` does."""
         made = {
             name: cast(MigrationStrategy, self._required("migration", name, options))
             for name, options in chosen.items()
@@ -276,9 +190,9 @@ class Registry:
         return made
 
     def _check_executors(self, name: str, strategy: object) -> None:
-        """Refuse a strategy whose `ability` or `discard` is no executor of its own offer."""
+        """Refuse a strategy with a `host_check` or `discard` that its own offer lacks."""
         own = self._strategy(name).executors
-        for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
+        for kind, named in ((HostChecking, "host_check"), (PeriodicImaging, "discard")):
             fault = ""
             try:
                 if implements(strategy, kind) and (executor := getattr(strategy, named)) not in own:
@@ -310,7 +224,7 @@ class Registry:
             offer, common = self._strategy(strategy), chosen.get(strategy, EMPTY)
             return merged_options(offer.own_options or offer.options, common, own)
 
-        common = cache(partial(merged, own=EMPTY))  # most processes set no option of their own
+        common = cache(partial(merged, own=EMPTY))  # most processes have no own options
 
         def options(strategy: str, spec: ProcessSpec) -> Any:
             own = spec.migration.options if spec.migration.strategy == strategy else EMPTY
@@ -319,7 +233,7 @@ class Registry:
         return options
 
     def capabilities(self, chosen: NameToOptions = EMPTY) -> dict[str, Capabilities]:
-        """Return what each installed strategy can do for a process without options of its own."""
+        """Return the capabilities of each installed strategy for a process without own options."""
         of = self.capabilities_of(chosen)
         names = self.names("migration")
         return {name: of(ProcessSpec("", migration=MigrationPolicy(name))) for name in names}
@@ -327,9 +241,9 @@ class Registry:
     def capabilities_of(
         self, chosen: NameToOptions = EMPTY
     ) -> Callable[[ProcessSpec], Capabilities]:
-        """Return the function that tells what the strategy of a process can do for it.
+        """Return a function that returns the capabilities of the strategy of a process.
 
-        A strategy that is not installed here, or fails to tell, has no capabilities.
+        A strategy that is not installed here, or that fails, has no capabilities.
 
         Args:
             chosen: strategies with their options for all processes.
@@ -354,7 +268,7 @@ class Registry:
         return cast(MigrationOffer, self.offer("migration", name))
 
     def launchers(self, context: LauncherContext) -> MadeLaunchers:
-        """Make the launchers of a host; one that cannot be made is left out with the reason."""
+        """Create the launchers of a host; list those that cannot be created with the reason."""
         made: dict[str, MadeLauncher] = {}
         absent: dict[str, str] = {}
         broken: dict[str, str] = {}
@@ -371,7 +285,7 @@ class Registry:
         return MadeLaunchers(made, absent, broken)
 
     def executors(self) -> dict[str, OfferedExecutor]:
-        """Return the executors that plans may name on this host, from all migration offers."""
+        """Return the executors that plans may name on this host, of all migration offers."""
         return {
             executor: OfferedExecutor(name, function)
             for name in self.names("migration")
@@ -379,7 +293,7 @@ class Registry:
         }
 
     def broken_strategies(self) -> dict[str, str]:
-        """Return the migration offers that are broken here, name to reason."""
+        """Return the name of each broken migration offer, with the reason."""
         return {
             broken.name or broken.source.plugin: f"{broken.source}: {broken.reason}"
             for broken in self._broken
@@ -387,10 +301,10 @@ class Registry:
         }
 
     def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
-        """Make the probes of a host, the default ones for None.
+        """Create the probes of a host, the default ones for None.
 
-        A probe that declares itself absent here is left out with its reason. One that fails in any
-        other way is replaced by a `FailedProbe`.
+        A probe that raises `SkipPlugin` is absent. A probe that fails in any other way is replaced
+        by a `FailedProbe`.
 
         Raises:
             ConfigError: for an unknown name or option.
@@ -411,21 +325,9 @@ class Registry:
                 )
                 failed[name] = f"{source}: {reason}"
         for name, reason in failed.items():
-            made.append(self._failed_probe(name, reason, made))
+            offer = cast(ProbeOffer, self.offer("probe", name))
+            made.append(failed_probe(offer, reason, made))
         return Probes(tuple(made), absent)
-
-    def _failed_probe(self, name: str, reason: str, others: Sequence[MadeProbe]) -> MadeProbe:
-        """Return a substitute for a probe that could not be made."""
-        taken = {resource.name for other in others for resource in other.resources}
-        declared = cast(ProbeOffer, self.offer("probe", name)).resources
-        described = [
-            ResourceDescription(resource, "1", 1.0, "unknown")
-            for resource in dict.fromkeys(declared)
-            if resource not in taken
-        ]
-        valid = [one for one in described if not resource_fault(one)]
-        probe = FailedProbe(tuple(valid[: RESOURCE_SLOTS - len(taken)]), reason)
-        return MadeProbe(name, probe, tuple(probe.resources), _FAILED_PERIOD, 1.0)
 
     def _probe(
         self,
@@ -438,7 +340,7 @@ class Registry:
         probe = self._make("probe", name, options, context)
         try:
             resources = tuple(probe.resources)
-            fault = _fault_of_resources(resources, offer, before)
+            fault = fault_of_resources(resources, offer, before)
             fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
         except FAULTS as raised:
             resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
@@ -448,7 +350,7 @@ class Registry:
         return MadeProbe(name, probe, resources, offer.period, offer.deadline)
 
     def _required(self, kind: PluginKind, name: str, options: Mapping[str, Any]) -> Any:
-        """Make an object that the master needs: its absence here is an error."""
+        """Create an object that the master needs, so that its absence here is an error."""
         try:
             return self._make(kind, name, options)
         except SkipPlugin as skip:
@@ -477,12 +379,12 @@ class Registry:
 
         try:
             thing = limited(CREATE_LIMIT, partial(create, *given), late)
-        except (SkipPlugin, ConfigError):  # raised on purpose, for this host or these options
+        except (SkipPlugin, ConfigError):  # not a fault of the plugin
             raise
         except FAULTS as fault:
             reason = f"`create` ({definition(create)}) raised {describe_plugin_fault(fault)}"
             raise self._fault(kind, name, reason) from fault
-        lacks = _missing_method(kind, thing)
+        lacks = missing_method(kind, thing)
         if lacks:
             raise self._fault(kind, name, f"`create` ({definition(create)}) made {lacks}")
         self._outcome[kind, name] = ("selected", offer.summary)
@@ -497,7 +399,7 @@ class Registry:
     # --- lookup of names ----------------------------------------------------------------------
 
     def _keep_single(self, offers: Sequence[Offered]) -> None:
-        """Keep the offers with a unique name: two plugins with one name would run by chance."""
+        """Keep the offers with a unique name, because a duplicate name is ambiguous."""
         for offered in offers:
             key = (offered.kind, offered.offer.name)
             same = [other for other in offers if (other.kind, other.offer.name) == key]
@@ -509,9 +411,9 @@ class Registry:
                 self._broken.append(Broken(offered.source, reason, *key))
 
     def _refuse_shared_executors(self) -> None:
-        """Mark offers as broken whose executors share a name, because orders hold only the name.
+        """Mark offers with executors of equal names as broken, because orders have only the name.
 
-        Offers that share one function may share its name.
+        Offers with the same function may share its name.
         """
         owners: dict[str, list[str]] = {}
         for name in self.names("migration"):
@@ -540,7 +442,7 @@ class Registry:
         title, names = TITLES[kind], self.names(kind)
         near = get_close_matches(name, names, 1)
         meant = f"; did you mean {near[0]!r}?" if near else "."
-        shipped = f"; {_SHIPPED_IN[kind]} brings rosrm's own" if kind in _SHIPPED_IN else ""
+        shipped = f"; {_SHIPPED_IN[kind]} has rosrm's own" if kind in _SHIPPED_IN else ""
         installed = f"Installed: {', '.join(names)}." if names else f"None is installed{shipped}."
         raise ConfigError(
             f"unknown {title} {name!r}{meant} {installed}{self._broken_note(kind, name)}"
@@ -549,13 +451,13 @@ class Registry:
     def _broken_note(self, kind: PluginKind, name: str = "") -> str:
         """Return the faults of the broken plugin that may be meant, and the number of the others.
 
-        A plugin is matched by the name of its offer or, where that is unknown, by its own.
+        A plugin is matched by the name of its offer or, if that is unknown, by its own name.
         """
         might = [b for b in self._broken if b.kind in ("", kind)]
         meant = [b for b in might if not name or name == b.name]
         if not meant:
             meant = [b for b in might if not b.name and _is_named_like(b.source, name)]
-        if not meant:  # any plugin without a known offer may be the one
+        if not meant:  # any plugin without a known offer may be meant
             meant = [b for b in might if not b.name][:_MOST_BROKEN]
         reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in meant)
         note = " Broken: " + "; ".join(reasons) + "." if reasons else ""
@@ -567,56 +469,10 @@ class Registry:
 
 
 def _is_named_like(source: PluginSource, name: str) -> bool:
-    """Return True if a broken plugin without known offers may have one of this name."""
+    """Return True if a broken plugin without known offers may have an offer of this name."""
     words = {word for text in (source.plugin, source.distribution) for word in _words(text)}
     return bool(words & set(_words(name))) or bool(get_close_matches(name, [source.plugin], 1))
 
 
 def _words(text: str) -> list[str]:
     return [word for word in re.split(r"[^a-z]+", text.lower()) if word not in ("", "rosrm")]
-
-
-def _missing_method(kind: PluginKind, thing: object) -> str:
-    """Return the fault of an object that an offer made; "": it has all its methods."""
-    if thing is None:
-        wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
-        return f"None; an object with {wanted} is required (does it lack a `return`?)"
-    for name in _METHODS[kind]:
-        if not hasattr(type(thing), name) and not hasattr(thing, name):
-            has = [one for one in dir(thing) if not one.startswith("_")]
-            near = get_close_matches(name, has, 1)
-            misspelt = f"; is its `{near[0]}` misspelt?" if near else ""
-            return f"a {type(thing).__name__}, which has no `{name}`{misspelt}"
-    return ""
-
-
-def _fault_of_resources(
-    resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
-) -> str:
-    """Return why a host cannot have these resources, without the subject; "" if it can."""
-    taken = {resource.name: other.name for other in before for resource in other.resources}
-    if not resources:
-        return "describes no resource; raise SkipPlugin in `create` where there is nothing to read"
-    for resource in resources:
-        fault = resource_fault(resource)
-        if fault:
-            return fault
-        if resource.name in taken:
-            return f"reads {resource.name!r}, as {taken[resource.name]!r} does already"
-        if resource.name not in offer.resources:
-            declared = repr((*offer.resources, resource.name))
-            return (
-                f"reads {resource.name!r}, which its offer does not declare: "
-                f"say ProbeOffer(..., resources={declared})"
-            )
-    if len(taken) + len(resources) > RESOURCE_SLOTS:
-        return f"brings the resources of this host to more than {RESOURCE_SLOTS}"
-    return ""
-
-
-def close_quietly(probe: Probe) -> None:
-    """Close a probe that is given up; ignore a failure of the close."""
-    try:
-        probe.close()
-    except FAULTS:
-        return

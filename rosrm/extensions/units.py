@@ -1,8 +1,8 @@
-"""Quantities with units, for our settings and for the options of plugins.
+"""Quantities with units, for rosrm's settings and for the options of plugins.
 
 A field annotated with one of these types accepts a number in base units or text with a unit, and
-refuses a value out of its range. This module imports pydantic only when a file is validated,
-because the runtimes of master and slave start without it::
+refuses a value out of its range. Only the validation of a file imports pydantic here, because the
+runtimes of master and slave start without it::
 
     @dataclass(frozen=True)
     class Options:
@@ -57,7 +57,7 @@ _NUMBER_AND_UNIT: Final = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\
 
 
 class UnfitAmount(ValueError):
-    """An amount that fits no resource; the message is better where the resource is known."""
+    """An amount that fits no resource; `of` returns a more precise message for one resource."""
 
     def __init__(self, text: str, given: object) -> None:
         super().__init__(text)
@@ -74,16 +74,15 @@ class UnfitAmount(ValueError):
 
 @dataclass(frozen=True)
 class Quantity:
-    """Marks a number that may carry a unit and must lie within a range.
+    """Annotation of a number that may have a unit and must lie within a range.
 
     Attributes:
-        measures: a key of `UNITS`: the units that may follow the number. A duration is at most ten
-            years.
-        low: least value allowed.
-        high: greatest value allowed.
-        above: the value must be greater than `low`.
-        whole: the value must be a whole number.
-        hint: added to the message on a value out of range.
+        measures: key of `UNITS` with the allowed units. A duration is at most ten years.
+        low: lowest allowed value.
+        high: highest allowed value.
+        above: True: the value must be greater than `low`.
+        whole: True: the value must be a whole number.
+        hint: text added to the message on a value out of range.
     """
 
     measures: str = "number"
@@ -117,7 +116,10 @@ class Quantity:
 
     def _number(self, given: object) -> float:
         if isinstance(given, (int, float)) and not isinstance(given, bool):
-            return float(given)
+            try:
+                return float(given)
+            except OverflowError:  # an integer of more than 308 digits
+                return math.inf
         found = _NUMBER_AND_UNIT.fullmatch(given) if isinstance(given, str) else None
         if found is None:
             raise ValueError(f"{given!r} is not {self._form()}")
@@ -143,7 +145,7 @@ class Quantity:
         return f"a number, or text such as {_EXAMPLES[self.measures]}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Return a schema by which pydantic calls `parse`; only pydantic calls this."""
+        """Return a schema with which pydantic calls `parse`; only pydantic calls this."""
         from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_plain_validator_function(self._parse_in_file)
@@ -169,7 +171,7 @@ Amount = Annotated[float, ANY_AMOUNT]
 
 
 class IsResource:
-    """Marks text that names a resource: the configuration refuses names that no probe reads."""
+    """Annotation of text that names a resource; a name that no probe reads is refused in a file."""
 
 
 ResourceName = Annotated[str, IsResource()]

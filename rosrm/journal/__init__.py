@@ -2,6 +2,6 @@
 
 sqlite.py      the journal
 retention.py   bounds on the event record
-errors.py      failures of a disk: those that may pass, and permanent ones
-recovery.py    repair of a journal with a gap, or of an unreadable one
+errors.py      errors, temporary and permanent, with remedies
+recovery.py    recovery of a damaged journal
 """

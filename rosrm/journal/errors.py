@@ -1,4 +1,4 @@
-"""Error messages about a journal, each with its cause and remedy."""
+"""Errors of a journal, with cause and remedy in their messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _OTHER_STATE = "give the master another `state:`"
 
 
 def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
-    """Return the error for the user; a `JournalBlocked` where the failure may pass."""
+    """Return the error for the user; a `JournalBlocked` if the failure may be temporary."""
     text = str(error)
     beginning = f"the journal {path} cannot be used ({text}); "
     cause = getattr(error, "strerror", None) or text
@@ -51,19 +51,19 @@ _NOTHING_LOST = "no acknowledged request is lost"
 
 
 def unreadable(path: Path, fault: Exception) -> JournalError:
-    """Return the error for a sound database whose content makes no sense."""
+    """Return the error for an intact database with invalid content."""
     return JournalError(
         f"the journal {path} cannot be used ({type(fault).__name__}: {fault}); it was not written "
         f"by this rosrm: restore it from a backup, or move it away to start with an empty journal"
     )
 
 
-#: What to do with a damaged file.
+#: Remedies for a damaged file.
 DAMAGED = (
     "the file is damaged: restore it from a backup, or start the master once with `--recover`, "
     "which continues with its readable part and keeps the damaged file, or move it "
-    "away to start with an empty journal. Nothing is stopped as long as no master runs; then the "
-    "processes that its journal does not know are stopped as their slaves register"
+    "away to start with an empty journal. As long as no master runs, no process is stopped. Once "
+    "one runs, it stops the processes that its journal lacks as their slaves register"
 )
 
 

@@ -1,8 +1,8 @@
-"""Recovery of a damaged journal: its readable part goes into a new journal; the old file is kept.
+"""Recovery of a damaged journal: a new journal gets the readable part; the old file is not deleted.
 
-A damaged page takes its intents and events with it, so the new journal has a gap. A process whose
-intent is lost is stopped as its slave registers. Two things that could start a process twice are
-repaired here: the hosts that processes are on, and the numbers of instances.
+The intents and events on a damaged page are lost, so the new journal has a gap. A process whose
+intent is lost is stopped as its slave registers. Two losses could start a process twice and are
+repaired here: the hosts of processes, and the numbers of instances.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import JournalBlocked, JournalError
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record
 from rosrm.runtime.disk_space import room_for
 from rosrm.wording import counted
 
 _BESIDE: Final = ("-wal", "-shm")
-#: A damaged page hides all rows behind it in a scan. So events are read in small groups, and from
-#: the end; intents from both ends, then one by one by the names that the events mention.
+#: A scan ends at a damaged page. So events are read from the end and in small groups. Intents are
+#: read from both ends, then one by one by the names in the events.
 _EVENTS: Final = "SELECT * FROM record WHERE sequence BETWEEN ? AND ? AND facts IS NOT NULL"
 _NEWEST_EVENTS: Final = "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence DESC"
 _FEW: Final = 50
@@ -38,18 +38,18 @@ _INTENTS: Final = (
     "SELECT tbl, key, value FROM intent ORDER BY tbl DESC, key DESC",
 )
 _INTENT: Final = "SELECT tbl, key, value FROM intent WHERE tbl = ? AND key = ?"
-#: Most bytes that are added (sparsely) to a truncated file.
+#: Highest number of bytes that are added (sparsely) to a truncated file.
 _MOST_EMPTY: Final = 2**30
 #: Instance numbers left unused above the largest known one.
 _FREE: Final = 1000
-#: Facts of events that hold instance numbers, and a bound above all real numbers.
+#: Facts of events with instance numbers, and the exclusive upper bound of instance numbers.
 _NUMBERS: Final = ("number", "source", "destination")
 _NO_NUMBER: Final = 2**53
 
 
 @dataclass(slots=True)
 class _Found:
-    """The rows that could be read: intents by table and key, events by sequence, as stored."""
+    """The readable rows as stored: intents by table and key, events by sequence."""
 
     intents: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
     events: dict[int, tuple[Any, ...]] = field(default_factory=dict)
@@ -60,14 +60,14 @@ def recover(path: Path, wall: Callable[[], float] = time.time) -> str:
     """Write a new journal from the readable part of a damaged one.
 
     Args:
-        path: of the journal; no master may have it open.
-        wall: unix time, seconds.
+        path: path of the journal; no master may have the file open.
+        wall: returns the unix time in seconds.
 
     Returns:
-        A summary for the user: the recovered records, and the new path of the damaged file.
+        A summary for the user: number of recovered rows, and the new path of the damaged file.
 
     Raises:
-        JournalError: the journal is not damaged, nothing in it can be read, or space or a
+        JournalError: the journal is not damaged, nothing in it is readable, or space or a
             permission is missing; the journal is unchanged.
     """
     _check_damaged(path)
@@ -85,7 +85,7 @@ def _recover(path: Path, wall: Callable[[], float]) -> str:
         new = Path(place) / "new.sqlite"
         aside = path.with_name(f"{path.name}.damaged-{int(wall())}")
         _write(new, found, aside)
-        # A kill at any point leaves a journal: without one, a master stops every process.
+        # A journal must exist at every moment: a master without one stops every process.
         os.link(path, aside)
         for suffix in _BESIDE:
             with contextlib.suppress(FileNotFoundError):
@@ -98,8 +98,8 @@ def _not_recovered(path: Path, error: BaseException) -> JournalError:
     why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     room = room_for(path)
     return JournalError(
-        f"the journal {path} was not recovered, and is as it was: {why}. A recovery needs room "
-        f"beside it for two more of its size{f' ({room})' if room else ''}, and the right to write "
+        f"the journal {path} was not recovered and is unchanged: {why}. A recovery needs free "
+        f"space beside it of twice its size{f' ({room})' if room else ''}, and the right to write "
         f"into its folder"
     )
 
@@ -120,7 +120,7 @@ def _check_damaged(path: Path) -> None:
 
 
 def _salvage(path: Path, place: Path) -> _Found:
-    """Read a copy, because reading would write to the original (`-shm`, a checkpoint)."""
+    """Read a copy, because SQLite also writes when it reads (`-shm`, a checkpoint)."""
     copy = place / "damaged.sqlite"
     for suffix in ("", "-wal"):
         with contextlib.suppress(FileNotFoundError):
@@ -133,14 +133,14 @@ def _salvage(path: Path, place: Path) -> _Found:
         _read_intents(database, found)
     if not found.intents:
         raise JournalError(
-            f"nothing can be read of the journal {path}: restore it from a backup, or move it away "
+            f"the journal {path} has no readable part: restore it from a backup, or move it away "
             f"to start with an empty one"
         )
     return found
 
 
 def _fill_up(copy: Path) -> None:
-    """Add empty pages: SQLite reads nothing of a file that is shorter than its header says."""
+    """Add empty pages, because SQLite refuses a file that is shorter than its header states."""
     head = copy.read_bytes()[:32]
     page, count = int.from_bytes(head[16:18], "big"), int.from_bytes(head[28:32], "big")
     size = copy.stat().st_size
@@ -173,7 +173,7 @@ def _read_intents(database: sqlite3.Connection, found: _Found) -> None:
 def _rows(
     database: sqlite3.Connection, found: _Found, query: str, *values: object
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield rows up to the first that cannot be read."""
+    """Return the rows up to the first unreadable one."""
     try:
         yield from database.execute(query, values)
     except sqlite3.Error:
@@ -181,14 +181,14 @@ def _rows(
 
 
 def _write(path: Path, found: _Found, aside: Path) -> None:
-    _put_right(found)
+    _add_lost_rows(found)
     SqliteJournal(path).close()
     with contextlib.closing(sqlite3.connect(path)) as database, database:
         database.executemany(
             f"INSERT INTO record VALUES ({', '.join('?' * 8)})",  # noqa: S608 - fixed words
             [found.events[sequence] for sequence in sorted(found.events)],
         )
-    journal = SqliteJournal(path)
+    journal = SqliteJournal(path, keep_events=_MOST_EVENTS)  # the master's own bound holds later
     intents = [Intent(table, key, value) for (table, key), value in found.intents.items()]
     journal.write(
         [Record(EventKind.JOURNAL_RECOVERED, message=_summary(found, aside.name))], intents, 0.0
@@ -196,8 +196,8 @@ def _write(path: Path, found: _Found, aside: Path) -> None:
     journal.close()
 
 
-def _put_right(found: _Found) -> None:
-    """Restore the rows that the remaining intents depend on and that may be lost."""
+def _add_lost_rows(found: _Found) -> None:
+    """Add lost rows on which the remaining intents depend."""
     hosts = {key for table, key in found.intents if table == "host"}
     ids = [int(found.intents["host", name].get("host_id", 0)) for name in hosts]
     largest = _largest_reported(found)
@@ -213,13 +213,13 @@ def _put_right(found: _Found) -> None:
                 found.intents["host", host] = known
     found.intents.setdefault(("cluster", "instances"), {"next": largest + _FREE})
     epoch = found.intents.setdefault(("cluster", "epoch"), {"epoch": 0})
-    epoch["boot"] = "recovered"  # as after a reboot: all hosts report before work is assigned
+    epoch["boot"] = "recovered"  # as after a reboot: the master first waits for all hosts
 
 
 def _largest_reported(found: _Found) -> int:
     """Return the largest instance number in the events, those of ended instances included.
 
-    A supervisor that has forgotten the end of a number refuses to start any number up to it.
+    A supervisor that has dropped an ended instance refuses to start any number up to its own.
     """
     largest = 0
     for event in found.events.values():
@@ -233,11 +233,11 @@ def _largest_reported(found: _Found) -> int:
 def _summary(found: _Found, aside: str) -> str:
     processes = sum(table == "process" for table, _ in found.intents)
     hosts = sum(table == "host" for table, _ in found.intents)
-    part = "all that was" if found.whole else "what could still be read:"
+    part = "with all of its rows:" if found.whole else "with its readable rows:"
     held = counted(processes, "process", "processes")
     events = counted(len(found.events), "event")
     return (
         f"the journal was recovered from a damaged one, {part} {held}, {counted(hosts, 'host')} "
-        f"and {events}; the damaged file is {aside}. Look at `rosrm ps` "
-        f"for what is missing, and submit it again: a missing process that still runs is stopped"
+        f"and {events}; the damaged file is {aside}. Submit again each process that `rosrm ps` "
+        f"does not list: a missing process that still runs is stopped"
     )

@@ -1,8 +1,8 @@
-"""The journal in SQLite: intent, and the event record.
+"""Journal in SQLite: intents and the event record.
 
 One group of records and intents is one transaction. In WAL mode with `synchronous=NORMAL` a
-committed group survives the death of the process at any instant; `full` adds a disk flush for each
-group and survives a power failure too.
+committed group survives a kill of the process at any instant. With `FULL`, each commit flushes the
+disk, so the group also survives a power failure.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.runtime.private_files import make_private_directory, make_private_file
 
 #: Version of the tables; a file with another version is refused.
@@ -34,7 +34,7 @@ CREATE TABLE IF NOT EXISTS intent (
 ) WITHOUT ROWID;
 """
 
-#: Milliseconds for which a write waits while another program holds the file.
+#: Milliseconds for which a write waits while another program has locked the file.
 _PATIENCE_MS: Final = 200
 #: Bytes to which the write-ahead log is cut after a checkpoint.
 _LONGEST_LOG: Final = 16 << 20
@@ -44,15 +44,15 @@ class SqliteJournal:
     """Intents and events in one SQLite file.
 
     Args:
-        path: of the file; file and folder are created where missing.
+        path: path of the file; a missing file or folder is created.
         sync: "normal" or "full".
-        keep_events: newest records kept.
+        keep_events: number of the newest records that are not deleted.
         keep_bytes: most bytes of the records; the file is larger by its intents and indexes.
-        wall: unix time, seconds.
+        wall: returns the unix time in seconds.
 
     Raises:
         JournalError: the file is damaged, of another version, in use by another master, or the
-            disk is full; the message says what to do.
+            disk is full; the message has the remedy.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class SqliteJournal:
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version not in (0, SCHEMA):
             raise other_version(self._path, version, SCHEMA)
-        # 0.14 s for 100,000 events, where quick_check takes 0.09 s and misses damaged indexes.
+        # 0.14 s for 100,000 events; quick_check takes 0.09 s, but does not find damaged indexes.
         (verdict,) = database.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
             raise sqlite3.DatabaseError(verdict)
@@ -118,7 +118,7 @@ class SqliteJournal:
 
     @property
     def last_sequence(self) -> int:
-        """Sequence of the newest record; 0: there is none."""
+        """Return the sequence of the newest record; 0: there is none."""
         return self._sequence
 
     def write(
@@ -127,7 +127,7 @@ class SqliteJournal:
         """Append records and replace intents in one atomic group.
 
         Raises:
-            JournalBlocked: a failure that may pass; nothing was changed, and a retry is safe.
+            JournalBlocked: a temporary failure; nothing was changed, and a retry is safe.
             JournalError: the file is damaged.
         """
         wall = self._wall()
@@ -185,7 +185,7 @@ class SqliteJournal:
         if process:
             where.append("process = ?")
             matched.append(process)
-        if host:  # or a migration from it, matched as text, because damaged facts are no JSON
+        if host:  # also a migration from it, matched as text, because damaged facts are no JSON
             where.append("(host = ? OR instr(facts, ?))")
             matched += [host, f'"from": {json.dumps(host)}']
         rows = self._guarded(
@@ -207,7 +207,7 @@ class SqliteJournal:
             raise fault_of(self._path, sqlite3.DatabaseError(str(error))) from error
 
     def close(self) -> None:
-        """Flush and release the files."""
+        """Flush and close the files."""
         self._guarded(self._database.close)
 
 
@@ -220,7 +220,7 @@ def _row(stored: StoredRecord) -> Row:
 
 
 def _facts(text: str) -> Mapping[str, Any]:
-    """Return a record's facts; damaged ones as text, so that the other records stay readable."""
+    """Return a record's facts; damaged facts as text, so that other records stay readable."""
     try:
         facts = json.loads(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Fallback scoring policy, for a chosen one that raises, hangs or returns invalid scores."""
+"""Fallback scoring policy, used if the configured one raises, hangs or returns invalid scores."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _log = logging.getLogger("rosrm.master")
 
 
 def fallback_of(registry: Registry, chosen: str) -> tuple[str, ScoringPolicy] | None:
-    """Return the default policy with its name; None: it is chosen, not installed, or broken."""
+    """Return the default policy with its name; None if it is the chosen one, missing or broken."""
     name = ScoringChoice().policy
     if name == chosen or name not in registry.names("scoring"):
         return None

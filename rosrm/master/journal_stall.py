@@ -17,7 +17,7 @@ from rosrm.core.master.commands import Command, Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.journal_stall import note_readings
 
-#: Most status batches kept for later; slaves are asked again for the rest.
+#: Most queued status batches; the master requests the rest again from the slaves.
 _MOST_STATUSES: Final = 10_000
 #: Events that are dropped, because they recur.
 _DROPPED: Final = (happened.TimePassed, happened.UsagesReceived, happened.PeerRefused)
@@ -29,7 +29,7 @@ class JournalStall:
 
     Attributes:
         commands: the commands that are not durable yet, in order.
-        reason: of the failure, as text for clients.
+        reason: text of the failure, for clients.
         since: monotonic time of the first failure, seconds.
         core_now: time of the core's stopped clock.
         tried: monotonic time of the last attempt to write, seconds.
@@ -47,7 +47,7 @@ class JournalStall:
     def take(
         self, state: MasterState, events: Iterable[happened.Event], reply: Callable[[Reply], None]
     ) -> None:
-        """Apply readings, refuse requests, and keep other events for later."""
+        """Apply readings, refuse requests, and queue other events."""
         for event in events:
             if isinstance(event, happened.ReadingsReceived):
                 note_readings(state, event, self.core_now)

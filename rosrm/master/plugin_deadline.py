@@ -19,11 +19,11 @@ class Deadlines:
     """Deadline for each call of each plugin.
 
     The core treats a late call like any other failure, and decides without the plugin. A plugin
-    that was late is not called again for a while. Otherwise the master would wait for the plugin
-    at every reading, and have no time for its slaves.
+    that was late is not called again for a while. Otherwise the master would wait for the plugin at
+    every reading, and neglect its slaves.
 
     Args:
-        seconds: for one call.
+        seconds: time limit of one call.
         pause: seconds for which a plugin is not called after a late call.
 
     Attributes:

@@ -10,8 +10,8 @@ from typing import Any, Final
 from rosrm.core.master import listing
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
-from rosrm.extensions.contracts import StoredRecord
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.records import StoredRecord
 from rosrm.model.rows import EventRow, Listing, PluginRow
 
 _DEFAULT_EVENTS: Final = 1000
@@ -22,12 +22,12 @@ class MasterQueries:
 
     Args:
         master: name of the master.
-        state: of its core.
+        state: the state of the master's core.
         journal: holds the events.
         plugins: rows of `rosrm plugins` for the master's own plugins.
         uptime: returns the seconds since the master's start.
         core_now: returns the time of the core's clock.
-        trouble: returns the reason why the master accepts no new work; "": it does.
+        trouble: returns the reason why the master accepts no new work; "" if it accepts work.
     """
 
     def __init__(

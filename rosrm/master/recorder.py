@@ -1,4 +1,4 @@
-"""Recording of a master's run, written by a thread of its own.
+"""Recording of a master's run, written by a separate thread.
 
 The master's loop only queues events; the thread encodes and writes them. A recording is bounded in
 size. Any error ends the recording, never the master.
@@ -50,8 +50,8 @@ class Recorder:
         directory: for the file `MASTER-EPOCH.rosrec`; created if it does not exist.
         header: initial state of the master.
         max_size: most bytes; a recording that would be larger ends.
-        keep: number of files of this master kept in the directory, this one included; older ones
-            are deleted.
+        keep: most recordings of this master in the directory, this one included; older ones are
+            deleted.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -117,7 +117,7 @@ class Recorder:
             with self._file:
                 self._write_events()
                 self._file.write(frame(FrameKind.END, self._why.encode()))
-        except Exception as fault:  # noqa: BLE001 - whatever it is, it must not go unseen
+        except Exception as fault:  # noqa: BLE001 - every error must be logged
             self._why = self._why or "failed"
             _log.warning("the record %s ends here: %s", self.path, _describe(fault))
         finally:
@@ -128,7 +128,7 @@ class Recorder:
             self._done += noted.weight
             try:
                 written = _encoded(noted)
-            except Exception as fault:  # noqa: BLE001 - a bug in here is no reason to lose the rest
+            except Exception as fault:  # noqa: BLE001 - a bug here must not lose the other events
                 self._end(f"failed: {_describe(fault)}, at {type(noted.event).__name__}")
                 return
             if self._size + len(written) > self._max_size:

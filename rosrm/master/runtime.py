@@ -12,7 +12,7 @@ import socket
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master import events as happened
@@ -31,14 +31,7 @@ from rosrm.core.master.reducer import step
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Instance
 from rosrm.errors import JournalBlocked, Refused
-from rosrm.extensions.contracts import (
-    CheckpointPolicy,
-    Intent,
-    MigrationStrategy,
-    Record,
-    ScoringPolicy,
-    StoredRecord,
-)
+from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
@@ -47,6 +40,7 @@ from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.master.endpoint import MasterEndpoint
@@ -60,8 +54,8 @@ from rosrm.wording import counted, listed
 
 _log = logging.getLogger("rosrm.master")
 
-#: Period of the tick in seconds, which checks readings and deadlines. A tick costs the same for any
-#: number of readings (docs/decisions/0014).
+#: Period of the tick in seconds, which checks readings and deadlines. The cost of a tick does not
+#: depend on the number of readings (docs/decisions/0014).
 _TICK: Final = 0.05
 #: Seconds for the discovery of another running master.
 _DISCOVERY: Final = 1.0
@@ -70,11 +64,25 @@ _DISCOVERY: Final = 1.0
 _COLLECT_AT: Final = (10_000, 20, 20)
 #: Seconds within which two starts of masters count as simultaneous.
 _AT_ONCE: Final = 1.0
-#: Seconds of plugin calls in one turn beyond which the core's clock is set back by them.
+#: Seconds of plugin calls in one turn; beyond this limit the core's clock is set back by them.
 _BLOCKED: Final = 0.5
 #: Seconds between two attempts to write the journal during a stall.
 _TRY_AGAIN: Final = 0.5
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+
+
+class _LastRun(NamedTuple):
+    """The previous run of this master, by its journal.
+
+    Attributes:
+        newest: sequence of the newest record.
+        machine_rebooted: the machine has rebooted since, and the run recorded no end.
+        epoch: of that run; 0: there was none.
+    """
+
+    newest: int
+    machine_rebooted: bool
+    epoch: int
 
 
 class MasterRuntime:
@@ -150,8 +158,8 @@ class MasterRuntime:
     def _restored(
         self, policy: ScoringPolicy, strategies: dict[str, MigrationStrategy]
     ) -> MasterState:
-        newest, fell, epoch = self._last_run()
-        epoch += 1
+        last = self._last_run()
+        epoch = last.epoch + 1
         state = MasterState(
             self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
             self._fallback, declared=self._declared,
@@ -165,7 +173,7 @@ class MasterRuntime:
             restore.restore(state, self._journal.intents, now)
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
-        journal_gap.begin(state, newest, now, machine_rebooted=fell)
+        journal_gap.begin(state, last.newest, now, machine_rebooted=last.machine_rebooted)
         started = f"master {self._config.name} started, epoch {epoch}"
         self._journal.write(
             [Record(EventKind.MASTER_STARTED, message=started)],
@@ -180,13 +188,12 @@ class MasterRuntime:
         self._record_from(state, now)
         return state
 
-    def _last_run(self) -> tuple[int, bool, int]:
-        """Return the newest sequence, True if the machine crashed since, and the last epoch."""
+    def _last_run(self) -> _LastRun:
         known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
         last = self._journal.records(newest=1)
         stopped = not last or last[0].record.kind is EventKind.MASTER_STOPPED
-        fell = not stopped and known.get("boot", _boot()) != _boot()
-        return self._journal.last_sequence, fell, int(known["epoch"])
+        rebooted = not stopped and known.get("boot", _boot()) != _boot()
+        return _LastRun(self._journal.last_sequence, rebooted, int(known["epoch"]))
 
     def _record_from(self, state: MasterState, now: float) -> None:
         """Begin the recording of this run, if configured, with the intents that were restored."""
@@ -394,7 +401,7 @@ class MasterRuntime:
 
 
 def what_runs(state: MasterState) -> str:
-    """Return how many processes keep running without the master, and what slaves still stop."""
+    """Return a sentence that counts the processes that keep running, and those being stopped."""
     stopping: list[Instance] = []
     running = 0
     for instance in state.instances.values():

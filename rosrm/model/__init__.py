@@ -1,12 +1,13 @@
-"""The values that all parts share, and their JSON.
+"""Values that all parts share, and their conversion to JSON.
 
 values.py               processes, hosts, instances, resources
 plan.py                 plans of migrations: steps, undo, commit
 orders.py               orders of the master to a slave
 event_kinds.py          the kinds of events in the event record
-rows.py                 the rows of listings
-ros_settings.py         how a part joins the ROS graph
-codec.py                values as JSON
+records.py              records and intents, and the protocol of a journal
+rows.py                 rows of listings
+ros_settings.py         ROS settings of a part: domain, discovery, transports
+codec.py                conversion of values to JSON and back
 durations.py            bound of all times
-description_checks.py   checks of what a slave reports about its host
+description_checks.py   checks of the description of a host
 """

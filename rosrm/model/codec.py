@@ -1,9 +1,9 @@
 """Conversion of dataclasses to plain JSON values and back, driven by their type hints.
 
 Readers are compiled once per type. A dataclass is read from an object, or from a list of its fields
-in order (`dataclasses.astuple` as JSON). Each class of a union has its name in JSON as the class
-attribute `KIND`, which the object has as `kind`. This module does not import pydantic, because the
-core and the lean runtimes use it. pydantic checks the files of users.
+in order (`dataclasses.astuple` as JSON). Each class of a union has a class attribute `KIND`, which
+its JSON object has as `kind`. This module does not import pydantic, because the core and the lean
+runtimes import it. pydantic checks the files of users.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ T = TypeVar("T")
 _Convert = Callable[[Any], Any]
 
 _SCALARS: Final = (str, int, float, bool, type(None))
-#: Types whose values are JSON already.
+#: Types with values that are valid JSON.
 _PLAIN: Final = frozenset(_SCALARS)
-#: Annotations of fields that are JSON already; `json` refuses a value of another type.
+#: Annotations of fields that are written unchanged; `json` refuses a value of another type.
 _PLAIN_HINTS: Final = ("str", "int", "float", "bool", str, int, float, bool)
 _JSON_OBJECT: Final = ("Mapping[str, Any]", Mapping[str, Any])
 
 
 def _compiled_once(function: Callable[[Any], T]) -> Callable[[Any], T]:
-    return cache(function)  # typed, because mypy does not accept a type as an argument of a cache
+    return cache(function)  # typed, because mypy accepts no type as argument of a cached function
 
 
 class ByName:
-    """An enum with this base class is in JSON with its names, not with its values."""
+    """Base class of enums that are written by name, not by value."""
 
 
 # --- writing ----------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class _Unfit(ValueError):
         self.path = path
 
     def below(self, outer: str) -> _Unfit:
-        """Return the same error with the path of the value around it."""
+        """Return the same error with its path prefixed by the enclosing value."""
         dot = "." if self.path and not self.path.startswith("[") else ""
         return _Unfit(self.text, self.joint, f"{outer}{dot}{self.path}")
 
@@ -121,7 +121,7 @@ class _Unfit(ValueError):
 def from_plain(wanted: type[T], plain: Any) -> T:
     """Return a dataclass from plain values; raise `ValueError` with the path of the field.
 
-    A missing field has its default.
+    A missing field gets its default.
     """
     made: T = _reader(wanted)(plain)
     return made
@@ -130,7 +130,7 @@ def from_plain(wanted: type[T], plain: Any) -> T:
 def fields_from_plain(
     wanted: type[Any], plain: Mapping[str, Any], names: Iterable[str]
 ) -> dict[str, Any]:
-    """Return those fields of a dataclass that an object has, as keyword arguments.
+    """Return the named fields of a dataclass that an object has, as keyword arguments.
 
     Raises:
         ValueError: with the path of an invalid field, or the name of a missing one without default.
@@ -141,14 +141,14 @@ def fields_from_plain(
 
 
 def checked(value: T, what: str) -> T:
-    """Return a plugin's value as the journal gives it back.
+    """Return a plugin's value after a round trip through JSON, as the journal restores it.
 
     Args:
         value: a dataclass.
-        what: its name in the message.
+        what: name of the value in the message.
 
     Raises:
-        PluginError: a field has the wrong type, or is no JSON.
+        PluginError: a field has the wrong type, or is not valid JSON.
     """
     try:
         return from_plain(type(value), json.loads(json.dumps(to_plain(value))))
@@ -184,7 +184,7 @@ class _Shape(NamedTuple):
     """The fields of a dataclass.
 
     Attributes:
-        readers: reader of each field by its name, in order, with a type that needs no reader.
+        readers: field name to a type that needs no reader, and the reader; in order.
         required: names of the fields without a default.
     """
 
@@ -205,7 +205,7 @@ def _object_reader(kind: Any) -> _Convert:
     is_of_union = hasattr(kind, "KIND")
 
     def read(plain: Any) -> Any:
-        shape = _shape(kind)  # not before the first use, because a field may have the type itself
+        shape = _shape(kind)  # at the first use, because a field may have the type itself
         if isinstance(plain, list) and len(plain) <= len(shape.readers):
             plain = dict(zip(shape.readers, plain, strict=False))
         if not isinstance(plain, Mapping):
@@ -279,7 +279,7 @@ def _by_kind(readers: Mapping[str, _Convert]) -> _Convert:
 
 
 def _choice_reader(choices: Mapping[Any, Any]) -> _Convert:
-    """Return a reader of the keys of a mapping: each stands for its value."""
+    """Return a reader that maps each allowed JSON value to its choice."""
 
     def read(plain: Any) -> Any:
         if not isinstance(plain, (str, int)) or plain not in choices:

@@ -1,4 +1,4 @@
-"""Checks of descriptions: of a host, sent by its slave, and of a resource, also of a probe."""
+"""Checks of the description of a host, sent by its slave, and of a resource, also by a probe."""
 
 from __future__ import annotations
 

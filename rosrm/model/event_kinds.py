@@ -1,6 +1,6 @@
-"""The kinds of events in the event record, each with its meaning.
+"""Kinds of events in the event record, with their meanings.
 
-`docs/reference/events.md` has the same table: `python scripts/event_table.py` writes it.
+`python scripts/event_table.py` copies the table to `docs/reference/events.md`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class EventKind(str, Enum):
     meaning: str
 
     def __new__(cls, text: str, meaning: str = "") -> Self:
-        """Make a member from its name in the journal and its meaning."""
+        """Create a member from its name in the journal and its meaning."""
         kind = str.__new__(cls, text)
         kind._value_ = text
         kind.meaning = meaning
@@ -33,12 +33,9 @@ class EventKind(str, Enum):
     MASTER_STARTED = "master_started", "the master started, with its epoch"
     MASTER_STOPPED = "master_stopped", "the master stopped, with the cause"
     JOURNAL_RECOVERED = "journal_recovered", "a damaged journal was rebuilt: `master --recover`"
-    JOURNAL_BACK = (
-        "journal_back",
-        "the journal can be written again, after a time without decisions",
-    )
+    JOURNAL_BACK = "journal_back", "the journal can be written again after a journal stall"
     JOURNAL_BEHIND = "journal_behind", "the newest records of the journal are missing"
-    PEER_REFUSED = "peer_refused", "a message was refused: another version, or not valid"
+    PEER_REFUSED = "peer_refused", "a message was refused: another protocol version, or malformed"
     PRUNED = "pruned", "ended processes were removed from the listings"
 
     # --- processes -----------------------------------------------------------------------
@@ -62,8 +59,8 @@ class EventKind(str, Enum):
     INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
     UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
     FENCED = "fenced", "a host runs an instance that has a successor: it is killed"
-    GIVEN_UP = "given_up", "the host of the instance is lost, and the instance is written off"
-    READOPTED = "readopted", "the lost host is back, and the instance on it owns the name again"
+    GIVEN_UP = "given_up", "the host of the instance is lost, and the instance is given up"
+    READOPTED = "readopted", "the lost host rejoined, and its instance owns the name again"
 
     # --- hosts ---------------------------------------------------------------------------
 
@@ -78,8 +75,8 @@ class EventKind(str, Enum):
     HOST_CORDONED = "host_cordoned", "a client cordoned the host: it gets no new work"
     HOST_UNCORDONED = "host_uncordoned", "a client uncordoned the host"
     HOST_DRAINING = "host_draining", "a client drains the host: its processes move away"
-    HOST_DRAINED = "host_drained", "nothing is left on the host that can leave"
-    READING_REFUSED = "reading_refused", "a reading is not a number, negative or out of range"
+    HOST_DRAINED = "host_drained", "no process that can leave is left on the host"
+    READING_REFUSED = "reading_refused", "a reading is not a number, is negative or is out of range"
     OVER_LIMIT = "over_limit", "the host reached a limit; facts: the resource"
     UNDER_LIMIT = "under_limit", "the host is under all its limits again"
     NOTHING_MOVES = "nothing_moves", "no process can leave the host, with the reasons"
@@ -91,7 +88,7 @@ class EventKind(str, Enum):
     MIGRATION_STEP_FAILED = "migration_step_failed", "a step of the plan failed, with the reason"
     MIGRATION_UNDONE = "migration_undone", "the migration turns back, with the reason"
     MIGRATION_REDONE = "migration_redone", "the destination is active: the migration is finished"
-    MIGRATION_STUCK = "migration_stuck", "a step that must be done failed: it is tried again"
+    MIGRATION_STUCK = "migration_stuck", "a step that must succeed failed: it is retried"
     MIGRATION_TAKEN_UP = "migration_taken_up", "a restarted master continues the migration"
     MIGRATION_FORGOTTEN = "migration_forgotten", "a restarted master cannot continue the migration"
     MIGRATION_REFUSED = "migration_refused", "a process is not moved as requested, with the reason"
@@ -101,12 +98,12 @@ class EventKind(str, Enum):
     TAKE_OVER = "take_over", "the source ended during the handoff: the destination takes over"
     DESTINATION_UNHEARD = (
         "destination_unheard",
-        "the destination does not confirm that the handoff is called off: it is stopped",
+        "the destination does not confirm the abort of the handoff: it is stopped",
     )
 
     # --- snapshots and standbys ----------------------------------------------------------
 
-    KEPT_ON = "kept_on", "the hosts that keep replicas of the snapshots were chosen"
+    KEPT_ON = "kept_on", "the hosts for replicas of the snapshot were chosen"
     STANDBY_BEGUN = "standby_begun", "the standby starts on another host"
     STANDBY_READY = "standby_ready", "the standby is ready to take over"
     STANDBY_WAITS = "standby_waits", "no standby can be started now, with the reason"
@@ -121,8 +118,8 @@ class EventKind(str, Enum):
     RESTORE_BEGUN = "restore_begun", "the process is restored from its image; facts: steps"
     RESTORED = "restored", "the process runs again from its image"
     RESTORE_FAILED = "restore_failed", "the process was not restored, and stays checkpointed"
-    IMAGE_REMOVED = "image_removed", "an image that is no longer needed was removed"
-    IMAGE_LEFT = "image_left", "an image could not be removed: it is tried again"
+    IMAGE_REMOVED = "image_removed", "an unwanted image was removed"
+    IMAGE_LEFT = "image_left", "an image could not be removed: the removal is retried"
     PERIODIC_CHECKPOINT = "periodic_checkpoint", "the first periodic checkpoint was made"
     PERIODIC_FAILED = "periodic_failed", "no periodic checkpoint was made, with the reason"
 
@@ -138,7 +135,7 @@ class EventKind(str, Enum):
     def read(cls, text: str) -> EventKind:
         """Return the kind of a journalled event.
 
-        A kind that only another version of rosrm knows is kept, so that its event is still shown.
+        A kind of another version of rosrm becomes a new member, so that its event is shown.
         """
         try:
             return cls(text)

@@ -73,8 +73,8 @@ class ReplicateSnapshot:
     """Replicate the snapshots of an instance to these hosts from now on.
 
     Attributes:
-        hosts: their names; empty: to none.
-        every: least seconds between two transfers.
+        hosts: names of the hosts; (): no replication.
+        every: shortest time between two transfers, in seconds.
     """
 
     instance: InstanceId
@@ -84,7 +84,7 @@ class ReplicateSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class DropReplica:
-    """Delete the snapshots of a process, of instances up to this one."""
+    """Delete the snapshots of a process that were written by instances up to this one."""
 
     instance: InstanceId
 
@@ -102,5 +102,5 @@ Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica
 
 
 def seconds_of(order: Order) -> float:
-    """Return the seconds that an order may take at its slave, before any time-out of its answer."""
+    """Return the seconds for which a slave may execute an order before it answers."""
     return order.timeout if isinstance(order, RunExecutor) else 0.0

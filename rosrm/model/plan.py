@@ -1,8 +1,8 @@
 """Migration plans as data: steps in order, each with its undo, and one commit.
 
-A strategy proposes a `Plan`; the master's core executes it, and a `Migration` holds its progress.
-Before the commit a failure undoes the steps done so far, newest first, back to a running source;
-after it the plan is rolled forward. A migration that can do neither is shown as stuck.
+A strategy proposes a `Plan`; the master's core executes it, and a `Migration` has its progress.
+A failure before the commit undoes the completed steps, newest first, back to a running source. A
+failed step after the commit is retried. A migration that can do neither is shown as stuck.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Move:
         source_host: name of its host.
         destination: the instance to be started, already numbered.
         destination_host: name of its host.
-        fallback: an instance for a new start at the source, should a stop be undone.
-        now: unix time, whole seconds (the alias of a handoff carries it).
+        fallback: an instance for a new start at the source, if the undo of a stop needs one.
+        now: unix time in whole seconds, for the alias of a handoff.
         source_node: name of the source's node: an alias, if a handoff started it.
-        options: of the strategy for this process: those of the cluster with the process's own over
-            them, an object of the offer's `own_options` or `options`.
+        options: options of the strategy for this process: those of the cluster, overridden by those
+            of the process; an object of the offer's `own_options` or `options`.
     """
 
     spec: ProcessSpec
@@ -48,8 +48,8 @@ class Move:
 class Aim(str, Enum):
     """Purpose of a plan.
 
-    In a checkpoint, the source ends in an image on its own host, and no destination is started. In
-    a restore, the source is the instance of the image, which does not run any more.
+    A checkpoint dumps the source into an image on its host and starts no destination. In a restore,
+    the source is the dumped instance, which does not run any more.
     """
 
     MOVE = "move"
@@ -91,9 +91,8 @@ class Start:
     """Start an instance on a host; done when the slave reports that it runs.
 
     A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted. A
-    restored instance starts from an image of the source, which earlier steps have brought to the
-    host while the source is frozen; it is not restarted either. `remappings` are added to those of
-    the process's spec.
+    restored instance starts from an image of the frozen source, which earlier steps have copied to
+    the host; it is not restarted either. `remappings` are added to those of the spec.
     """
 
     KIND: ClassVar = "start"
@@ -110,7 +109,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class AwaitReady:
-    """Wait until an instance is ready; done `settle` seconds after its slave reports so."""
+    """Wait until an instance is ready; done `settle` seconds after its slave has reported that."""
 
     KIND: ClassVar = "await_ready"
 
@@ -125,7 +124,7 @@ class AwaitReady:
 class AwaitReleased:
     """Wait until a silent source reports that its last outputs have arrived, or the time-out.
 
-    This step never fails: the successor is active, and outputs cannot be recalled.
+    This step never fails, because the successor is active and sent messages cannot be recalled.
     """
 
     KIND: ClassVar = "await_released"
@@ -138,7 +137,7 @@ class AwaitReleased:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Stop an instance; done when its slave reports that it has ended."""
+    """Stop an instance; done when its slave reports the end."""
 
     KIND: ClassVar = "stop"
 
@@ -152,8 +151,8 @@ class Stop:
 class Configure:
     """Publish `state_config` with this phase to the source and the destination of the migration.
 
-    Each phase is done when they have answered by the handoff protocol; DONE, and any phase that is
-    not `awaited`, at once.
+    A phase is done when both have answered by the handoff protocol. DONE, and a phase that is not
+    `awaited`, is done at once.
     """
 
     KIND: ClassVar = "configure"
@@ -166,7 +165,7 @@ class Configure:
 
 @dataclass(frozen=True, slots=True)
 class SetRestart:
-    """Set another restart policy of an instance; done when its slave has accepted it."""
+    """Replace the restart policy of an instance; done when its slave has accepted the order."""
 
     KIND: ClassVar = "set_restart"
 
@@ -181,8 +180,8 @@ class SetRestart:
 class Commit:
     """Make the destination the owner of the name; each plan has one commit.
 
-    In the plan of a checkpoint, the image becomes the owner, and no instance is. `image` names the
-    executor that removes an unwanted image; "": this is no checkpoint.
+    In the plan of a checkpoint, the image becomes the owner instead of an instance. `image` names
+    the executor that removes an unwanted image; "": the plan is not that of a checkpoint.
     """
 
     KIND: ClassVar = "commit"
@@ -194,7 +193,7 @@ class Commit:
 
 @dataclass(frozen=True, slots=True)
 class Execute:
-    """Run an executor that the strategy's plugin registered on a slave (the open step).
+    """Run an executor of the strategy's plugin on a slave.
 
     The executor gets the arguments and, as `results`, the answers of the executors of earlier steps
     of the same migration, by their names.
@@ -218,8 +217,8 @@ class Plan:
 
     Attributes:
         steps: in order; exactly one is a `Commit`.
-        overlap: seconds that both instances may be active at once, declared; 0: never.
-        options: kept with the record of the migration.
+        overlap: declared seconds for which both instances may be active at once; 0: never.
+        options: stored with the migration.
     """
 
     steps: tuple[Step, ...]
@@ -228,7 +227,7 @@ class Plan:
 
 
 def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
-    """Return the fault of a plan that a strategy proposed for an aim; "" for a sound one."""
+    """Return the fault of a plan that a strategy proposed for an aim; "": none."""
     given: object = plan
     if not isinstance(given, Plan):
         return f"it is {'None' if given is None else type(given).__name__}, not a Plan"
@@ -249,7 +248,7 @@ def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
 
 
 def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
-    """Return why the owner of the name after the commit may not exist by then; "" if it does."""
+    """Return why the new owner of the name may not exist at the commit; "" if it does."""
     at = next(at for at, step in enumerate(plan.steps) if isinstance(step, Commit))
     before, commit, after = plan.steps[:at], plan.steps[at], plan.steps[at + 1 :]
     if isinstance(commit, Commit) and bool(commit.image) != (aim is Aim.CHECKPOINT):
@@ -268,7 +267,7 @@ def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
 
 
 def _checkpoint_fault(plan: Plan, after: Iterable[Step], move: Move) -> str:
-    """Return why the source may run beside its image, or what else is begun; "" for none."""
+    """Return why an instance may run beside the image after a checkpoint; "" if none may."""
     if any(isinstance(step, Start) for step in all_steps(plan.steps)):
         return "a checkpoint starts an instance"
     if not any(isinstance(step, Stop) and step.instance == move.source for step in after):
@@ -307,28 +306,29 @@ def _shadow_fault(step: Start, move: Move) -> str:
 def _handoff_fault(step: Step) -> str:
     """Return the fault of a step of the handoff protocol; "": none.
 
-    A silent source may resume only when the destination never becomes active.
+    A silent source may resume only if the destination never becomes active, so SWITCH needs ABORT
+    as its undo.
     """
     if not isinstance(step, Configure):
         return ""
     if step.phase not in _FORWARD:
-        return f"it says {step.phase.name} on the way forward"
+        return f"it has the phase {step.phase.name}, which only an undo may have"
     undo = step.undo
     aborts = isinstance(undo, Configure) and undo.phase is HandoffPhase.ABORT and undo.awaited
     if step.phase is HandoffPhase.SWITCH and not aborts:
-        return "it says SWITCH, and its undo is not ABORT"
+        return "it has the phase SWITCH, and its undo is not ABORT"
     return ""
 
 
 def executors_of(plan: Plan) -> Iterator[tuple[str, str]]:
-    """Return the executors that a plan names, also in its undo, with their hosts."""
+    """Return the executors that a plan and its undo name, with their hosts."""
     for step in all_steps(plan.steps):
         if isinstance(step, Execute):
             yield step.executor, step.host
 
 
 def all_steps(steps: Iterable[Step]) -> Iterator[Step]:
-    """Return the steps with their undo, the undo of that, and so on."""
+    """Return the steps, each followed by the chain of its undo steps."""
     for step in steps:
         current: Step | None = step
         while current is not None:

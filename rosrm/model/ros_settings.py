@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from rosrm.errors import ConfigError
 
-#: A higher domain would need ports beyond the range of UDP.
+#: Highest domain id, because higher ones need ports beyond 65535.
 HIGHEST_DOMAIN: Final = 232
+#: An absolute ROS namespace.
+NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +25,7 @@ class RosSettings:
         discovery_range: "localhost", "subnet", "off" or "system_default".
         discovery_server: "host:port" of a Fast DDS discovery server, instead of multicast.
         transports: FASTDDS_BUILTIN_TRANSPORTS, for example "UDPv4".
-        namespace: of rosrm's topics and services.
+        namespace: namespace of rosrm's topics and services.
     """
 
     domain: int | None = None
@@ -37,19 +40,31 @@ class RosSettings:
             "ROS_DOMAIN_ID": "" if self.domain is None else str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": self.discovery_range.upper(),
             "ROS_DISCOVERY_SERVER": self.discovery_server,
-            # A plain client gets only its own topics from the server: too little to see nodes.
+            # A plain client gets only its own topics from the server and sees no other nodes.
             "ROS_SUPER_CLIENT": "TRUE" if self.discovery_server else "",
             "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
         }
         return {name: value for name, value in variables.items() if value}
 
-    def check_domain(self) -> None:
-        """Raise `ConfigError` if the ROS_DOMAIN_ID in force is invalid.
+    def check(self) -> None:
+        """Raise `ConfigError` for a setting, or a ROS_DOMAIN_ID in force, that ROS cannot use.
 
-        Otherwise DDS would print a fault of its own, or rclpy would raise a traceback.
+        Otherwise DDS would print an error without a remedy or end the process, or rclpy would raise
+        a traceback.
         """
+        if not NAMESPACE.fullmatch(self.namespace):
+            raise ConfigError(
+                f'{self.namespace!r} is not an absolute ROS namespace such as "/rosrm"'
+            )
+        if self.domain is not None:
+            if type(self.domain) is not int or not 0 <= self.domain <= HIGHEST_DOMAIN:
+                raise ConfigError(
+                    f"the ROS domain {self.domain!r} is not a whole number from 0 to "
+                    f"{HIGHEST_DOMAIN}"
+                )
+            return
         word = os.environ.get("ROS_DOMAIN_ID", "")
-        if self.domain is not None or not word:
+        if not word:
             return
         if not (word.isascii() and word.isdigit() and int(word) <= HIGHEST_DOMAIN):
             raise ConfigError(
@@ -58,7 +73,7 @@ class RosSettings:
             )
 
     def describe(self) -> str:
-        """Return domain, RMW and discovery in force, for messages."""
+        """Return a text on the domain, RMW and discovery in force."""
         joined = {**os.environ, **self.environment()}
         discovery = joined.get("ROS_DISCOVERY_SERVER") or joined.get(
             "ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET"

@@ -1,4 +1,4 @@
-"""Rows of listings, and parts of logs: plain values for clients, tables and tests."""
+"""Rows of listings, and parts of logs, as plain values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from rosrm.model.values import EMPTY, HostDescription
 
-#: Kinds of offers; "plugin": a fault of a plugin before its offers are known.
+#: Kinds of offers; "plugin": a plugin that failed before its offers were known.
 PluginKind = Literal["probe", "scoring", "migration", "checkpoint", "launcher", "plugin"]
 PluginState = Literal["selected", "available", "absent", "broken", "failing"]
 
@@ -18,7 +18,7 @@ class ResourceRow:
     """One resource of a host: fractions 0..1 of its capacity.
 
     Attributes:
-        stale: the reading is old: its probe is late or failed, or the host is not up.
+        stale: the reading is old, because its probe is late or failed, or the host is not up.
     """
 
     name: str
@@ -38,9 +38,9 @@ class HostRow:
     Attributes:
         state: "up", "suspect", "lost", "left" or "detached" (its slave was stopped and left
             processes running).
-        accepting: the slave is under all its limits and has asked for work.
+        accepting: the slave is under all its limits and has requested work.
         reading_age: seconds since the newest `resource_info`.
-        drained: it is draining, and no process is left on it that can leave.
+        drained: the host is draining, and no process that can leave is left on it.
     """
 
     description: HostDescription
@@ -62,16 +62,17 @@ class ProcessRow:
     Attributes:
         state: "queued", "set_aside", "assigned", "starting", "running", "backoff", "stopping",
             "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable", "stuck"
-            or "unknown" (its host is silent, and not lost yet).
-        host: of the owning instance, or of the image, or of its end; "" for none.
-        number: of the owning instance; 0: none.
-        exit_code: of the last run, a signal as a negative number; None: unknown, or it runs.
-        queue_position: 1 is the head; 0: not in the queue.
+            or "unknown" (its host is silent and not lost yet).
+        host: host of the owning instance, of the image, or of the last run; "" for none.
+        number: number of the owning instance; 0: none.
+        exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
+            process runs.
+        queue_position: 1: head; 0: not in the queue.
         since: seconds in this state.
-        cpu: cores.
-        memory: bytes.
+        cpu: CPU usage in cores.
+        memory: memory usage in bytes.
         reason: why it waits, failed, ...
-        stale: `cpu` and `memory` are old, as its host is silent or lost.
+        stale: `cpu` and `memory` are old, because its host is silent or lost.
     """
 
     name: str
@@ -116,8 +117,8 @@ class PluginRow:
     """One offer of a plugin, or a fault.
 
     Attributes:
-        distribution: name and version of the package that brings it.
-        host: "" for the master.
+        distribution: name and version of the Python distribution.
+        host: name of the host; "" for the master.
     """
 
     kind: PluginKind
@@ -134,9 +135,9 @@ class Listing:
 
     Attributes:
         master: name of the master.
-        uptime: of the master, seconds.
-        last_sequence: of the event record.
-        trouble: why the master accepts no new work now; "": it does.
+        uptime: seconds since the start of the master.
+        last_sequence: sequence of the newest event.
+        trouble: why the master accepts no new work now; "": it accepts work.
     """
 
     master: str
@@ -154,15 +155,15 @@ class LogPart:
     """A part of an instance's log.
 
     Attributes:
-        number: of the instance.
-        numbers: of all instances of the process whose logs the host holds, ascending.
-        content: the bytes.
-        offset: of the content, from the first byte that the instance wrote. Bytes between the
+        number: number of the instance.
+        numbers: numbers of all instances of the process with a log on the host, ascending.
+        content: bytes of the log.
+        offset: offset of the content from the first byte that the instance wrote. Bytes between the
             requested offset and this one were dropped.
         next_offset: offset of the next part.
         ended: the instance has ended, and the log is complete.
-        marks: checks of the log: (unix time, offset, pid). Everything before the offset had been
-            written by that time; a pid not 0 is that of a process whose output begins there.
+        marks: time marks of the log: (unix time, offset, pid). All bytes before the offset were
+            written by that time. At a pid other than 0, the output of that process begins.
     """
 
     number: int

@@ -12,7 +12,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
-#: Slots of a `resource_info` message: most resources of one host.
+#: Slots of a `resource_info` message: highest number of resources of one host.
 RESOURCE_SLOTS: Final = 16
 #: A usage above this is an error, not a measurement (a CPU reading of 1.2 can be real).
 ABSURD_USAGE: Final = 64.0
@@ -26,7 +26,7 @@ IsolationAction = Literal["keep", "stop"]
 
 
 class Kind(str, Enum):
-    """Duration of a process: until it is stopped (service), or until its own end (job)."""
+    """Kind of a process: it runs until it is stopped (service), or to completion (job)."""
 
     SERVICE = "service"
     JOB = "job"
@@ -38,10 +38,10 @@ class RestartPolicy:
 
     Attributes:
         delay: seconds before the first restart.
-        max_delay: bound of the back-off, seconds.
-        factor: by which the delay grows with each restart.
-        attempts: most restarts within `window`; one more and the process has failed.
-        window: seconds; after as long without a restart, the count begins at 0 again.
+        max_delay: upper bound of the delay, seconds.
+        factor: factor by which the delay grows with each restart.
+        attempts: highest number of restarts within `window`; after them the process has failed.
+        window: seconds for which a restart counts.
     """
 
     when: RestartCondition = "never"
@@ -57,16 +57,16 @@ class Readiness:
     """Condition under which an instance counts as ready.
 
     Attributes:
-        kind: "graph" (this instance is seen in the ROS graph), "running" (the process runs), or
-            "auto": "graph" for a ROS node, "running" for everything else.
-        timeout: seconds; not ready by then, the start has failed.
+        kind: "graph" (its node is in the ROS graph), "running" (the process runs), or "auto":
+            "graph" for a ROS node, "running" for other programs.
+        timeout: seconds after which an instance that is not ready has failed.
     """
 
     kind: ReadinessKind = "auto"
     timeout: float = 30.0
 
 
-#: Seconds beyond a process's own grace, for the signal, the report and the message.
+#: Seconds beyond the graces of a process, for the order, the signals and the report.
 _STOP_MARGIN: Final = 5.0
 
 
@@ -93,9 +93,9 @@ class MigrationPolicy:
     """Migration of a process to another host.
 
     Attributes:
-        strategy: name of a migration strategy; None: it is never moved.
-        overlap: a stateless relaunch may run both instances for a moment (start first).
-        options: the strategy's own options for this process.
+        strategy: name of a migration strategy; None: the process never moves.
+        overlap: True: a stateless relaunch may start the new instance before it stops the old one.
+        options: options of the strategy for this process.
     """
 
     strategy: str | None = None
@@ -108,9 +108,9 @@ class HostLossPolicy:
     """Treatment of a process when its host is lost.
 
     Attributes:
-        then: "wait" for the host, go "elsewhere" (as soon as a host has room; the host keeps it if
-            it rejoins before), or "stop": it has failed.
-        delay: seconds after the loss until that is done.
+        then: "wait" for the host; start "elsewhere" as soon as a host has room, unless the lost
+            host rejoins before; or "stop": the process has failed.
+        delay: seconds after the loss before `then` applies.
     """
 
     then: HostLossAction = "wait"
@@ -122,8 +122,9 @@ class IsolationPolicy:
     """Treatment of a process while its host and the master have no contact.
 
     Attributes:
-        then: "keep" it running, or "stop" it.
-        after: seconds; 0: so soon that it has ended when a successor starts elsewhere.
+        then: "keep" the process running, or "stop" it.
+        after: seconds without contact; 0: chosen so that the process has ended before a successor
+            starts elsewhere.
     """
 
     then: IsolationAction = "keep"
@@ -137,7 +138,7 @@ class StandbyPolicy:
     The standby takes over at once when the primary ends.
 
     Attributes:
-        apart_by: host labels in which the host of the standby differs from that of the primary.
+        apart_by: host labels in which the hosts of primary and standby must differ.
     """
 
     wanted: bool = False
@@ -146,13 +147,13 @@ class StandbyPolicy:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Health checks of a running process; one that fails them has failed.
+    """Health checks of a running process; an unhealthy process has failed.
 
     Attributes:
-        topic: that must be published at `rate`; "": none.
-        rate: Hz, at least.
-        lifecycle: state in which its lifecycle node must be; "": not checked.
-        timeout: seconds for which a check may fail; 0: health is not watched.
+        topic: topic that the node must publish; "": no check.
+        rate: lowest rate of the topic, in Hz.
+        lifecycle: required state of the lifecycle node; "": no check.
+        timeout: seconds for which a check may fail; 0: no checks.
     """
 
     topic: str = ""
@@ -168,17 +169,17 @@ class ProcessSpec:
     Exactly one of `package` with `executable`, `module` and `command` is given.
 
     Attributes:
-        name: unique among live processes; the node's name where it is a ROS node.
-        namespace: of the node; "" or absolute.
+        name: unique among live processes; also the name of its ROS node.
+        namespace: namespace of the node; "" or absolute.
         parameters: ROS parameters, values as in JSON.
         remappings: ROS name to ROS name.
-        ros: it is a ROS node and gets its name, namespace, parameters and remappings; None, which
-            becomes a boolean: True for an executable of a ROS package.
+        ros: True for a ROS node, which gets its name, namespace, parameters and remappings; None
+            becomes True for an executable of a ROS package, else False.
         needs: declared amounts by resource name, in base units.
-        required_labels: host labels without which a host may never take it.
-        preferred_labels: among hosts that fit, those with more of these go first.
-        avoided_labels: hosts with any of these are taken only when no other fits.
-        priority: higher goes first.
+        required_labels: labels that a host must have to run the process.
+        preferred_labels: of the hosts that fit, those with more of these labels are preferred.
+        avoided_labels: a host with any of these labels is chosen only if no other host fits.
+        priority: processes with a higher number are placed first.
     """
 
     name: str
@@ -223,13 +224,19 @@ class ProcessSpec:
         return " ".join(self.command)
 
 
+def qualified_name(namespace: str, node_name: str) -> str:
+    """Return a node's name with its namespace: `/robot/camera`."""
+    inside = namespace.strip("/")
+    return f"/{inside}/{node_name}" if inside else f"/{node_name}"
+
+
 @dataclass(frozen=True, slots=True, order=True)
 class InstanceId:
-    """One run of a process on one host.
+    """Id of an instance: one start of a process on one host.
 
     Attributes:
         process: name of the process.
-        number: grows with each assignment in the whole cluster and is never used again.
+        number: number that grows with each assignment in the cluster and is never used again.
     """
 
     process: str
@@ -244,9 +251,9 @@ class Fence:
     """Deadline at which a host without contact stops an instance, by its own clock.
 
     Attributes:
-        after: seconds since the last contact: the newest time at which the master received from it.
-        grace: seconds from there until SIGKILL at the latest.
-        alive: a running slave counts as contact, even without beats.
+        after: seconds since the last contact, at which the master received a message of the host.
+        grace: seconds after that deadline until SIGKILL at the latest.
+        alive: True: a running slave counts as contact, even without beats.
     """
 
     after: float
@@ -259,16 +266,16 @@ class Assignment:
     """An order to run an instance of a process.
 
     Attributes:
-        epoch: of the master that gave it.
-        node_name: name of its node; differs from the process's name in a handoff.
-        shadow: it starts as the destination of a handoff: silent, and not restarted until an order
-            to its slave allows it.
+        epoch: epoch of the master.
+        node_name: name of its node; in a handoff an alias.
+        shadow: True for the destination of a handoff: it starts silent, and is not restarted until
+            an order to its slave allows restarts.
         fence: deadline at which its host stops it without contact to the master; None: never.
         kept_on: hosts with a snapshot of the process, the newest first.
-        kept_from: snapshots of instances with a lower number belong to an earlier process of the
-            name; 0: its node publishes no state, and there are none.
-        restored: it starts from the image of a former instance on the host, and is not restarted
-            until an order to its slave allows it.
+        kept_from: lowest number of an instance with a valid snapshot; 0: the node publishes no
+            state, and there are no snapshots.
+        restored: True: it starts from the image of a former instance on the host, and is not
+            restarted until an order to its slave allows restarts.
     """
 
     instance: InstanceId
@@ -283,7 +290,7 @@ class Assignment:
 
     @property
     def has_snapshots(self) -> bool:
-        """Return True if its node publishes a state of which snapshots are kept."""
+        """Return True if its node publishes state that is stored in snapshots."""
         return self.kept_from > 0
 
     @property
@@ -309,7 +316,7 @@ class InstanceState(str, Enum):
 
     @property
     def ended(self) -> bool:
-        """Return True if the slave holds no process for it and will start none."""
+        """Return True if no process of the instance runs, and none will."""
         return self in _ENDED
 
 
@@ -326,14 +333,14 @@ class InstanceStatus:
     """Status of one instance on its slave.
 
     Attributes:
-        pid: of the session leader; 0: none.
-        exit_code: of the last run, where no signal ended it; -1: its end was not seen.
-        exit_signal: that ended the last run; 0: none.
-        restarts: by the restart policy on this host.
-        peak_memory: bytes, of the last run; 0: not known.
-        cpu_time: seconds of CPU of the last run.
+        pid: pid of the session leader; 0: none.
+        exit_code: exit code of the last run without a signal; -1: the end was not observed.
+        exit_signal: signal that ended the last run; 0: none.
+        restarts: number of restarts by the restart policy on this host.
+        peak_memory: peak memory of the last run in bytes; 0: unknown.
+        cpu_time: CPU time of the last run in seconds.
         run_time: seconds from start to end of the last run.
-        message: why it failed or was refused, as text.
+        message: text on why it failed or was refused.
     """
 
     instance: InstanceId
@@ -351,7 +358,7 @@ class InstanceStatus:
     def known_exit(self) -> int | None:
         """Return the exit code of the last run, or its signal as a negative number.
 
-        None: the end was not seen, or the instance never ran.
+        None: the end was not observed, or the instance never ran.
         """
         if self.exit_signal:
             return -self.exit_signal
@@ -360,7 +367,7 @@ class InstanceStatus:
 
     @property
     def succeeded(self) -> bool:
-        """Return True if it has exited with code 0 and without a signal."""
+        """Return True if the instance has exited with code 0 and without a signal."""
         return self.state is InstanceState.EXITED and not (self.exit_code or self.exit_signal)
 
 
@@ -369,9 +376,9 @@ class SnapshotReport:
     """A snapshot of a process on a host.
 
     Attributes:
-        instance: whose snapshot it is.
-        sequence: cycles that it covers.
-        size: bytes.
+        instance: instance that wrote it.
+        sequence: number of cycles that it covers.
+        size: size in bytes.
     """
 
     instance: InstanceId
@@ -386,8 +393,9 @@ class ResourceDescription:
     Attributes:
         name: "memory", "cpu", "disk", ...
         unit: base unit of `capacity`: "B", "core", "B/s", "1".
-        capacity: what usage 1.0 stands for, > 0.
-        scope: of the measurement: "machine", "cgroup", "slice" or a name that the probe defines.
+        capacity: amount at usage 1.0, > 0.
+        scope: scope of the measurement: "machine", "cgroup", "slice" or a name that the probe
+            defines.
     """
 
     name: str
@@ -417,10 +425,10 @@ class HostDescription:
         name: unique among live slaves.
         incarnation: random number of this run of the slave.
         resources: at most RESOURCE_SLOTS; the position is the slot in `resource_info`.
-        max_processes: most processes held at a time; 0: no bound.
-        period: of `resource_info`, seconds.
-        executors: that plugins offer for the open step of a plan.
-        absent: probe name to the reason why it is absent here.
+        max_processes: highest number of running processes; 0: no bound.
+        period: seconds between two `resource_info` messages.
+        executors: names of executors that plugins offer for `Execute` steps.
+        absent: probe name to the reason why the probe is absent on this host.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Numpy arrays as a message: npz that neither contains nor loads pickled objects."""
+"""Numpy arrays as a message, in npz format without pickled objects."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _SMALL: Final = 32
 
 @dataclass(slots=True)
 class PublisherGate:
-    """The switch of the author's publishers: messages are sent while it is open."""
+    """Switch of the author's publishers: messages are sent while it is open."""
 
     is_open: bool
 
@@ -42,14 +42,14 @@ class Input:
     """One buffered subscription.
 
     Attributes:
-        topic: fully qualified.
+        topic: its fully qualified name.
         key: the topic, or `/topic#2` for a second subscription of it.
-        callback: the author's.
+        callback: the author's function.
         with_info: the callback takes the message's information too.
-        buffered: its messages are kept during a handoff.
+        buffered: messages are stored during a handoff.
         wants_all: every message counts, not only the newest.
         covered: source time stamps of the newest processed messages, ns.
-        subscription: rclpy's.
+        subscription: rclpy's object.
     """
 
     callback: Callable[..., Any]
@@ -126,10 +126,10 @@ class TimerOf:
     """One timer of the author.
 
     Attributes:
-        timer: rclpy's.
+        timer: rclpy's object.
         started: the timer runs, or will run when its node becomes active.
         period_ns: the author's period, while the timer has another one for its first run.
-        taken: ticks taken by an executor's threads that have not begun.
+        taken: due runs that threads of an executor have taken but not begun.
     """
 
     timer: Any
@@ -149,7 +149,7 @@ class TimerOf:
         return bool(getattr(self.timer.clock, "ros_time_is_active", False))
 
     def start_in(self, seconds: float) -> None:
-        """Run first after `seconds`, and in the author's period from then on."""
+        """Start the timer: first run after `seconds`, then with the author's period."""
         self.period_ns = self.timer.timer_period_ns
         self.timer.timer_period_ns = max(1, int(seconds * 1e9))
         self.timer.reset()
@@ -161,14 +161,14 @@ class TimerOf:
             self.timer.reset()
 
     def stop(self) -> None:
-        """Stop running until the next start."""
+        """Stop the timer until its next start."""
         self.back_in_step()
         self.timer.cancel()
 
 
 @dataclass(frozen=True, slots=True)
 class DeferredAnswer:
-    """A placeholder for an answer: the request reached a node that is not active."""
+    """Placeholder for an answer, because the request reached a node that is not active."""
 
     request: Any
     response: Any
@@ -183,9 +183,9 @@ class ServiceOf:
     The author gets this object from `create_service` in place of rclpy's `Service`.
 
     Args:
-        create: makes the server, for a callback.
+        create: creates the server with a callback.
         destroy: destroys the server.
-        name: as the author gave it.
+        name: name given by the author.
         serve: answers a request, or returns it as `DeferredAnswer`.
     """
 
@@ -237,7 +237,7 @@ class ServiceOf:
 
 
 class OpeningOf:
-    """An object that the author creates when the node becomes active.
+    """Object that the author creates when the node becomes active.
 
     Args:
         create: the author's function; if its result has a `destroy`, that is called when the node

@@ -23,7 +23,7 @@ class NodeIdentity:
         cluster: name of the master that started it.
         epoch: of that master.
         shadow: it starts as the destination of a handoff.
-        keep: directory of its snapshots; "": none are written.
+        keep: directory of its snapshots; "" if none are written.
         keep_every: greatest age of a snapshot, seconds.
     """
 
@@ -39,7 +39,7 @@ class NodeIdentity:
 
 
 def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
-    """Return the identity set by a slave; None: rosrm did not start this process."""
+    """Return the identity set by a slave; None if rosrm did not start this process."""
     process, _, number = environment.get("ROSRM_INSTANCE", "").rpartition("#")
     topic = environment.get("ROSRM_STATE_CONFIG", "")
     if not process or not number.isdecimal() or not topic:

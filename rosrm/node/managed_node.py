@@ -1,4 +1,4 @@
-"""A migratable node: the layer between the author's callbacks and ROS.
+"""Layer between the author's callbacks and ROS in a migratable node.
 
 At any time the node is active (messages pass directly), a shadow (inputs are buffered, outputs
 dropped), or silent (the same, for a source whose successor may be active). Each callback of the
@@ -40,7 +40,7 @@ from rosrm_msgs.msg import CoveredInput
 #: silent source with a stuck destination may have to buffer half a minute of a fast sensor.
 BUFFER_LIMIT: Final = 100_000
 BUFFER_BYTES: Final = 512 << 20
-#: rclpy's own topics, which every node handles for itself.
+#: rclpy's own topics, which each node handles without rosrm.
 _INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
 #: Seconds after activation in which a message may arrive that the source has processed. The time is
 #: limited, because the clock of a publisher may be set back.
@@ -59,14 +59,14 @@ class NodeEntities:
     """The author's entities of one node.
 
     Args:
-        node: the author's.
-        plain: rclpy's own methods of it.
+        node: the author's node.
+        plain: gives access to rclpy's own methods of the node.
         identity: given by rosrm to this process.
         resting: the node does not start active: a shadow, or a node that restores a snapshot first.
 
     Attributes:
-        turn: held while a callback runs.
-        sequence: cycles so far.
+        turn: lock that is held while a callback runs.
+        sequence: number of cycles so far.
         in_cycle: a callback of the author has begun and not ended; also True after it raised.
         on_cycle: called after each cycle; set by the role in a handoff, as is the next.
         on_overflow: called with the topic of an input whose buffer is full.
@@ -93,7 +93,7 @@ class NodeEntities:
 
     @property
     def visible_node(self) -> str:
-        """Fully qualified name by which peers know this node."""
+        """Return the fully qualified name by which peers know this node."""
         return self.identity.node or str(self.node.get_fully_qualified_name())
 
     def visible(self, name: str, resolve: Callable[[str], str]) -> str:
@@ -154,7 +154,7 @@ class NodeEntities:
         **named: Any,
     ) -> Any:  # fmt: skip
         """Create a timer that runs while this node is active."""
-        if callback is None:  # rclpy's Rate, which sets a callback of its own later: no cycle
+        if callback is None:  # rclpy's Rate sets its own callback later, which is no cycle
             return self.plain.create_timer(period, None, *rest, autostart=autostart, **named)
         refuse_coroutine(callback, f"a timer of {period} s")
 
@@ -230,7 +230,7 @@ class NodeEntities:
                 self._cycle(one.serve, message, info)
 
     def _is_late(self, one: Input, info: Any) -> bool:
-        """Return True if the source processed this message while it was on its way here."""
+        """Return True if the source processed this message before the message arrived here."""
         if not self._late_until:
             return False
         if time.monotonic() >= self._late_until:
@@ -258,7 +258,7 @@ class NodeEntities:
         return not isinstance(self.node.executor, MultiThreadedExecutor)
 
     def _catch_up(self, one: Input) -> None:
-        """Buffer received messages, because a reader has less room and drops the oldest."""
+        """Buffer received messages, because a DDS reader has less room and drops the oldest."""
         for message, info in waiting(one.subscription):
             self._keep(one, message, info)
 
@@ -270,12 +270,12 @@ class NodeEntities:
                     self._catch_up(one)
 
     def input_with_gap(self) -> str:
-        """Return an input that needs every message and has lost one for good; "": there is none."""
+        """Return an input that has lost a message and needs every one; "" if there is none."""
         wanting = (one for one in self.inputs if one.buffered and one.wants_all)
         return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
 
     def serve_what_has_come(self, then: Callable[[], None]) -> None:
-        """Serve received messages, because a later shadow never got them, then call `then`."""
+        """Serve received messages, which a later shadow does not receive; then call `then`."""
         if not self._replay.is_on:
             self.catch_up()
         if self.buffer:
@@ -322,7 +322,7 @@ class NodeEntities:
     def _close(self, opening: ServiceOf | OpeningOf) -> None:
         try:
             opening.close()
-        except Exception as error:  # noqa: BLE001 - the author's code: anything may come
+        except Exception as error:  # noqa: BLE001 - the author's code may raise anything
             what = f"{type(error).__name__}: {error}"
             self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
@@ -343,7 +343,7 @@ class NodeEntities:
             )
 
     def inherit(self, inputs: Iterable[CoveredInput]) -> None:
-        """Count messages that the source of the state processed as processed here."""
+        """Treat messages that the source of the state processed as processed here."""
         own = {one.key: one for one in self.inputs}
         for covered in inputs:
             if covered.topic in own:
@@ -362,7 +362,7 @@ class NodeEntities:
         Args:
             timers_due: as `timers_due` returned it; timers beyond the list start now.
             since: monotonic time at which it did.
-            announce: called at once, because serving may take long.
+            announce: called first, because serving may take long.
             settle: called after the first slices of buffered messages and the start of timers and
                 services.
         """

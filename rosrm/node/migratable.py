@@ -25,7 +25,7 @@ _NODES: Final[dict[int, Any]] = {}
 
 
 class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
-    """Makes a node migratable; a base class listed before rclpy's node, or a subclass of it.
+    """Base class of a migratable node, listed before rclpy's `Node` or a subclass of that.
 
     Without rosrm (started by hand or by a launch file) the node equals rclpy's: no topic, no
     callback, no cost. Under rosrm
@@ -52,7 +52,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
             self._rosrm.begin()
 
     def _be_the_only_one(self, identity: NodeIdentity) -> None:
-        """Register the one migratable node of this process: an instance has one state.
+        """Register the migratable node of this process; a process has at most one.
 
         Raises:
             RuntimeError: another node of this process is migratable already.
@@ -74,11 +74,11 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """Name one topic of this node's state; several calls make a state of several parts.
 
         Args:
-            topic: on which the state is published after each cycle, if it has subscribers.
-            message_type: of the topic.
+            topic: the state is published on it after each cycle, if it has subscribers.
+            message_type: message class of the topic.
             save: returns the state as a message, or None: unchanged since the last time.
-            restore: takes the message, and overwrites the node's state. It is called for every
-                state that a shadow receives.
+            restore: takes the message, and overwrites the node's state. A shadow calls it for every
+                state that it receives.
 
         Raises:
             ValueError: the topic was named before.
@@ -89,8 +89,9 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     def when_active(self, create: Callable[[], Any]) -> None:
         """Call `create` when this node becomes active: at once, unless it is a shadow.
 
-        For objects that must exist in the active node only, such as an action server. The node
-        destroys the result (`.destroy()`) when it falls silent, and creates it again if it resumes.
+        This is for objects that may exist in the active node only, such as an action server. The
+        node destroys the result (`.destroy()`) when it falls silent, and creates it again if it
+        resumes.
         """
         if self._rosrm is not None:
             self._rosrm.entities.when_active(create)
@@ -100,7 +101,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     # --- rclpy's methods -------------------------------------------------------------------
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **named: Any) -> Any:
-        """Create a publisher as rclpy's; messages of a shadow or a silent node are dropped."""
+        """Create a publisher as rclpy does; messages of a shadow or a silent node are dropped."""
         if self._rosrm is None:
             return super().create_publisher(msg_type, topic, qos_profile, **named)
         return self._rosrm.entities.create_publisher(msg_type, topic, qos_profile, **named)
@@ -109,7 +110,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         self, msg_type: Any, topic: str, callback: Callable[..., Any], qos_profile: Any, *,
         buffer: bool = True, **named: Any,
     ) -> Any:  # fmt: skip
-        """Create a subscription as rclpy's.
+        """Create a subscription as rclpy does.
 
         Args:
             buffer: in a handoff every message is processed once, by the source or by the
@@ -125,7 +126,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         self, timer_period_sec: float, callback: Callable[..., Any], *rest: Any,
         autostart: bool = True, **named: Any,
     ) -> Any:  # fmt: skip
-        """Create a timer as rclpy's; a shadow's is stopped, then in phase with the source's."""
+        """Create a timer as rclpy does; in a shadow it starts later, in phase with the source's."""
         if self._rosrm is None:
             return super().create_timer(
                 timer_period_sec, callback, *rest, autostart=autostart, **named
@@ -137,13 +138,13 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **named: Any
     ) -> Any:
-        """Create a service as rclpy's; the server exists while this node is active."""
+        """Create a service as rclpy does; the server exists while this node is active."""
         if self._rosrm is None:
             return super().create_service(srv_type, srv_name, callback, **named)
         return self._rosrm.entities.create_service(srv_type, srv_name, callback, **named)
 
     def create_client(self, srv_type: Any, srv_name: str, **named: Any) -> Any:
-        """Create a client as rclpy's; a name below `~` uses the node name that peers know."""
+        """Create a client as rclpy does; a name below `~` uses the node name that peers know."""
         if self._rosrm is not None:
             srv_name = self._rosrm.entities.visible(srv_name, self.resolve_service_name)
         return super().create_client(srv_type, srv_name, **named)

@@ -1,4 +1,4 @@
-"""Timers by the monotonic clock, which no clock change or simulation delays."""
+"""Timers by the monotonic clock, independent of clock changes and simulated time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ def steady_timer(
 ) -> Any:
     """Create a timer by the monotonic clock; rclpy's default follows the node's (wall) clock.
 
-    Without `autostart` it runs from its `reset` on. `plain` has rclpy's own methods of the node.
+    Without `autostart` the timer starts at its `reset`. `plain` gives access to rclpy's own methods
+    of the node.
     """
     clock = Clock(clock_type=ClockType.STEADY_TIME)
     return plain.create_timer(period, callback, clock=clock, autostart=autostart)

@@ -1,5 +1,8 @@
-"""Recording of a master's run: every input of its core, so that the run can be replayed.
+"""Recording of a master's run: every input of its core, for a replay.
 
-`frames` handles the file, `encoding` the events in it, and `reader` assembles the run. All of it is
-pure; `rosrm.master.recorder` writes the file.
+frames.py     file format
+encoding.py   conversion of events and decisions
+reader.py     reader of a whole recording
+
+`rosrm.master.recorder` writes the file.
 """

@@ -1,6 +1,6 @@
 """Conversion of the core's events and decisions to the content of frames and back.
 
-Readings and usages are arrays and stay so; everything else is JSON with the fields of its
+Readings and usages are written as arrays, all other events as JSON with the fields of their
 dataclass. Numbers keep every bit, because a difference in the last digit could change a decision in
 a replay.
 """
@@ -41,7 +41,7 @@ from rosrm.recording.frames import FrameKind
 
 #: Seconds by the master's monotonic clock, and unix time.
 _TIMES: Final = struct.Struct("<dd")
-#: Number of readings, number of slots in use, and usage and limit of all other slots.
+#: Number of readings, number of slots in use, usage and limit of all other slots.
 _READINGS: Final = struct.Struct("<IIdd")
 _USAGES: Final = struct.Struct("<qQI")
 _COLUMNS: Final = (
@@ -49,7 +49,7 @@ _COLUMNS: Final = (
     ("accepting", "?"), ("stale", "<u4"),
 )  # fmt: skip
 
-#: Orders in a decision; those about replicas do not decide where anything runs.
+#: Orders that are decisions. Orders about replicas are not, because they place no instance.
 _ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
     {
         StartInstance: "start",
@@ -61,7 +61,7 @@ _ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
         ReportInstances: "report",
     }
 )
-#: Bits of an order's number to its series, in the records of rosrm 0.1.0.
+#: Bits of an order's number to its series, in recordings of rosrm 0.1.0.
 _SERIES_OF_0_1_0: Final = MappingProxyType({41: "replication", 42: "capability", 43: "periodic"})
 _KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {kind.__name__: kind for kind in get_args(happened.Event)}
@@ -74,8 +74,8 @@ class Happened:
 
     Attributes:
         now: seconds by the master's monotonic clock.
-        wall: unix time, as the core knew it.
-        decided: the core's decisions, one line each (`decisions`); None: not recorded.
+        wall: unix time of the core in seconds.
+        decided: the core's decisions (`decisions`), one line each; None: not recorded.
     """
 
     now: float
@@ -174,7 +174,7 @@ def _decoded_usages(content: bytes) -> happened.UsagesReceived:
 
 
 def decisions(commands: Sequence[Command]) -> tuple[str, ...]:
-    """Return the commands that decide where something runs, one line each, for comparison."""
+    """Return the commands that start, stop or move instances, one line each, for comparison."""
     return tuple(line for command in commands if (line := _decision(command)))
 
 

@@ -4,9 +4,9 @@ r"""File format of a recording: a line with its version, then frames with length
     frame*                  length u32, CRC-32 u32 (both little-endian), then `length` bytes
 
 The first byte of a frame is its kind (`FrameKind`). The first frame is the header. The last frame
-of a closed recording states why it ends; without that frame the file is cut short. The file is also
-cut short where only zeros follow, because a power loss leaves zeros for bytes that were not on the
-disk yet.
+of a closed recording states why the recording ends. A file without that frame is cut short. A file
+with only zeros after some frame is also cut short, because a power loss leaves zeros for bytes that
+were not on the disk yet.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import BinaryIO, Final
 
 from rosrm.errors import RecordError
 
-#: Version of the format below; only files of this version are read.
+#: Version of the format; files of other versions are refused.
 RECORD_VERSION: Final = 1
 MAGIC: Final = b"rosrm-record "
 _PREFIX: Final = struct.Struct("<II")
-#: Bytes: every frame is smaller. A larger length is damage, so nothing is allocated for it.
+#: Largest length of a frame in bytes; a larger one is damage, and nothing is allocated for it.
 _LARGEST: Final = 2**30
 _LONGEST_LINE: Final = 64
-#: Bytes of a tail that are read at once.
+#: Bytes per read in the search for zeros.
 _AT_ONCE: Final = 2**20
 
 
@@ -61,8 +61,8 @@ def frames(file: BinaryIO, name: str) -> Iterator[tuple[FrameKind, bytes, int]]:
     """Return the frames of a recording, each with its kind, its content and its offset in bytes.
 
     Args:
-        file: from its beginning.
-        name: of the file, for messages.
+        file: opened at its beginning.
+        name: name of the file, for messages.
 
     Raises:
         RecordError: no recording, another version, damaged, or cut within a frame.
@@ -91,7 +91,7 @@ def _check_opening(file: BinaryIO, name: str) -> int:
     line = file.readline(_LONGEST_LINE).rstrip(b"\0")
     if not line.startswith(MAGIC):
         raise RecordError(
-            f"{name}: is no record of a master's run: it does not begin with "
+            f"{name}: is no recording of a master's run: it does not begin with "
             f"{MAGIC.decode().strip()!r}. A master writes one with `record:` in its cluster.yaml"
         )
     if line != opening():
@@ -99,26 +99,26 @@ def _check_opening(file: BinaryIO, name: str) -> int:
             raise cut_short(name, 0)
         version = line[len(MAGIC) :].strip().decode(errors="replace")
         raise RecordError(
-            f"{name}: is a record of version {version}; this rosrm reads version {RECORD_VERSION}. "
-            f"Use the rosrm that wrote it"
+            f"{name}: is a recording of version {version}; this rosrm reads version "
+            f"{RECORD_VERSION}. Use the rosrm that wrote the file"
         )
     return len(line)
 
 
 def cut_short(name: str, at: int) -> RecordError:
-    """Return the error of a file that ends before the recording does."""
+    """Return the error of a file without the end of its recording."""
     return CutShort(
-        f"{name}: the record is cut short at byte {at}: its master was killed, lost its power, "
+        f"{name}: the recording is cut short at byte {at}: its master was killed, lost its power, "
         f"still runs, or the file was not copied as a whole. --cut accepts the complete part"
     )
 
 
 class CutShort(RecordError):
-    """A recording without its end; the frames before are complete."""
+    """The recording has no end; the frames before are complete."""
 
 
 def _broken(file: BinaryIO, read: bytes, name: str, at: int) -> RecordError:
-    """Return the error of an invalid frame: cut, where it ends in zeros to the end, or damaged."""
+    """Return the error of an invalid frame: cut short if only zeros follow, else damaged."""
     if read.endswith(b"\0"):
         while rest := file.read(_AT_ONCE):
             if rest.strip(b"\0"):
@@ -130,6 +130,6 @@ def _broken(file: BinaryIO, read: bytes, name: str, at: int) -> RecordError:
 
 def _damaged(name: str, at: int) -> RecordError:
     return RecordError(
-        f"{name}: the record is damaged at byte {at}: length, checksum or kind of the frame there "
-        f"do not fit. Nothing of it was used"
+        f"{name}: the recording is damaged at byte {at}: the frame there has an invalid length, "
+        f"checksum or kind. Nothing of the file was used"
     )

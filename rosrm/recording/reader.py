@@ -1,4 +1,4 @@
-"""Reader of recordings: the initial state of the master, and all its events."""
+"""Reader of recordings: the initial state of a master, and all events of its core."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Header:
         software: version of rosrm.
         master: name of the cluster.
         config: the master's settings, as `ClusterConfig.to_json` has them.
-        epoch: of this run of the master.
-        started: seconds by its monotonic clock when its state was restored.
-        intents: content of its journal at the start, by table.
+        epoch: epoch of the master.
+        started: time, in seconds by its monotonic clock, at which its state was restored.
+        intents: intents in its journal at the start, by table.
     """
 
     software: str
@@ -49,9 +49,9 @@ class Recording:
     """A whole recording.
 
     Attributes:
-        name: of its file.
-        events: in the order in which the core handled them.
-        end: why it ends: "stopped: SIGINT", "full: …"; "cut short" for one that was cut.
+        name: name of the file.
+        events: events in the order in which the core handled them.
+        end: why the recording ends: "stopped: SIGINT", "full: …" or "cut short".
     """
 
     name: str
@@ -69,9 +69,9 @@ def read_record(file: BinaryIO, name: str, *, cut: bool = False) -> Recording:
     """Read a recording.
 
     Args:
-        file: from its beginning.
-        name: of the file, for messages.
-        cut: accept the complete frames of a file that is cut short.
+        file: opened at its beginning.
+        name: name of the file, for messages.
+        cut: True: accept the complete frames of a file that is cut short.
 
     Raises:
         RecordError: no recording, damaged, cut short, or of another version.
@@ -90,7 +90,7 @@ def read_record(file: BinaryIO, name: str, *, cut: bool = False) -> Recording:
 
 
 class _Reader:
-    """Assembles frames to a recording."""
+    """Builder of a recording from its frames."""
 
     def __init__(self, name: str) -> None:
         self.header: Header | None = None
@@ -103,7 +103,7 @@ class _Reader:
         """Add the next frame."""
         self.at = at
         if (kind is FrameKind.HEADER) is not (self.header is None) or self.end:
-            raise self._nonsense("a frame that does not belong there")
+            raise self._nonsense("a frame of this kind is not allowed there")
         try:
             self._take(kind, content)
         except (ValueError, TypeError, KeyError) as fault:
@@ -123,13 +123,13 @@ class _Reader:
         else:
             event = decode(kind, content)
             if self._events and event.now < self._events[-1].now:
-                raise ValueError("time goes back")
+                raise ValueError("its time is before that of the previous event")
             self._events.append(event)
 
     def _nonsense(self, what: str) -> RecordError:
         wrote = f" (written by rosrm {self.header.software})" if self.header else ""
         return RecordError(
-            f"{self._name}: the frame at byte {self.at} makes no sense to rosrm {__version__}"
+            f"{self._name}: the frame at byte {self.at} is invalid for rosrm {__version__}"
             f"{wrote}: {what}"
         )
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import is_dataclass
 from functools import cache, partial
 from operator import attrgetter
-from typing import Any, Final, TypeVar, get_type_hints
+from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 from rosrm.errors import Refused
 from rosrm.model import values
@@ -172,9 +172,9 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
 def _word_fault(message: msg.ProcessSpec) -> str:
     words = (
         ("kind", message.kind, tuple(kind.value for kind in values.Kind)),
-        ("readiness", message.readiness.kind, ("auto", "graph", "running")),
-        ("host_loss", message.host_loss.then, ("wait", "elsewhere", "stop")),
-        ("isolation", message.isolation.then, ("keep", "stop")),
+        ("readiness", message.readiness.kind, get_args(values.ReadinessKind)),
+        ("host_loss", message.host_loss.then, get_args(values.HostLossAction)),
+        ("isolation", message.isolation.then, get_args(values.IsolationAction)),
     )
     for name, given, allowed in words:
         if given not in allowed:
@@ -217,8 +217,9 @@ def restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
 
 
 def _restart_fault(message: msg.RestartPolicy) -> str:
-    if message.when not in ("never", "on-failure", "always"):
-        return f"restart {message.when!r}; allowed: never, on-failure, always"
+    allowed = get_args(values.RestartCondition)
+    if message.when not in allowed:
+        return f"restart {message.when!r}; allowed: {', '.join(allowed)}"
     if not 1.0 <= message.factor < _INFINITE:
         return f"the factor of its restarts is {message.factor}; allowed: 1 and more"
     for name in ("delay", "max_delay", "window"):

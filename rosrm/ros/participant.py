@@ -60,7 +60,7 @@ class Participant:
     """
 
     def __init__(self, settings: RosSettings, name: str, *, pace: Pace = "eager") -> None:
-        settings.check_domain()
+        settings.check()
         os.environ.update(settings.environment())
         self.settings = settings
         self.context = rclpy.Context()

@@ -59,7 +59,7 @@ def arguments(descriptor: int) -> list[str]:
 def interrupts_held() -> Iterator[None]:
     """Block SIGINT while a runtime is started, so that it reaches the runtime's own handlers.
 
-    Otherwise Python, which handles a Ctrl-C from its first moment on, would print a traceback.
+    Otherwise a Ctrl-C before the handlers are installed would print a traceback.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -10,7 +10,7 @@ from rosrm.wording import size
 
 
 def room_for(path: Path) -> str:
-    """Return the free and total size of a file's file system; "" where it cannot be read."""
+    """Return a sentence on the free and total size of a file's file system; "" if unreadable."""
     try:
         usage = shutil.disk_usage(path.parent)
         place = path.parent.resolve()

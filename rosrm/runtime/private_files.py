@@ -81,11 +81,13 @@ def make_safe_directory(directory: str | os.PathLike[str]) -> None:
 def open_private(path: str, flags: int) -> int:
     """Open or create a regular file of this user, with mode 0600; never follow a link.
 
+    With O_TRUNC the file is emptied only after these checks.
+
     Raises:
         OSError: it cannot be opened, is a link, or belongs to another user.
     """
     try:
-        file = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        file = os.open(path, flags & ~os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise _refusal(path, "it is a symbolic link") from None
@@ -95,6 +97,8 @@ def open_private(path: str, flags: int) -> int:
         _check_file(path, state)
         if state.st_mode & _OTHERS:
             os.fchmod(file, 0o600)
+        if flags & os.O_TRUNC:
+            os.ftruncate(file, 0)
     except OSError:
         os.close(file)
         raise

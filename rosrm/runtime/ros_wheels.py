@@ -23,7 +23,7 @@ _WHEEL_FOLDER: Final = re.compile(
 def without_bootstrapper(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without the bootstrapper's changes; without its guard, unchanged.
 
-    The bootstrapper keeps earlier folders of LD_LIBRARY_PATH, though in no order; those stay.
+    Folders that were in LD_LIBRARY_PATH before the bootstrapper stay, in any order.
     """
     cleaned = dict(environment)
     if cleaned.pop(_GUARD, None) is None:

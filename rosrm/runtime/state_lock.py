@@ -17,13 +17,13 @@ _log = logging.getLogger("rosrm")
 
 @contextlib.contextmanager
 def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[None]:
-    """Hold a state directory for one process of a role on this machine.
+    """Lock a state directory for one process of a role on this machine.
 
     Args:
-        directory: created where it is missing; one that is open to other users is tightened.
+        directory: created if it is missing; an existing one that is open to others is tightened.
         role: "master" or "slave".
         code: error code of the refusal.
-        remedy: settings that allow a second process beside the first; "": none do.
+        remedy: settings that allow a second process beside the first; "" if none do.
 
     Raises:
         Refused: another process holds the directory; the message names its pid.

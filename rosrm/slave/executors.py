@@ -10,9 +10,10 @@ from functools import partial
 from typing import Any
 
 from rosrm.errors import Refused, RosrmError, describe_fault, describe_plugin_fault
+from rosrm.extensions.contracts import Executor
 from rosrm.extensions.discovery import definition
+from rosrm.extensions.made import OfferedExecutor
 from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given
-from rosrm.extensions.registry import Executor, OfferedExecutor
 from rosrm.ros.slave.services import ExecutorOutcome
 
 #: Takes the outcome of an executor.
@@ -81,7 +82,7 @@ class Executors:
             min(timeout, threading.TIMEOUT_MAX), self._post, [partial(self._fail, strategy, late)]
         )
         timer.daemon = True
-        given = {**arguments, "here": here}
+        complete = {**arguments, "here": here}
 
         def settle(outcome: ExecutorOutcome) -> None:
             if outcome.code in ("", "unable"):
@@ -92,7 +93,7 @@ class Executors:
             done(outcome)
 
         def work() -> None:
-            outcome = _outcome(name, function, given)
+            outcome = _outcome(name, function, complete)
             timer.cancel()
             self._post(partial(settle, outcome))
 

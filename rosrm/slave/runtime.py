@@ -1,4 +1,4 @@
-"""Main loop of the slave: sample, report, ask for work, launch instances, watch them."""
+"""Main loop of the slave: sample, report, request work, launch instances, watch them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -113,53 +114,19 @@ class SlaveRuntime:
             launchers = Launchers.of(offered, registry.capabilities_of())
             sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions)
-            context = ProbeContext(config.scope, config.budget, config.state, sessions)
-            probes = registry.probes(config.probes, context)
-            self._sampler = Sampler(probes.made)
-            opened.callback(self._sampler.close)
+            absent = self._open_probes(registry, sessions, opened)
             first = self._sampler.first().reports
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_stop_signals(self._stop)
-            self._supervisor = SupervisorLink(
-                config.state / "supervisor", config.logs, post=self._post, take=self._take,
-                follow=self._follow_session,
-                ended=lambda fault: self._ending.note_supervisor_left(fault),  # noqa: PLW0108 - made later
-            )  # fmt: skip
-            opened.callback(self._supervisor.close)
-            self._participant = Participant(
-                config.ros, f"rosrm_slave_{token(config.host)}", pace="steady"
-            )
-            opened.callback(self._participant.close)
-            graph = GraphWatch(self._participant.node)
+            self._open_supervisor(opened)
+            graph = self._join_ros(absent, opened)
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
-            self._limit = self._limits()
-            self._endpoint = SlaveEndpoint(
-                self._participant, self._description(probes.absent), self._state, take=self._take,
-                snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
-                seen=JournalWatermark(config.state / "journal_seen"),
-            )  # fmt: skip
             self._note_probes(first)
-            self._endpoint.failing.update(self._executors.failing_plugins())
-            for name, reason in offered.broken.items():
-                self._endpoint.failing["launcher", name] = reason
-            for strategy, reason in self._executors.failing.items():
-                _log.info("migration strategy %s is broken: %s", strategy, reason)
-            kept = config.state / "kept"
-            self._replication = ReplicationService(
-                kept, config.host, config.keep,
-                ReplicationEndpoint(self._participant, config.host),
-                post=self._post, publish=self._endpoint.publish_snapshots,
-            )  # fmt: skip
-            duties = Duties(
-                self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
-                self._execute, self._read_log,
-            )  # fmt: skip
-            SlaveServices(
-                self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch
-            )
+            self._note_broken(offered.broken)
+            self._serve_master(max_age)
             self._starter = Starter(
-                config, kept, self._state, self._supervisor, self._endpoint, self._replication,
-                graph, sessions, launchers, take=self._take,
+                config, self._kept, self._state, self._supervisor, self._endpoint,
+                self._replication, graph, sessions, launchers, take=self._take,
             )  # fmt: skip
             self._ending = Shutdown(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
@@ -167,6 +134,69 @@ class SlaveRuntime:
             )  # fmt: skip
             self._closing = opened.pop_all()
         self._adopt()
+
+    # --- the parts -----------------------------------------------------------------------
+
+    def _open_probes(
+        self, registry: Registry, sessions: SessionTable, opened: contextlib.ExitStack
+    ) -> Mapping[str, str]:
+        """Start reading the probes; return the absent ones with the reasons."""
+        config = self._config
+        context = ProbeContext(config.scope, config.budget, config.state, sessions)
+        probes = registry.probes(config.probes, context)
+        self._sampler = Sampler(probes.made)
+        opened.callback(self._sampler.close)
+        self._limit = self._limits()
+        return probes.absent
+
+    def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
+        self._supervisor = SupervisorLink(
+            self._config.state / "supervisor", self._config.logs, post=self._post, take=self._take,
+            follow=self._follow_session,
+            ended=lambda fault: self._ending.note_supervisor_left(fault),  # noqa: PLW0108 - made later
+        )  # fmt: skip
+        opened.callback(self._supervisor.close)
+
+    def _join_ros(self, absent: Mapping[str, str], opened: contextlib.ExitStack) -> GraphWatch:
+        """Create participant and endpoint; return the view of the ROS graph."""
+        config = self._config
+        self._participant = Participant(
+            config.ros, f"rosrm_slave_{token(config.host)}", pace="steady"
+        )
+        opened.callback(self._participant.close)
+        self._endpoint = SlaveEndpoint(
+            self._participant, self._description(absent), self._state, take=self._take,
+            snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
+            seen=JournalWatermark(config.state / "journal_seen"),
+        )  # fmt: skip
+        return GraphWatch(self._participant.node)
+
+    def _note_broken(self, launchers: Mapping[str, str]) -> None:
+        """Log and report the plugins that are broken on this host from the start."""
+        self._endpoint.failing.update(self._executors.failing_plugins())
+        for name, reason in launchers.items():
+            self._endpoint.failing["launcher", name] = reason
+        for strategy, reason in self._executors.failing.items():
+            _log.info("migration strategy %s is broken: %s", strategy, reason)
+
+    def _serve_master(self, max_age: float) -> None:
+        """Offer the services of this slave, with those of snapshot replication."""
+        config = self._config
+        self._replication = ReplicationService(
+            self._kept, config.host, config.keep,
+            ReplicationEndpoint(self._participant, config.host),
+            post=self._post, publish=self._endpoint.publish_snapshots,
+        )  # fmt: skip
+        duties = Duties(
+            self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
+            self._execute, self._read_log,
+        )  # fmt: skip
+        SlaveServices(self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch)
+
+    @property
+    def _kept(self) -> Path:
+        """Return the directory of the snapshots."""
+        return self._config.state / "kept"
 
     def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         limit = np.ones(RESOURCE_SLOTS, np.float32)

@@ -40,7 +40,7 @@ from rosrm.model.values import ABSURD_USAGE, RESOURCE_SLOTS, Reading
 
 if TYPE_CHECKING:
     from rosrm.extensions.contracts import Probe
-    from rosrm.extensions.registry import MadeProbe
+    from rosrm.extensions.made import MadeProbe
 
 #: A read that takes longer, in seconds, is too slow to share a thread.
 QUICK: Final = 0.05

@@ -1,4 +1,4 @@
-"""Format of a snapshot: one file, or the same bytes in transfer to another host. Pure."""
+"""Format of a snapshot, the same in a file and in transfer to another host. Pure."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Listing:
 
     Attributes:
         blocks: the mark, then each part of the state, serialised.
-        path: of the file that it was read from.
+        path: file that the snapshot was read from.
     """
 
     head: Head
@@ -71,13 +71,13 @@ class Listing:
 
 
 class TransferPart(NamedTuple):
-    """A part of a snapshot in transfer to another host.
+    """Part of a snapshot in transfer to another host.
 
     Attributes:
-        number, sequence: of the instance, and of the snapshot.
+        number, sequence: number of the instance, and sequence of the snapshot.
         offset: bytes before this part.
-        total: bytes of the whole.
-        digest: CRC-32 of the whole.
+        total: bytes of the whole snapshot.
+        digest: CRC-32 of the whole snapshot.
     """
 
     process: str
@@ -138,7 +138,7 @@ def decoded_head(data: bytes) -> tuple[Head, int]:
 
 
 def checked(data: bytes) -> tuple[Head, int]:
-    """Return the same as `decoded_head` for a complete file; raise `Damaged` for any other."""
+    """Return the result of `decoded_head` for a complete file; raise `Damaged` for any other."""
     head, start = decoded_head(data)
     if len(data) < head.size:
         raise Damaged(f"it ends after {len(data)} of {head.size} bytes")

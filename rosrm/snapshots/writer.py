@@ -13,11 +13,11 @@ from rosrm.snapshots.reader import COPY, HEAD_ROOM, OPEN, SLOTS, content_of, pat
 
 
 class SlotWriter:
-    """Writes a node's snapshots into its two slots in turn, never over the newest one.
+    """Writer of a node's snapshots into its two slots in turn, never over the newest one.
 
     Args:
-        directory: of the process; created where it does not exist.
-        process: its name.
+        directory: directory of the process; created if it does not exist.        process: name of
+            the process.
         instance: number of the writing instance.
 
     Raises:
@@ -45,9 +45,9 @@ class SlotWriter:
             raise
 
     def write(self, sequence: int, blocks: Sequence[Block]) -> bool:
-        """Write a snapshot over the older one; a kill at any instant leaves the newer one complete.
+        """Overwrite the older snapshot; a kill at any instant leaves the newer one complete.
 
-        Returns False, with nothing changed, if a newer instance writes here.
+        Return False, with nothing changed, if a newer instance writes here.
 
         Raises:
             OSError: the snapshot cannot be written; the newer one is still complete.
@@ -101,7 +101,7 @@ def _write_all(file: int, parts: Sequence[bytes], at: int) -> None:
 
 
 class CopyWriter:
-    """Receives a replica from another host in parts; the earlier replica stays until `finish`.
+    """Writer of a replica from another host; the earlier replica stays until `finish`.
 
     Args:
         directory: of the process; created where it does not exist.
@@ -145,7 +145,7 @@ class CopyWriter:
         with contextlib.suppress(OSError):
             self._begun.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
-            self._directory.rmdir()  # fails, as intended, where other files are kept
+            self._directory.rmdir()  # fails, as intended, if the directory holds other files
 
     def _close(self) -> None:
         if self._file >= 0:

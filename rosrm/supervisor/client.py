@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
@@ -101,19 +102,26 @@ class SupervisorClient:
         state = Path(os.path.abspath(state_directory))
         deadline = time.monotonic() + timeout
         while True:
-            client = cls(connect_or_start(state, start, log, deadline), state)
             try:
-                client._introduce(log, deadline)
+                return cls._connect_once(state, start, log, deadline)
+            except TimeoutError:
+                silent = f"the supervisor of {state} did not answer in time"
+                raise SupervisorSilent(silent) from None
             except SupervisorGone:
                 # A dying supervisor still accepts connections for an instant.
-                client.close()
                 if time.monotonic() > deadline:
                     raise
-            except BaseException:
-                client.close()
-                raise
-            else:
-                return client
+
+    @classmethod
+    def _connect_once(
+        cls, state: Path, start: bool, log: LogLimits, deadline: float
+    ) -> SupervisorClient:
+        client = cls(connect_or_start(state, start, log, deadline), state)
+        with contextlib.ExitStack() as failing:
+            failing.callback(client.close)
+            client._introduce(log, deadline)
+            failing.pop_all()
+        return client
 
     # --- orders -------------------------------------------------------------------------------
 
@@ -208,12 +216,13 @@ class SupervisorClient:
     # --- receiving ----------------------------------------------------------------------------
 
     def _introduce(self, log: LogLimits, deadline: float) -> None:
+        """Send `hello`, and take the welcome; raises `TimeoutError`."""
         self.send(messages.Hello(messages.PROTOCOL, os.getpid(), log))
         while not self.pid:
             if self._failure is not None:
                 raise self._failure
             if not readable(self._peer, max(0.0, deadline - time.monotonic())):
-                raise SupervisorSilent(f"{self._name()} did not answer in time")
+                raise TimeoutError
             self._read()
 
     def _read(self) -> None:

@@ -20,10 +20,17 @@ _CHUNK: Final = 1 << 16
 
 
 def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) -> socket.socket:
-    """Return a connection to the supervisor of a state directory; raises `SupervisorError`."""
+    """Return a connection to the supervisor of a state directory.
+
+    Raises:
+        TimeoutError: a supervisor exists, and accepts no connection in time.
+        SupervisorError: there is none and none can be started in time.
+    """
     while True:
         try:
-            return endpoint.connect(str(state))
+            return endpoint.connect(str(state), deadline - time.monotonic())
+        except TimeoutError:
+            raise
         except (FileNotFoundError, ConnectionRefusedError):
             if not start:
                 raise SupervisorError(f"no supervisor serves {state}") from None
@@ -32,7 +39,7 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
         problem = _start(state, log, deadline)
         if not problem:
             continue
-        if time.monotonic() > deadline or "another supervisor" not in problem:
+        if time.monotonic() > deadline or endpoint.ANOTHER not in problem:
             raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
         # Another supervisor is about to listen or to end: neither can be awaited from here.
         time.sleep(0.02)
@@ -60,6 +67,7 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
         while not answer.startswith(b"ready\n"):
             if not readable(output, max(0.0, deadline - time.monotonic())):
                 answer += b"it was not ready in time"
+                process.kill()  # the first stage; it may hang, e.g. on a disk that does not answer
                 break
             part = os.read(output.fileno(), _CHUNK)
             if not part:
@@ -72,7 +80,10 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
 
 
 def readable(file: socket.socket | object, timeout: float | None) -> bool:
-    """Return True if there is something to read within `timeout` seconds; None: no limit."""
+    """Return True if there is something to read within `timeout` seconds; None: no limit.
+
+    A file that another thread has closed counts as readable: the read reports it.
+    """
     return _poll(file, select.POLLIN, timeout)
 
 
@@ -83,5 +94,8 @@ def writable(file: socket.socket, timeout: float | None) -> bool:
 
 def _poll(file: object, event: int, timeout: float | None) -> bool:
     poll = select.poll()
-    poll.register(file, event)  # type: ignore[arg-type]
+    try:
+        poll.register(file, event)  # type: ignore[arg-type]
+    except ValueError:  # closed
+        return True
     return bool(poll.poll(None if timeout is None else timeout * 1000.0))

@@ -5,9 +5,16 @@ from __future__ import annotations
 import fcntl
 import os
 import socket
+import struct
+from typing import Final
 
 from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.supervisor import own_log, paths
+
+#: First words of the error for a state directory that is served already.
+ANOTHER: Final = "another supervisor"
+#: Least seconds for a connection; a limit of 0 would mean none.
+_SHORTEST: Final = 0.001
 
 
 class EndpointError(Exception):
@@ -27,18 +34,41 @@ def listen(state: str) -> socket.socket:
         raise EndpointError(f"the state directory {state} cannot be used: {reason}") from None
 
 
-def connect(state: str) -> socket.socket:
-    """Connect to the supervisor of a state directory. Raises OSError where none listens."""
-    peer = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+def connect(state: str, timeout: float) -> socket.socket:
+    """Connect to the supervisor of a state directory.
+
+    Args:
+        state: the directory.
+        timeout: seconds.
+
+    Raises:
+        TimeoutError: a supervisor listens and accepts no connection, because it is stopped.
+        OSError: none listens.
+    """
     directory = os.open(state, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    peer = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
+        # Clients that gave up stay in the queue of a stopped supervisor. Once the queue is full,
+        # the kernel makes a connect wait like a send.
+        _limit_sends(peer, max(timeout, _SHORTEST))
         peer.connect(_short_path(directory))
+        _limit_sends(peer, 0.0)
+    except BlockingIOError:
+        peer.close()
+        raise TimeoutError(f"{state}: connection not accepted within {timeout:g} s") from None
     except OSError:
         peer.close()
         raise
     finally:
         os.close(directory)
     return peer
+
+
+def _limit_sends(peer: socket.socket, seconds: float) -> None:
+    """Limit the time of a blocking call that sends; 0: no limit."""
+    whole = int(seconds)
+    limit = struct.pack("ll", whole, int((seconds - whole) * 1e6))
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
 
 
 def let_go_of_terminal(state: str) -> None:
@@ -63,7 +93,7 @@ def _lock(state: str) -> None:
     except BlockingIOError:
         holder = os.read(file, 20).decode().strip() or "unknown"
         raise EndpointError(
-            f"another supervisor (pid {holder}) serves the state directory {state}"
+            f"{ANOTHER} (pid {holder}) serves the state directory {state}"
         ) from None
     os.ftruncate(file, 0)
     os.pwrite(file, f"{os.getpid()}\n".encode(), 0)

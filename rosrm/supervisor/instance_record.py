@@ -34,7 +34,7 @@ from rosrm.core.supervisor.instance import (
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
 from rosrm.runtime.private_files import open_private
-from rosrm.supervisor import json_lines, messages, paths, procfs
+from rosrm.supervisor import atomic_file, json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
 
 VERSION: Final = 1
@@ -43,8 +43,6 @@ COMPACT_BYTES: Final = 1 << 20
 COMPACT_FACTOR: Final = 4
 #: Most faults of the record that are reported one by one.
 MOST_NOTES: Final = 20
-
-_APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT
 
 
 class InstanceRecordError(Exception):
@@ -299,16 +297,7 @@ class InstanceRecord:
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._size)
 
     def _replace(self, text: bytes) -> None:
-        new = f"{self._path}.new"
-        file = open_private(new, _APPEND | os.O_TRUNC)
-        try:
-            view = memoryview(text)
-            while view:
-                view = view[os.write(file, view) :]
-            os.replace(new, self._path)
-        except OSError:
-            os.close(file)
-            raise
+        file = atomic_file.replace(self._path, text, os.O_APPEND)
         if self._file >= 0:
             os.close(self._file)
         self._file = file
@@ -316,7 +305,7 @@ class InstanceRecord:
     def _open_old(self) -> None:
         """Keep using the existing record, behind a tail that may be torn."""
         if self._file < 0:
-            self._file = open_private(self._path, _APPEND)
+            self._file = open_private(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
             self._waiting.insert(0, b"\n")
 
     def _add(self, fields: Mapping[str, Any]) -> None:

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rosrm.runtime.private_files import open_private
+from rosrm.supervisor import atomic_file
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -62,13 +63,7 @@ def size(log: str) -> int:
 
 def begin(log: str, mark: Mark, rest: bytes = b"") -> None:
     """Replace the index of a log file, as a whole."""
-    new = f"{path_of(log)}.new"
-    index = open_private(new, os.O_WRONLY | os.O_TRUNC | os.O_CREAT)
-    try:
-        os.write(index, _RECORD.pack(*mark) + rest)
-    finally:
-        os.close(index)
-    os.replace(new, path_of(log))
+    os.close(atomic_file.replace(path_of(log), _RECORD.pack(*mark) + rest))
 
 
 def base(log: str) -> int | None:

@@ -74,12 +74,19 @@ class LogKeeper:
         self._unchecked = limits.keep_bytes  # bytes that may lie there from earlier
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
-        """Open the log of a starting instance; make room, but keep logs of `known` instances."""
+        """Open the log of a starting instance; make room, but keep logs of `known` instances.
+
+        Raises:
+            OSError: the log cannot be opened. An old log that cannot be removed prevents no start.
+        """
         path = paths.log_file(self._state, *instance)
         log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         self._opened[instance] = os.fstat(log).st_size
-        self._folder.add(instance, known, self.limits)
-        self._folder.remove_old_processes(known, self.limits)
+        try:
+            self._folder.add(instance, known, self.limits)
+            self._folder.remove_old_processes(known, self.limits)
+        except OSError as error:
+            own_log.write(f"an old log cannot be removed: {error}")
         return log
 
     def watch(self, instance: Key, now: float, started: int = 0) -> None:
@@ -121,7 +128,10 @@ class LogKeeper:
         if self._unchecked < self.limits.keep_bytes // EXCESS_PART:
             return
         self._unchecked = 0
-        self._folder.remove_excess(self._logs, self.limits.keep_bytes)
+        try:
+            self._folder.remove_excess(self._logs, self.limits.keep_bytes)
+        except OSError as error:
+            own_log.write(f"an old log cannot be removed: {error}")
 
 
 class _Log:

@@ -50,12 +50,16 @@ class ProcessTrees:
         self._children[pid] = key
         self._add(key, pid, birth)
 
-    def take_over(self, key: Key, leader: Stat) -> None:
-        """Add a session leader that an earlier supervisor spawned."""
-        pidfd = os.pidfd_open(leader.pid)
+    def take_over(self, key: Key, leader: Stat) -> bool:
+        """Add a session leader that an earlier supervisor spawned; return False if it has ended."""
+        try:
+            pidfd = os.pidfd_open(leader.pid)
+        except ProcessLookupError:
+            return False
         self._taken_over[leader.pid] = pidfd
         self._add(key, leader.pid, leader.start)
         self._watch(pidfd, lambda: self._taken_over_ended(key, leader.pid))
+        return True
 
     def birth(self, key: Key) -> int:
         """Return the start time of the instance's leader in clock ticks; 0: not known."""

@@ -81,8 +81,7 @@ def _start_of(
     leaders = [stat for stat in found if stat.pid == stat.session]
     if instance.key not in recorded.spawning:
         return Resumed(instance.key)
-    if leaders:
-        trees.take_over(instance.key, leaders[0])
+    if leaders and trees.take_over(instance.key, leaders[0]):
         return Spawned(instance.key, leaders[0].pid)
     trees.kill(found)
     lost = "the supervisor was killed while it started this: how that went is not known"

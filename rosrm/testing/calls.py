@@ -13,7 +13,8 @@ from rosrm.config.documents import Problems, parse
 from rosrm.errors import ConfigError, PluginError
 from rosrm.extensions.discovery import HOOKS, ChosenOffer, Offer
 from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import FailedProbe, Registry
+from rosrm.extensions.made import FailedProbe
+from rosrm.extensions.registry import Registry
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import to_plain
 from rosrm.model.rows import PluginKind

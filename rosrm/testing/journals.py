@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 from unittest import SkipTest
 
-from rosrm.extensions.contracts import Intent, Journal, Record, StoredRecord
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Journal, Record, StoredRecord
 
 
 @dataclass
 class MemoryJournal:
-    """In-memory implementation of `rosrm.extensions.contracts.Journal`.
+    """In-memory implementation of `rosrm.model.records.Journal`.
 
     Attributes:
         stored: every record, oldest first.

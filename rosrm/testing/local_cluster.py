@@ -196,7 +196,7 @@ class LocalCluster:
             self.client.spin(_LOOK)
 
     def wait_for_hosts(self, timeout: float = 30.0) -> None:
-        """Wait until every slave has registered and asks for work."""
+        """Wait until every slave has registered and requests work."""
 
         def all_accept(view: Listing) -> bool:
             accepting = {row.description.name for row in view.hosts if row.accepting}
@@ -223,7 +223,7 @@ class LocalCluster:
     # --- begin and end -------------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        """Start everything and wait until every host asks for work."""
+        """Start everything and wait until every host requests work."""
         try:
             self.start_master()
             for host in self.hosts:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rosrm.extensions.contracts import Probe, ProbeContext, ProbeOffer
-from rosrm.extensions.registry import MadeProbe
+from rosrm.extensions.made import MadeProbe
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.values import EMPTY, Reading, ResourceDescription
 from rosrm.slave.sampler import read_values

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.master.scheduling.host_views import sound
+from rosrm.core.master.scheduling.host_views import checked_scores
 from rosrm.extensions.contracts import (
     BoolArray,
     FloatArray,
@@ -118,7 +118,7 @@ class ScoringContract:
 
         def ask() -> Scores:
             scores = policy.score(hosts, process)
-            sound(scores, hosts, np.ones(len(hosts.names), np.bool_))
+            checked_scores(scores, hosts, np.ones(len(hosts.names), np.bool_))
             return scores
 
         return call("score", CALL_LIMIT, ask)

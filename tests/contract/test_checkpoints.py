@@ -54,8 +54,8 @@ def test_apart_comes_first():
     assert choose(view(hosts=near), apart_by="rack").hosts in {("h2",), ("h4",)}
 
 
-def test_another_that_is_apart_takes_over_from_a_keeper_that_is_not():
-    """When it comes up, the state goes there."""
+def test_a_replica_moves_to_a_host_that_is_apart():
+    """A host with another label replaces the host with the same label, once it is up."""
     choice = choose(view(kept_on=("h2",)), apart_by="rack")
     assert HOSTS[choice.hosts[0]]["rack"] == "1"
 

@@ -1,7 +1,7 @@
 """Master and slave are killed while a process is checkpointed or restored.
 
-Who is killed with SIGKILL is started again, as its service manager would. Afterwards the process
-runs or waits in its image; whichever, it can be asked for the other, and it counts on by one each.
+The killed part is started again, as its service manager would do. Afterwards the process runs or is
+checkpointed, the other state can be requested, and no count is missing or repeated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tests.ros.clusters import MIB, PATIENCE, host, python, wait_until
 
 pytestmark = pytest.mark.timeout(180)
 
-#: What lies on the disk of the host at a moment of a checkpoint or a restore.
+#: Files of the host that mark a moment of a checkpoint or a restore.
 _SIGNS = {
     "dump": "kept-*", "kept": "kept-*/manifest.json", "taken": "in-*/manifest.json",
     "restored": f"in-*/{restore_result.FILE}",
@@ -47,7 +47,7 @@ class Scene:
         )
         self.cluster.submit(python("p", code))
         self.cluster.wait("p", "running")
-        self.goes_on()
+        self.check_counts()
 
     @property
     def images(self) -> Path:
@@ -57,15 +57,15 @@ class Scene:
         lines = self.numbers_file.read_text().splitlines(True) if self.numbers_file.exists() else []
         return [int(line) for line in lines if line.endswith("\n")]
 
-    def goes_on(self) -> None:
-        """It counts, and has left out or repeated nothing so far."""
+    def check_counts(self) -> None:
+        """Check that the process counts, and that no number is missing or repeated."""
         seen = len(self.numbers())
         wait_until(lambda: len(self.numbers()) > seen + 10, "numbers")
         found = self.numbers()
         assert found == list(range(1, len(found) + 1))
 
     def be(self, state: str) -> None:
-        """Bring it there, by the commands."""
+        """Bring the process into a state, by requests."""
         row = self.cluster.wait("p", "running", "checkpointed")
         if row.state != state:
             self.ask("checkpoint" if state == "checkpointed" else "restore")
@@ -93,7 +93,7 @@ class Scene:
             time.sleep(0.001)
 
     def kill(self, victim: str) -> None:
-        """SIGKILL, and what a service manager does then."""
+        """Kill a part by SIGKILL, and start it again as a service manager does."""
         part = self.cluster.master if victim == "master" else self.cluster.slaves["robot"]
         part.end(signal.SIGKILL)
         part.process.wait(PATIENCE)
@@ -104,7 +104,7 @@ class Scene:
             self.cluster.start_slave(self.cluster.hosts[0])
 
     def end(self) -> str:
-        """How it has ended: the kind of the event."""
+        """Return the kind of the event that ended the action."""
         deadline = time.monotonic() + 120.0
         while True:
             events = self.cluster.events(process="p", after=self._before)
@@ -125,8 +125,8 @@ def scene(make_shared, tmp_path_factory):
 
 @pytest.mark.parametrize("victim", ["master", "slave"])
 @pytest.mark.parametrize("moment", ["dump", "kept", "taken", "restored"])
-def test_one_who_carries_it_out_is_killed(criu, scene, victim, moment):
-    """The process counts on, then or once it is restored; it is there once, or in one image."""
+def test_a_checkpoint_or_restore_survives_the_kill_of_a_part(criu, scene, victim, moment):
+    """There is one instance or one image afterwards, and the counts continue."""
     action = "checkpoint" if moment in ("dump", "kept") else "restore"
     scene.be("running" if action == "checkpoint" else "checkpointed")
     scene.ask(action)
@@ -140,4 +140,4 @@ def test_one_who_carries_it_out_is_killed(criu, scene, victim, moment):
     assert len(held) == (row.state == "checkpointed")
     scene.cluster.wait_for_hosts()
     scene.be("running")
-    scene.goes_on()
+    scene.check_counts()

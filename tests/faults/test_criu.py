@@ -20,7 +20,7 @@ from rosrm.model.values import HostLossPolicy
 from rosrm_criu.engine import restore_result
 from tests.faults.handoff_watcher import instances
 from tests.ros.clusters import PATIENCE
-from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
+from tests.ros.portable_kit import NAME, Listener, ask, counter, nothing_left, two_hosts
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -40,18 +40,18 @@ class Scene:
 
     def __init__(self, make, lease: float = LivenessSettings().lease, **fields) -> None:
         self.cluster = two_hosts(make, liveness=LivenessSettings(lease=lease))
-        self.ear = Ear(self.cluster.domain)
+        self.listener = Listener(self.cluster.domain)
         self.cluster.submit(counter(options={"max_rate": _SLOWLY}, **fields))
         self._source = self._number = 0
         self.source = ""
 
     def close(self) -> None:
-        self.ear.close()
+        self.listener.close()
 
     def move(self, moment: str) -> None:
         """Begin a migration, and return at one of its moments."""
         row = self.cluster.wait(NAME, "running")
-        self.ear.hear(20)
+        self.listener.receive(20)
         self.source, self._number = row.host, row.number
         self._before = self.cluster.client.list().last_sequence
         left = set(self._signs(moment))  # of earlier migrations
@@ -114,7 +114,7 @@ class Scene:
             self.cluster.client.spin(0.1)
         assert len(ends) == 1, ends
         row = self.cluster.wait(NAME, "running")
-        self.ear.hear(30)
+        self.listener.receive(30)
         assert set(instances(self.cluster, NAME)) == {row.number}
         self.cluster.wait_for_hosts()
         nothing_left(self.cluster, but=but)
@@ -160,8 +160,8 @@ def test_the_master_or_a_slave_is_killed(criu, scene, victim, moment):
     scene.move(moment)
     scene.kill(victim)
     scene.end()
-    assert min(scene.ear.steps()) > 0
-    assert len(scene.ear.checksums) == 1
+    assert min(scene.listener.steps()) > 0
+    assert len(scene.listener.checksums) == 1
 
 
 @pytest.mark.parametrize("moment", ["restore", "join"])
@@ -170,8 +170,8 @@ def test_the_destination_is_killed(criu, scene, moment):
     scene.move(moment)
     scene.kill("destination")
     if scene.end() == "stayed":
-        assert min(scene.ear.steps()) > 0
-    scene.ear.forget()
+        assert min(scene.listener.steps()) > 0
+    scene.listener.forget()
 
 
 def test_the_source_is_killed_in_its_dump(criu, scene):
@@ -179,7 +179,7 @@ def test_the_source_is_killed_in_its_dump(criu, scene):
     scene.move("checkpoint")
     scene.kill("source")
     assert scene.end() == "stayed"
-    scene.ear.forget()
+    scene.listener.forget()
 
 
 def test_the_source_is_killed_once_its_image_is_restored(criu, scene):
@@ -187,8 +187,8 @@ def test_the_source_is_killed_once_its_image_is_restored(criu, scene):
     scene.move("join")
     scene.kill("source")
     assert scene.end() == "migrated"
-    assert min(scene.ear.steps()) > 0
-    assert len(scene.ear.checksums) == 1
+    assert min(scene.listener.steps()) > 0
+    assert len(scene.listener.checksums) == 1
 
 
 @pytest.mark.parametrize("moment", ["fetch", "restore"])
@@ -196,11 +196,11 @@ def test_the_destination_s_host_is_switched_off(criu, scene, moment):
     """Before the commit the source continues, at the latest when that host counts as lost."""
     scene.move(moment)
     name = scene.switch_off("destination")
-    scene.ear.hear(20, 90.0)
+    scene.listener.receive(20, 90.0)
     scene.switch_on(name)
     # Its next slave gives the image two minutes: it cannot know that the migration has ended.
     assert scene.end(but=name) == "stayed"
-    assert min(scene.ear.steps()) > 0
+    assert min(scene.listener.steps()) > 0
 
 
 @pytest.mark.parametrize(
@@ -211,8 +211,8 @@ def test_a_host_with_host_loss_elsewhere_is_switched_off(criu, restless, victim,
     scene = restless
     scene.move(moment)
     name = scene.switch_off(victim)
-    scene.ear.forget()
-    scene.ear.hear(50, 90.0)
+    scene.listener.forget()
+    scene.listener.receive(50, 90.0)
     row = scene.cluster.wait(NAME, "running")
     assert row.host == _OTHER[name]
     assert not scene.cluster.events("migration_stuck", process=NAME)
@@ -220,5 +220,5 @@ def test_a_host_with_host_loss_elsewhere_is_switched_off(criu, restless, victim,
     # Its next slave keeps the fetched image for two minutes.
     scene.end(but=name)
     assert scene.cluster.wait(NAME, "running").number == row.number
-    assert min(scene.ear.steps()) > 0
-    scene.ear.forget()
+    assert min(scene.listener.steps()) > 0
+    scene.listener.forget()

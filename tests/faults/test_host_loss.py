@@ -114,7 +114,7 @@ def test_a_standby_goes_on_from_the_last_state(make_cluster, how: str) -> None:
         cluster.submit(counter("moving", standby=StandbyPolicy(wanted=True)))
         primary = cluster.wait("moving", "running")
         cluster.wait_for_event("standby_ready", process="moving")
-        wait_until(lambda: len(watcher.outputs) > 50, "the primary is heard")
+        wait_until(lambda: len(watcher.outputs) > 50, "counts of the primary")
         if how == "process":
             os.kill(primary.pid, signal.SIGKILL)
         else:

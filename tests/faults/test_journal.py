@@ -12,9 +12,9 @@ import pytest
 
 from rosrm.config.settings import LivenessSettings
 from rosrm.errors import JournalError, NoMaster, Refused
-from rosrm.extensions.contracts import Intent
 from rosrm.journal.recovery import recover
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.records import Intent
 from tests.faults.disks import small_disk
 from tests.ros.clusters import alive, clusters, host, job, service
 from tests.waiting import PATIENCE, wait_gone, wait_until

@@ -9,7 +9,7 @@ import pytest
 from rosrm.testing.loopback import enter_private_network
 from tests.ros.clusters import STEADY, clusters
 from tests.ros.nodes import Stage
-from tests.ros.portable_kit import Ear
+from tests.ros.portable_kit import Listener
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -33,10 +33,10 @@ def make_shared(tmp_path_factory):
 
 
 @pytest.fixture
-def ear(cluster):
+def listener(cluster):
     """Yield a listener to the portable counters in the module's cluster."""
-    with closing(Ear(cluster.domain)) as ear:
-        yield ear
+    with closing(Listener(cluster.domain)) as listener:
+        yield listener
 
 
 @pytest.fixture

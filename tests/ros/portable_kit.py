@@ -33,7 +33,7 @@ def two_hosts(make: Make, **settings) -> Cluster:
     )  # fmt: skip
 
 
-class Ear:
+class Listener:
     """Receiver of the counts of portable counters, in a thread of its own."""
 
     def __init__(self, domain: int) -> None:
@@ -41,7 +41,7 @@ class Ear:
         rclpy.init(
             context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
-        self._node = rclpy.create_node("ear", context=self._context)
+        self._node = rclpy.create_node("listener", context=self._context)
         self._node.create_subscription(Int64MultiArray, "count", self._take, QoSProfile(depth=1000))
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -56,7 +56,7 @@ class Ear:
         if passes:
             self.checksums.add(checksum)
 
-    def hear(self, more: int, patience: float = PATIENCE) -> None:
+    def receive(self, more: int, patience: float = PATIENCE) -> None:
         """Wait for so many more counts, at most `patience` seconds."""
         wanted, deadline = len(self.counts) + more, time.monotonic() + patience
         while len(self.counts) < wanted:

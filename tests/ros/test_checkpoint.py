@@ -1,4 +1,4 @@
-"""Processes that are checkpointed and restored on their host, and who listens to them meanwhile."""
+"""Checkpoint and restore of processes on their host, seen by subscribers of their topics."""
 
 from __future__ import annotations
 
@@ -55,31 +55,31 @@ except BaseException:
 """
 
 
-class Ear:
-    """Hears what is counted: numbers, or arrays that begin with one."""
+class Listener:
+    """Subscriber of the counts: numbers, or arrays that begin with one."""
 
     def __init__(self, domain: int, kind: type = Int64) -> None:
         self._context = rclpy.Context()
         self._context.init(domain_id=domain)
-        self._node = rclpy.create_node("ear", context=self._context)
+        self._node = rclpy.create_node("listener", context=self._context)
         self._node.create_subscription(kind, "count", self._take, QoSProfile(depth=1000))
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.counts: list[int] = []
 
     def _take(self, message: Int64 | Int64MultiArray) -> None:
-        told = message.data
-        self.counts.append(told if isinstance(message, Int64) else told[0])
+        data = message.data
+        self.counts.append(data if isinstance(message, Int64) else data[0])
 
-    def hear(self, more: int) -> None:
-        """So many counts more."""
+    def receive(self, more: int) -> None:
+        """Wait for this number of further counts."""
         wanted, deadline = len(self.counts) + more, time.monotonic() + PATIENCE
         while len(self.counts) < wanted:
             assert time.monotonic() < deadline, f"{len(self.counts)} counts of {wanted}"
             self._executor.spin_once(0.1)
 
     def listen(self, seconds: float) -> None:
-        """Whatever comes."""
+        """Receive counts for some seconds."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             self._executor.spin_once(0.05)
@@ -91,7 +91,7 @@ class Ear:
 
 @pytest.fixture
 def cluster(make_cluster):
-    """One host."""
+    """Return a cluster of one host."""
     return make_cluster(
         host("robot"), liveness=STEADY,
         migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
@@ -100,10 +100,10 @@ def cluster(make_cluster):
 
 
 @pytest.fixture
-def ear(cluster) -> Iterator[Ear]:
-    ear = Ear(cluster.domain)
-    yield ear
-    ear.close()
+def listener(cluster) -> Iterator[Listener]:
+    listener = Listener(cluster.domain)
+    yield listener
+    listener.close()
 
 
 def counter(**fields) -> ProcessSpec:
@@ -112,7 +112,7 @@ def counter(**fields) -> ProcessSpec:
 
 
 def ask(cluster, action: str, name: str) -> None:
-    """Once its host has said whether it can."""
+    """Request an action as soon as the host has reported its capabilities."""
     deadline = time.monotonic() + PATIENCE
     while True:
         try:
@@ -126,7 +126,7 @@ def ask(cluster, action: str, name: str) -> None:
 
 
 def checkpoint(cluster, name: str) -> ProcessRow:
-    """Of a process whose pids are gone then."""
+    """Checkpoint a process, and check that its pid is gone."""
     pid = cluster.process(name).pid
     ask(cluster, "checkpoint", name)
     row = cluster.wait(name, "checkpointed")
@@ -141,49 +141,49 @@ def restore(cluster, name: str) -> None:
     assert row.state == "running", row.reason
 
 
-def alone() -> None:
-    """Its participant is to speak UDP alone."""
+def require_udp() -> None:
+    """Skip the test where participants cannot be limited to UDP."""
     if os.environ.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4":
         pytest.skip("a network of its own, with UDPv4 alone, may not be made here")
 
 
 @pytest.mark.parametrize("away", [0.0, 5.0])
-def test_a_subscriber_hears_a_restored_node_go_on(criu, cluster, ear, away):
-    """By one each, twice in a row; who joins the graph meanwhile takes none of its ports."""
-    alone()
+def test_a_subscriber_receives_the_counts_of_a_restored_node(criu, cluster, listener, away):
+    """No count is missing after two restores; a node that joins before them takes no port of it."""
+    require_udp()
     cluster.submit(counter())
     cluster.wait("counter", "running")
-    ear.hear(50)
+    listener.receive(50)
     for _ in range(2):
         checkpoint(cluster, "counter")
-        ear.listen(away)
-        other = Ear(cluster.domain)
+        listener.listen(away)
+        other = Listener(cluster.domain)
         restore(cluster, "counter")
-        ear.hear(50)
+        listener.receive(50)
         other.close()
-    assert ear.counts == list(range(ear.counts[0], ear.counts[-1] + 1))
+    assert listener.counts == list(range(listener.counts[0], listener.counts[-1] + 1))
     cluster.cancel("counter")
 
 
-def test_a_restored_node_that_crashes_is_started_by_its_policy(criu, cluster, ear):
-    """It begins anew then: an image is for one life."""
-    alone()
+def test_the_restart_policy_restarts_a_restored_node_from_its_beginning(criu, cluster, listener):
+    """An image serves one restore, so after a crash the counts begin at 1 again."""
+    require_udp()
     cluster.submit(counter())
     cluster.wait("counter", "running")
-    ear.hear(10)
+    listener.receive(10)
     checkpoint(cluster, "counter")
     restore(cluster, "counter")
-    ear.hear(10)
+    listener.receive(10)
     os.kill(cluster.process("counter").pid, 9)
     deadline = time.monotonic() + PATIENCE
-    while all(before < after for before, after in pairwise(ear.counts)):
-        assert time.monotonic() < deadline, "it did not begin anew"
-        ear.listen(0.1)
+    while all(before < after for before, after in pairwise(listener.counts)):
+        assert time.monotonic() < deadline, "no count was lower than the one before"
+        listener.listen(0.1)
     cluster.cancel("counter")
 
 
 def rosrm(cluster, *words: str) -> subprocess.CompletedProcess:
-    """The command, a participant of this very host."""
+    """Run a command of rosrm, which joins the ROS graph on this host."""
     environment = {**os.environ, "ROS_DOMAIN_ID": str(cluster.domain), "COLUMNS": "200"}
     return subprocess.run(
         [sys.executable, "-m", "rosrm.cli", *words],
@@ -191,12 +191,12 @@ def rosrm(cluster, *words: str) -> subprocess.CompletedProcess:
     )  # fmt: skip
 
 
-def test_the_commands_wait_until_it_is_done(criu, cluster, ear):
-    """They are participants on its host themselves, and take none of its ports."""
-    alone()
+def test_checkpoint_and_restore_with_wait_end_after_the_action(criu, cluster, listener):
+    """The commands join the graph on the same host, and take no port of the process."""
+    require_udp()
     cluster.submit(counter())
     cluster.wait("counter", "running")
-    ear.hear(20)
+    listener.receive(20)
     checkpoint(cluster, "counter")  # its host is known to be able
     restore(cluster, "counter")
     for action, said in (
@@ -205,23 +205,23 @@ def test_the_commands_wait_until_it_is_done(criu, cluster, ear):
     ):
         done = rosrm(cluster, action, "counter", "--wait")
         assert (done.returncode, said in done.stdout) == (0, True), done.stdout + done.stderr
-    ear.hear(20)
-    assert ear.counts == list(range(ear.counts[0], ear.counts[-1] + 1))
+    listener.receive(20)
+    assert listener.counts == list(range(listener.counts[0], listener.counts[-1] + 1))
     refused = rosrm(cluster, "restore", "counter", "--wait")
     assert refused.returncode != 0
     assert "only a checkpointed process is restored" in refused.stderr
     cluster.cancel("counter")
 
 
-def test_a_portable_node_moves_on_after_a_restore(criu, make_cluster):
-    """It is not asked to leave for a checkpoint, and can be for a move later."""
-    alone()
+def test_a_portable_node_can_migrate_after_a_restore(criu, make_cluster):
+    """A checkpoint does not ask the node to leave the graph; a later migration does."""
+    require_udp()
     cluster = make_cluster(
         host("left"), host("right"), liveness=STEADY,
         migration=MigrationSettings(strategies={"criu": {}}, automatic=False),
         defaults=ProcessDefaults(needs={"memory": MIB}),
     )  # fmt: skip
-    ear = Ear(cluster.domain, Int64MultiArray)
+    listener = Listener(cluster.domain, Int64MultiArray)
     try:
         cluster.submit(
             ProcessSpec(
@@ -230,38 +230,38 @@ def test_a_portable_node_moves_on_after_a_restore(criu, make_cluster):
             )
         )  # fmt: skip
         here = cluster.wait("p", "running").host
-        ear.hear(20)
+        listener.receive(20)
         ask(cluster, "checkpoint", "p")
         assert cluster.wait("p", "checkpointed").host == here
         restore(cluster, "p")
-        ear.hear(20)
-        assert ear.counts == list(range(ear.counts[0], ear.counts[-1] + 1))
+        listener.receive(20)
+        assert listener.counts == list(range(listener.counts[0], listener.counts[-1] + 1))
         ask(cluster, "migrate", "p")
         cluster.wait_for_event("migrated", process="p", timeout=2 * PATIENCE)
         assert cluster.wait("p", "running").host != here
-        ear.hear(20)
-        assert all(before < after for before, after in pairwise(ear.counts))
+        listener.receive(20)
+        assert all(before < after for before, after in pairwise(listener.counts))
         cluster.cancel("p")
     finally:
-        ear.close()
+        listener.close()
 
 
-def test_a_node_with_shared_memory_is_refused_with_what_to_set(criu, cluster, ear):
-    """Its peers would clear that away; it runs on."""
-    alone()
+def test_the_refusal_of_a_node_with_shared_memory_names_the_setting(criu, cluster, listener):
+    """Peers would remove the shared memory of a dumped node. The node keeps running."""
+    require_udp()
     cluster.submit(counter(environment={"FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}))
     cluster.wait("counter", "running")
-    ear.hear(10)
+    listener.receive(10)
     ask(cluster, "checkpoint", "counter")
     event = cluster.wait_for_event("checkpoint_failed", process="counter")
     assert "its ROS participant has shared memory (/dev/shm/fastrtps_" in event.message
     assert "`FASTDDS_BUILTIN_TRANSPORTS: UDPv4` in its `environment`" in event.message
-    ear.hear(10)
+    listener.receive(10)
     cluster.cancel("counter")
 
 
-def test_what_cannot_be_dumped_runs_on_and_says_why(criu, cluster, tmp_path):
-    """A Unix socket that is connected to a process outside of it."""
+def test_a_process_that_cannot_be_dumped_keeps_running(criu, cluster, tmp_path):
+    """The record gives the reason: a Unix socket connected to another process."""
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(tmp_path / "s"))
         server.listen()
@@ -284,7 +284,7 @@ def test_what_cannot_be_dumped_runs_on_and_says_why(criu, cluster, tmp_path):
 
 
 def test_an_image_outlives_slave_and_master(criu, cluster):
-    """It lies on its host, and its process waits there; cancelled, it is removed."""
+    """A checkpointed process stays on its host; a cancel removes its image."""
     count = (
         "import time\nn = 0\n"
         "while True:\n    n += 1\n    print(n, flush=True)\n    time.sleep(0.01)\n"
@@ -304,15 +304,15 @@ def test_an_image_outlives_slave_and_master(criu, cluster):
     restore(cluster, "plain")
     cluster.wait_for_log("plain", "\n")
     first = int(cluster.log("plain").split()[0])
-    assert first > 20, "it has begun anew"
+    assert first > 20, "the count began again"
     images = cluster.directory / "hosts" / "robot" / "images"
     assert list(images.glob("kept-*"))
     cluster.cancel("unwanted", "plain")
     wait_until(lambda: not list(images.glob("kept-*")), "the removal of the image")
 
 
-def test_without_criu_the_refusal_says_so(make_cluster, monkeypatch, tmp_path):
-    """And what to do; the process runs on."""
+def test_a_checkpoint_is_refused_on_a_host_without_criu(make_cluster, monkeypatch, tmp_path):
+    """The process keeps running."""
     monkeypatch.setenv("ROSRM_CRIU", str(tmp_path / "none"))
     cluster = make_cluster(
         host("robot"), migration=MigrationSettings(strategies={"criu": {}}, automatic=False)

@@ -25,34 +25,34 @@ def moved(cluster, times: int):
     return next(row for row in view.processes if row.state == "running")
 
 
-def test_a_node_counts_on_where_it_is_restored(criu, cluster, ear):
+def test_a_node_counts_on_where_it_is_restored(criu, cluster, listener):
     """Over several migrations no count is repeated or missing, and the memory is the same."""
     cluster.submit(counter())
     cluster.wait(NAME, "running")
-    ear.hear(50)
+    listener.receive(50)
     for times in (1, 2, 3):
         before = cluster.process(NAME).host
         assert not ask(cluster)
         row = moved(cluster, times)
         assert row.host != before
-        ear.hear(50)
+        listener.receive(50)
     # A reader that discovers the writer late misses its first counts.
-    steps = ear.steps()
+    steps = listener.steps()
     assert min(steps) == 1
     assert sum(step > 1 for step in steps) <= 3
-    assert len(ear.checksums) == 1
+    assert len(listener.checksums) == 1
     cluster.cancel(NAME)
     nothing_left(cluster)
 
 
-def test_it_is_healthy_where_it_is_restored(criu, cluster, ear):
+def test_it_is_healthy_where_it_is_restored(criu, cluster, listener):
     """The health watch knows its topic, although the node has another pid in its namespace."""
     cluster.submit(counter(health=Health("count", rate=10.0, timeout=3.0)))
     cluster.wait(NAME, "running")
-    ear.hear(50)
+    listener.receive(50)
     assert not ask(cluster)
     moved(cluster, 1)
-    ear.hear(300)  # twice the timeout of the health watch
+    listener.receive(300)  # twice the timeout of the health watch
     row = cluster.process(NAME)
     assert (row.state, row.restarts, row.migrations) == ("running", 0, 1)
     cluster.cancel(NAME)

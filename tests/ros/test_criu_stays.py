@@ -24,27 +24,27 @@ def cluster(make_shared):
 
 
 @pytest.fixture
-def running(criu, cluster, ear):
+def running(criu, cluster, listener):
     """Yield a function that starts a counter; cancel it after the test."""
 
     def start(*arguments: str, **fields) -> str:
         cluster.submit(counter(*arguments, **fields))
         row = cluster.wait(NAME, "running")
-        ear.hear(10)
+        listener.receive(10)
         return row.host
 
     yield start
     cluster.cancel(NAME)
 
 
-def stayed(cluster, ear) -> str:
+def stayed(cluster, listener) -> str:
     """Return the reason of a failed migration; the node counts on, and nothing of it is left."""
     before = cluster.client.list().last_sequence
     assert not ask(cluster)
     event = cluster.wait_for_event("stayed", process=NAME, after=before, timeout=60.0)
     cluster.wait(NAME, "running")
-    ear.hear(30)
-    assert min(ear.steps()) == 1
+    listener.receive(30)
+    assert min(listener.steps()) == 1
     nothing_left(cluster)
     return event.message
 
@@ -58,7 +58,7 @@ def stayed(cluster, ear) -> str:
     ],
 )
 def test_a_host_without_a_criu_that_works_gets_nothing(
-    which, reason, cluster, ear, running, request, monkeypatch, tmp_path
+    which, reason, cluster, listener, running, request, monkeypatch, tmp_path
 ):
     """The request is refused with the reason, which is an event since the host registered."""
     program = tmp_path / "criu"
@@ -74,41 +74,41 @@ def test_a_host_without_a_criu_that_works_gets_nothing(
     assert str(program) in refusal or which != "none"
     absent = cluster.wait_for_event("strategy_absent", host=which)
     assert reason in absent.message
-    ear.hear(30)
-    assert set(ear.steps()) == {1}
+    listener.receive(30)
+    assert set(listener.steps()) == {1}
     part = cluster.slaves.pop(which)
     part.end(signal.SIGINT)
     part.process.wait(PATIENCE)
 
 
-def test_there_is_no_working_directory_at_the_destination(cluster, ear, running, tmp_path):
+def test_there_is_no_working_directory_at_the_destination(cluster, listener, running, tmp_path):
     """The error precedes the request to leave: no count is late."""
     place = tmp_path / "place"
     place.mkdir()
     running(working_directory=str(place))
     place.rmdir()
-    why = stayed(cluster, ear)
+    why = stayed(cluster, listener)
     assert f"its working directory {place} does not exist on" in why
     assert why.endswith("make it")
-    assert set(ear.steps()) == {1}
+    assert set(listener.steps()) == {1}
 
 
-def test_the_destination_has_no_room(cluster, ear, running):
+def test_the_destination_has_no_room(cluster, listener, running):
     """The reserve at the destination is larger than the free space."""
     running(options={"reserve": 10**15})
-    why = stayed(cluster, ear)
+    why = stayed(cluster, listener)
     assert "do not fit beside" in why
     assert f"{10**15} are to stay free" in why
 
 
-def test_an_image_that_was_damaged_is_not_restored(cluster, ear, running):
+def test_an_image_that_was_damaged_is_not_restored(cluster, listener, running):
     """A file is cut short before the restore; afterwards both ends have no image."""
     source = running()
     other = {"left": "right", "right": "left"}[source]
     images = cluster.directory / "hosts" / other / "images"
     cutter = threading.Thread(target=cut_short, args=(images,))
     cutter.start()
-    why = stayed(cluster, ear)
+    why = stayed(cluster, listener)
     cutter.join(PATIENCE)
     assert "is damaged: criu/core-" in why
     assert "bytes instead of" in why
@@ -124,15 +124,15 @@ def cut_short(images: Path) -> None:
         time.sleep(0.001)
 
 
-def test_a_process_with_a_pipe_to_another_one_is_not_dumped(cluster, ear, running):
+def test_a_process_with_a_pipe_to_another_one_is_not_dumped(cluster, listener, running):
     """The error names the descriptor and the process at the other end."""
     running("pipe", command=(sys.executable, TROUBLED))
-    why = stayed(cluster, ear)
+    why = stayed(cluster, listener)
     assert "is a pipe that it shares with pid" in why
     assert "(cat)" in why
 
 
-def test_a_node_that_hangs_in_a_callback_is_left_alone(cluster, ear, running, tmp_path):
+def test_a_node_that_hangs_in_a_callback_is_left_alone(cluster, listener, running, tmp_path):
     """The timeout is that of the option; after its callback the node runs as before."""
     block = tmp_path / "block"
     running("hangs", str(block), command=(sys.executable, TROUBLED), options={"leave_timeout": 1.0})
@@ -143,8 +143,8 @@ def test_a_node_that_hangs_in_a_callback_is_left_alone(cluster, ear, running, tm
     assert "the node has not left the ROS graph within 1 s" in event.message
     assert "a callback may be taking its time" in event.message
     block.unlink()
-    ear.hear(30)
-    assert set(ear.steps()) == {1}
+    listener.receive(30)
+    assert set(listener.steps()) == {1}
     nothing_left(cluster)
 
 

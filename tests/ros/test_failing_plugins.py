@@ -262,7 +262,7 @@ def test_a_probe_that_fails_is_stale_never_zero(cluster, name) -> None:
     """A failing probe stops new work, until it works, only where its resource has a limit."""
     works, waits, limited = f"works-{name}", f"waits-{name}", f"limited-{name}"
     assert cluster.run(job(works, "true"))[0].state == "finished"
-    wait_until(lambda: name in cluster.log_of("h0"), f"a word of h0 about {name}")
+    wait_until(lambda: name in cluster.log_of("h0"), f"a log line of h0 about {name}")
     assert "Traceback" not in cluster.log_of("h0")
 
     part = cluster.start_slave(host(limited, probes=probes(name), limits={name: 0.9}))

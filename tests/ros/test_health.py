@@ -299,11 +299,11 @@ def test_another_type_is_followed(stage) -> None:
     """The slave subscribes again when a publisher returns with another type."""
     listener = Listener(stage, rate=5.0)
     first = stage.plain.create_publisher(String, "/scan", 1)
-    listener.look_until(lambda look: look[0] is not None, "the first is heard")
+    listener.look_until(lambda look: look[0] is not None, "a message of the first")
     stage.plain.destroy_publisher(first)
     listener.look_until(lambda look: "not published" in look[1], "it is gone")
     stage.plain.create_publisher(Int64, "/scan", 1)
-    listener.look_until(lambda look: look[0] is not None, "the second is heard")
+    listener.look_until(lambda look: look[0] is not None, "a message of the second")
     listener.ear.close()
 
 

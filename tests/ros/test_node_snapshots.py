@@ -214,7 +214,7 @@ def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_
     """A snapshot also has the unchanged parts that were published before, e.g. parameters."""
     marks = stage.listen(StateMark, "/counter/_rosrm/mark", MARK)
     first = stage.instance(Counter, 1, keep=tmp_path)
-    stage.spin_until(lambda: marks and first.count >= 5, "five counts that somebody follows")
+    stage.spin_until(lambda: marks and first.count >= 5, "five counts and a follower of the state")
     at = first._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, at), "a kept state")
 

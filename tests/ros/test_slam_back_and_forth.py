@@ -60,7 +60,7 @@ def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
     with closing(Observer(cluster.ros)) as observer:
         cluster.submit(slam(out))
         cluster.wait("slam", "running")
-        wait_until(observer.publishers, "the SLAM is heard")
+        wait_until(observer.publishers, "a publisher of the SLAM")
         cluster.submit(player(drive, hz, report))
         wait_until(lambda: len(observer.received) >= 2, "the first scans are mapped")
         for moves in range(1, MOVES + 1):

@@ -112,7 +112,7 @@ def test_the_help_needs_no_ros_and_begins_with_the_groups_of_names(monkeypatch):
     for module in ("rclpy", "rosrm_msgs"):
         monkeypatch.setitem(sys.modules, module, None)
     text = pydoc.render_doc(rosrm, renderer=pydoc.plaintext)
-    assert text.index("The public names, by what they are for:") < text.index("CLASSES")
+    assert text.index("The public names, by purpose:") < text.index("CLASSES")
     assert "class Client(" in text
 
 

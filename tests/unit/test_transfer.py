@@ -40,8 +40,8 @@ def test_an_offer_survives_its_way_as_json():
     assert Offer.from_json(OFFER.as_json()) == OFFER
 
 
-def test_the_token_is_in_no_representation():
-    """What is logged or shown of an offer does not open it."""
+def test_the_representation_of_an_offer_has_no_token():
+    """A logged offer does not allow a fetch."""
     assert "secret" not in repr(OFFER)
 
 
@@ -256,8 +256,8 @@ def test_without_an_end_nothing_stays(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_fetch_has_left_is_removed_and_what_lives_is_not(tmp_path):
-    """The lock tells them apart; and files of other names are nobody's business."""
+def test_the_directory_of_a_killed_fetch_is_removed_and_a_used_one_is_kept(tmp_path):
+    """A lock marks a directory in use; files of other names stay."""
     stale = Path(tempfile.mkdtemp(prefix=".rosrm-fetch-", dir=tmp_path))
     (stale / "file").write_bytes(b"1")
     (tmp_path / "other").mkdir()
@@ -352,3 +352,11 @@ def test_who_starts_a_transfer_loads_nothing_of_its_libraries():
 def test_a_python_that_cannot_check_archives_is_refused(monkeypatch):
     monkeypatch.delattr(tarfile, "data_filter")
     assert "needs 3.10.12" in starting.missing()
+
+
+def test_a_transfer_killed_within_its_answer_is_reported():
+    """Half a line is no answer."""
+    end = starting._End.__new__(starting._End)
+    end._process = subprocess.Popen(["printf", '{"error": "the'], stdout=subprocess.PIPE)
+    with end._process, pytest.raises(TransferError, match="no answer"):
+        end._answer(5.0)

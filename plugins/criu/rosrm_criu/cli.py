@@ -54,8 +54,8 @@ def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
         json_forms.show({"program": program, "no_transfer": lacking, **asdict(able)})
     else:
         sent = (not lacking, "to other hosts", lacking or "images can be sent and fetched")
-        for good, what, said in [*_lines(found, able), sent]:
-            typer.echo(f"{'ok' if good else 'NO':4}{what:18}{said}")
+        for good, what, text in [*_lines(found, able), sent]:
+            typer.echo(f"{'ok' if good else 'NO':4}{what:18}{text}")
     if lacking or not able.works:
         raise typer.Exit(1)
 
@@ -86,13 +86,13 @@ def _lines(found: CriuBinary | None, able: CriuSupport) -> list[tuple[bool, str,
     whose = "every user" if facts["all_users"] == "yes" else f"the user {facts['uid']} alone"
     enough = found.number >= OLDEST
     wanted = "" if enough else f" ({'.'.join(map(str, OLDEST))} or newer is meant)"
-    said = "a process with a UDP socket was dumped, restored and went on" if able.works else ""
+    text = "a process with a UDP socket was dumped, restored and went on" if able.works else ""
     python = f"{facts['python']} ({facts['python_version']}), {facts['libc']}"
     return [
         (True, "program", found.command[0]),
         (enough, "version", found.version + wanted),
         (True, "processes", f"of {whose}"),
-        (able.works, "dump and restore", said or able.reason),
+        (able.works, "dump and restore", text or able.reason),
         (True, "kernel", f"{facts['kernel']} on {facts['machine']}"),
         (
             True,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rosrm_criu.options import CriuOptions
 
 #: Executors of a migration; see `executors/move.py`.
-ABILITY: Final = "criu_ability"
+HOST_CHECK: Final = "criu_host_check"
 INTRODUCE: Final = "criu_introduce"
 CHECKPOINT: Final = "criu_checkpoint"
 GO_ON: Final = "criu_go_on"
@@ -42,7 +42,7 @@ RUN_ON: Final = "criu_run_on"
 KILL: Final = "criu_kill"
 TAKE: Final = "criu_take"
 PUT_BACK: Final = "criu_put_back"
-AWAIT_KEPT: Final = "criu_await_kept"
+AWAIT_CHECKPOINT: Final = "criu_await_checkpoint"
 DROP: Final = "criu_drop"
 #: Executors of periodic checkpoints; see `executors/periodic.py`.
 DUMP: Final = "criu_dump"
@@ -163,7 +163,7 @@ def restore_plan(move: Move, options: CriuOptions) -> Plan:
             execute(move, here, TAKE, options.start_timeout, undo=put_back),
             # No undo, because a stop would end a process that may no longer have an image.
             Start(move.destination, here, options.start_timeout, alias, restored=True),
-            execute(move, here, AWAIT_KEPT, options.restore_timeout),
+            execute(move, here, AWAIT_CHECKPOINT, options.restore_timeout),
             Commit(),
             SetRestart(move.destination, here, move.spec.restart, options.start_timeout),
         )

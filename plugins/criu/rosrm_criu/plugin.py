@@ -17,7 +17,7 @@ Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 #: Function of each step, below `rosrm_criu.executors`.
 EXECUTORS: Final = {
-    plans.ABILITY: "move.report_capability",
+    plans.HOST_CHECK: "move.report_capability",
     plans.INTRODUCE: "move.introduce",
     plans.CHECKPOINT: "move.checkpoint",
     plans.GO_ON: "move.go_on",
@@ -30,7 +30,7 @@ EXECUTORS: Final = {
     plans.KILL: "checkpoint.kill",
     plans.TAKE: "checkpoint.take",
     plans.PUT_BACK: "checkpoint.put_back",
-    plans.AWAIT_KEPT: "checkpoint.await_kept",
+    plans.AWAIT_CHECKPOINT: "checkpoint.await_checkpoint",
     plans.DROP: "checkpoint.drop",
     plans.DUMP: "periodic.dump",
     plans.SWEEP: "periodic.sweep",

@@ -13,7 +13,7 @@ from rosrm import Execute, InstanceId, Move, Plan, ProcessSpec, options_of
 from rosrm_criu.engine.compatibility import mismatch
 from rosrm_criu.options import CriuOptions, OwnCriuOptions
 from rosrm_criu.plans import (
-    ABILITY,
+    HOST_CHECK,
     SWEEP,
     checkpoint_plan,
     move_plan,
@@ -29,9 +29,9 @@ class Criu:
         self._options = options
 
     @property
-    def ability(self) -> str:
+    def host_check(self) -> str:
         """Name the executor that tests CRIU on a host."""
-        return ABILITY
+        return HOST_CHECK
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         """Return the reason why an image of one host cannot be restored on another; "": it can."""

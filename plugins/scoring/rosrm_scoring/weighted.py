@@ -99,8 +99,8 @@ class WeightedSum:
         for name, weight in self._weights.items():
             if name in hosts.resources:
                 usage = float(hosts.usage[row, hosts.resources.index(name)])
-                said = f"{usage:.1%}"
+                shown = f"{usage:.1%}"
                 if np.isnan(usage):
-                    said = f"{self._missing:.1%} (not measured there)"
-                terms.append(f"{weight:g} x {name} {said}")
+                    shown = f"{self._missing:.1%} (not measured there)"
+                terms.append(f"{weight:g} x {name} {shown}")
         return " + ".join(terms) or "no resource that weighs is read on any host"

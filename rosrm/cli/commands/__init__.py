@@ -3,8 +3,8 @@
 ======  ===========================================================
 exit    when
 ======  ===========================================================
-0       it was done
-1       it was refused, or failed
+0       the command succeeded
+1       the master refused the request, or the command failed
 2       a file, option or argument is wrong; nothing was done
 3       no master (or slave) answered
 130     Ctrl-C
@@ -98,7 +98,7 @@ def common(
             "--cluster",
             metavar="FILE",
             envvar="ROSRM_CLUSTER",
-            help="A cluster.yaml; its section `ros` is used to reach the master.",
+            help="A cluster.yaml; its section `ros` has the settings to reach the master.",
         ),
     ] = None,
     version: Annotated[
@@ -108,7 +108,7 @@ def common(
         ),
     ] = False,
 ) -> None:
-    """Decides on which host each process of a ROS 2 application runs, and keeps it running."""
+    """Place the processes of a ROS 2 application on hosts, and keep them running."""
     del version  # handled by its callback
     ctx.obj = CommonOptions(domain, cluster)
 

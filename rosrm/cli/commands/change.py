@@ -1,6 +1,6 @@
 """Commands that change processes or hosts, from `submit` to `prune`."""
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ Timeout = Annotated[
         "--timeout", metavar="TIME", help="With --wait: maximum wait, e.g. 5min; default: no limit."
     ),
 ]
-#: Endings of file names. A process name has no slash, and a name with such an ending is taken
-#: for a file.
+#: Endings of file names: an argument with such an ending, or with a slash, is a file.
 _FILE_ENDINGS: Final = (".yaml", ".yml")
 
 
@@ -81,7 +80,7 @@ def cancel(
     timeout: Timeout = "",
     domain: Domain = None,
 ) -> None:
-    """Cancel processes: take them out of the queue, or stop them for good.
+    """Cancel processes: remove them from the queue, or stop them for good.
 
     For a work file, all its processes that have not ended are cancelled.
     """
@@ -192,7 +191,9 @@ def _with_ending(
         since = client.list().last_sequence if wait else 0
         echo(ask(client))
         if wait:
-            with interruptible(f"the request for {name} continues (`rosrm events --process`)"):
+            with interruptible(
+                f"the request for {name} continues (`rosrm events --process {name}`)"
+            ):
                 show_end(
                     client.wait_for_migration(
                         name, after=since, timeout=limit, on_change=show_change

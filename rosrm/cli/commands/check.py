@@ -1,6 +1,6 @@
 """Command `rosrm config check`: validation of configuration files before use."""
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig, HostConfig
     from rosrm.extensions.registry import Registry
 
-#: Lowest similarity of a misspelt word; gpu_memory and memory are less similar.
+#: Lowest similarity of a misspelt word; `gpu_memory` and `memory` are less similar.
 _NEAR: Final = 0.8
 
 config = typer.Typer(no_args_is_help=True, help="Check configuration files.")
@@ -97,7 +97,7 @@ def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
     A probe that reports itself absent is no failure, because the file may be for another host.
     """
     from rosrm.extensions.contracts import ProbeContext
-    from rosrm.extensions.registry import FailedProbe, close_quietly
+    from rosrm.extensions.made import FailedProbe, close_quietly
     from rosrm.slave.sessions import SessionTable
 
     context = ProbeContext(host.scope, host.budget, host.state, SessionTable())
@@ -115,17 +115,17 @@ def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
 
 def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     """Return a summary of a file; raises `ConfigError`."""
-    from rosrm.config.cluster import load_cluster
+    from rosrm.config.cluster import checked_cluster
     from rosrm.config.documents import read
-    from rosrm.config.host import load_host
+    from rosrm.config.host import checked_host
     from rosrm.config.kinds import kind_of
-    from rosrm.config.work import load_work
+    from rosrm.config.work import checked_work
     from rosrm.core.master.graph_names import node_of, shared_nodes
 
     root = read(file)
     match kind.value if kind else kind_of(root):
         case "cluster":
-            cluster = load_cluster(file, registry)
+            cluster = checked_cluster(root, file, registry)
             _make(file, cluster, registry)
             strategies = ", ".join(cluster.migration.strategies) or "none"
             return (
@@ -133,7 +133,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
                 f"checkpoint {cluster.checkpoint.policy or 'none'}"
             )
         case "host":
-            host = load_host(file, registry)
+            host = checked_host(root, file, registry)
             _make_probes(file, host, registry)
             probes = ", ".join(registry.default_probes() if host.probes is None else host.probes)
             return f"a host: {host.host}, probes {probes or 'none'}"
@@ -142,7 +142,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
         case _:
             for warning in _misspelt_needs(root, registry):  # also for a wrong file
                 echo(warning, err=True)
-            specs = load_work(file, registry)
+            specs = checked_work(root, file, registry)
             for warning in shared_nodes((spec.name, node_of(spec)) for spec in specs):
                 echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)

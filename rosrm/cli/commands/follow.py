@@ -1,6 +1,6 @@
 """Commands that can run until Ctrl-C: events, logs, top."""
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def events(  # noqa: PLR0917 - an argument for each option
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(events=True, process=process, host=host, newest=newest)
-        connection.say_trouble(snapshot)
+        connection.print_trouble(snapshot)
         if not snapshot.events:
             _check_names(client, process, host)
         console = tables.console()

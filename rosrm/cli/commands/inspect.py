@@ -1,6 +1,6 @@
 """Commands that print once: status, ps, hosts, plugins, explain."""
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(hosts=True, processes=True, plugins="failing", events=True, newest=5)
-    connection.say_trouble(snapshot)
+    connection.print_trouble(snapshot)
     if as_json:
         json_forms.show(json_forms.status_form(snapshot))
     else:
@@ -46,7 +46,7 @@ def ps(
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(processes=True, hosts=bool(host))
-    connection.say_trouble(snapshot)
+    connection.print_trouble(snapshot)
     check_name("host", host, [row.description.name for row in snapshot.hosts])
     shown = [row for row in snapshot.processes if not host or row.host == host]
     if as_json:
@@ -70,7 +70,7 @@ def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) ->
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(hosts=True)
-    connection.say_trouble(snapshot)
+    connection.print_trouble(snapshot)
     rows = snapshot.hosts
     if as_json:
         json_forms.show(json_forms.forms(rows))

@@ -1,10 +1,10 @@
 """Commands `rosrm master` and `rosrm slave`: check all settings, then execute the runtime.
 
-The runtime replaces this process and starts without pydantic, typer and rich, which it does not
-need. It reads the checked settings from an inherited file.
+The runtime replaces this process, imports neither pydantic nor typer nor rich, and reads the
+checked settings from an inherited file.
 """
 
-# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def slave(
             echo(f"nothing to stop: no slave was started with the state directory {settings.state}")
             return
         with only_one(settings.state, "slave", code="name_taken", remedy=""):
-            pass  # a running slave stops its processes itself
+            pass  # fails if a slave runs, which must stop its processes itself
         become("rosrm.slave.stop_all", settings.to_json())
         return
     if settings.probes is None:
@@ -122,7 +122,7 @@ def become(module: str, settings: str) -> None:
 def _without_this_folder() -> list[str]:
     """Return the option that stops `-m` from searching the working directory first.
 
-    In a checkout that search is wanted, so there the list is empty.
+    In a checkout that search is needed, so the list is empty.
     """
     in_checkout = Path(__file__).is_relative_to(Path.cwd())
     return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
@@ -131,7 +131,7 @@ def _without_this_folder() -> list[str]:
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
     chosen = ctx.ensure_object(CommonOptions).domain if domain is None else domain
     settings = settings if chosen is None else replace(settings, domain=chosen)
-    settings.check_domain()
+    settings.check()
     return settings
 
 

@@ -20,7 +20,7 @@ _DECIDED: Final = {
     "set_aside": "No host may take {process}",
 }
 _STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "full": "yellow"}
-#: Decimals of a score: more are the rounding errors of a sum, such as 1.4e-17.
+#: Decimals of a score; further ones are rounding errors of a sum, such as 1.4e-17.
 _DECIMALS: Final = 9
 _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 
@@ -33,7 +33,7 @@ def render(explanation: Mapping[str, Any]) -> RenderableType:
 def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield _headline(explanation)
     if explanation.get("kept"):
-        yield _kept(explanation["kept"])
+        yield _replicas(explanation["kept"])
     if explanation.get("checkpoint"):
         yield _checkpoint(explanation["checkpoint"])
     decision = explanation.get("decision")
@@ -65,7 +65,7 @@ def _headline(explanation: Mapping[str, Any]) -> Text:
     return text
 
 
-def _kept(replicas: list[Mapping[str, Any]]) -> Text:
+def _replicas(replicas: list[Mapping[str, Any]]) -> Text:
     """Return the hosts with a replica of the snapshot, and the cycle of each."""
     places = [
         f"{one['host']} (cycle {one['sequence']}, {size(one['size'])}, "

@@ -1,4 +1,4 @@
-"""Output of `--json`: the views unchanged, except a host with its description in one object."""
+"""Output of `--json`: the rows of listings; a host and its description are one object."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
 
 
 def form(row: HostRow | ProcessRow | EventRow | PluginRow) -> dict[str, Any]:
-    """Return a row as an object; that of a host has the members of its description."""
+    """Return a row as an object; the object of a host has the members of its description."""
     plain: dict[str, Any] = to_plain(row)
     return {**plain.pop("description", {}), **plain}
 
@@ -43,12 +43,12 @@ def show(value: Any) -> None:
 
 
 def show_line(value: Any) -> None:
-    """Print one JSON value on a line of its own."""
+    """Print one JSON value on one line."""
     echo(json.dumps(_finite(value)))
 
 
 def _finite(value: Any) -> Any:
-    """Replace NaN and infinity, which JSON lacks, by null for an unknown value."""
+    """Replace NaN and infinity, which JSON lacks, by null."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):

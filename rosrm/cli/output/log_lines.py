@@ -1,7 +1,7 @@
 """Output of `rosrm logs`: the bytes of one process, optionally with times and its name.
 
-Lines of rosrm's own begin with `---`: where a program starts another time, and what is missing.
-With several processes each start has such a line.
+rosrm adds lines that begin with `---`: one for each restart of the program, and one for dropped
+output. With several processes the first start has such a line, too.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rosrm.client.logs import LogChunk
 from rosrm.wording import printable, size
 
 Marks = Sequence[tuple[float, int, int]]
-#: Output, and the unix time by which it was written; 0.0: not known.
+#: Unix time by which the output was written, and the output; time 0.0: unknown.
 Piece = tuple[float, bytes]
 
 
@@ -37,11 +37,12 @@ class LogStream:
     """Output of one process in pieces.
 
     Attributes:
-        name: of the process.
-        prefix: begins each line; b"": no prefix, and bytes are copied as they are.
-        timestamps: each line begins with the time by which it was written, by its host's clock.
-        raw: control characters, e.g. of colours, are left as the process wrote them.
-        wrote: there was something to print.
+        name: name of the process.
+        prefix: beginning of each line; b"": no prefix, and bytes are copied unchanged.
+        timestamps: True: each line begins with the time by which it was written, by the clock of
+            its host.
+        raw: True: control characters, e.g. of colours, stay as the process wrote them.
+        wrote: True after the first output.
     """
 
     name: str
@@ -60,7 +61,7 @@ class LogStream:
     )
 
     def take(self) -> list[Piece]:
-        """Return the pieces that are ready, each once."""
+        """Return and clear the finished pieces."""
         pieces, self._pieces = self._pieces, []
         return pieces
 
@@ -86,13 +87,13 @@ class LogStream:
         self._is_new = self._is_new and not content
 
     def close(self) -> None:
-        """Add an unfinished line that waits for its end."""
+        """Complete an unfinished line."""
         if self._unfinished:
             self._line(self._unfinished + b"\n", self._when)
             self._unfinished = b""
 
     def _say(self, text: str, when: float) -> None:
-        """Add a line of rosrm's own; `when` gives its place among the lines of other processes."""
+        """Add a line of rosrm; `when` orders it among the lines of other processes."""
         self.close()
         if not self._at_line_start:
             self._add(b"\n")
@@ -131,7 +132,7 @@ class LogStream:
 
 
 def _stamp(when: float) -> str:
-    """Return a time in the local time zone; "?" for a log that was written without times."""
+    """Return a time in the local time zone; "?" if the time is unknown."""
     if when <= 0.0:
         return "?"
     return time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(when)) + f".{int(when * 10) % 10}"

@@ -1,4 +1,4 @@
-"""Output of `rosrm status`: the cluster on half a page."""
+"""Output of `rosrm status`: an overview of the cluster on half a page."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _failing(plugins: Iterable[PluginRow]) -> Iterator[Text]:
 
 
 def _first(lines: Sequence[Text], command: str) -> Iterator[Text]:
-    """Yield a paragraph with the first lines, and the command that shows the others."""
+    """Return a paragraph with the first lines, and the command that shows the others."""
     if lines:
         yield Text()
     yield from lines[:_MOST_NAMED]

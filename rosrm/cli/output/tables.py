@@ -63,7 +63,7 @@ def console() -> Console:
 
 
 def table(*columns: str, right: Sequence[str] = ()) -> Table:
-    """Return an empty table; the columns in `right` hold numbers, aligned at the right."""
+    """Return an empty table; the columns in `right` have numbers, aligned at the right."""
     made = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", show_edge=False)
     for column in columns:
         number = column in right
@@ -82,7 +82,7 @@ def show(renderable: RenderableType) -> None:
     with output.capture() as captured:
         output.print(renderable)
     output.file.write("".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
-    output.file.flush()  # here click turns a broken pipe into exit code 1
+    output.file.flush()  # in this call click turns a broken pipe into exit code 1
 
 
 def state(word: str) -> Text:
@@ -91,7 +91,7 @@ def state(word: str) -> Text:
 
 
 def sentence(name: str, word: str) -> Text:
-    """Return a process and its coloured state as the beginning of a sentence."""
+    """Return the beginning of a sentence: a process and its coloured state."""
     verb, _, rest = standing(word).partition(" ")
     return Text(f"{name} {verb} ").append(rest, STYLES.get(word, ""))
 
@@ -115,7 +115,7 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
 
 
 def age(row: ProcessRow, reading: str) -> Text:
-    """Return a reading of a process; an old one begins with `?`."""
+    """Return a reading of a process; a stale reading begins with `?`."""
     return Text(f"?{reading}", "dim") if row.stale and reading else Text(reading)
 
 

@@ -1,8 +1,8 @@
 """Live view: hosts with usage and limits, processes, queue, newest events.
 
-The view is a pure function of a `Listing` and the width; `rosrm top` and `make demo` show it. If
-room is short, reasons shrink first, then bars, and then columns are hidden; names stay whole. A
-reason that is too long loses the beginning that it shares with others, and then its end.
+The view is a pure function of a `Listing` and the width; `rosrm top` and `make demo` show it. In a
+narrow terminal reasons are cut first, then bars shrink, then columns are hidden; names stay whole.
+A reason is cut at the beginning that it shares with other reasons, and then at its end.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rosrm.cli.output import tables
 from rosrm.model.rows import HostRow, Listing, ProcessRow, ResourceRow
 from rosrm.wording import duration, percent, size, words
 
-#: Most processes in a view, if the height of the terminal is unknown.
+#: Highest number of processes in a view, if the height of the terminal is unknown.
 ROWS: Final = 18
 _BAR: Final = 14
 _LEAST_BAR: Final = 4
@@ -32,12 +32,12 @@ _MOST_RESOURCES: Final = 3
 #: Fraction of the limit from which a usage counts as near the limit.
 _NEAR: Final = 0.9
 _GAP: Final = 2
-#: Least useful width of a reason; a column is hidden to make room for it.
+#: Smallest useful width of a reason; a column is hidden if the reason would be narrower.
 _LEAST_REASON: Final = 20
 
-#: Resources that are shown first if there is too little room.
+#: Resources that are shown first, because a narrow terminal cuts the list.
 _FIRST: Final = ("memory", "cpu", "gpu", "disk")
-#: States in the order of interest; terminal ones come last.
+#: States in the order of the view: problems first, terminal states last.
 _ORDER: Final = (
     "stuck",
     "unreachable",
@@ -58,7 +58,7 @@ _ORDER: Final = (
 #: Beginnings of reasons that repeat the state.
 _BEGINNINGS: Final = {"set_aside": "no host may take it: "}
 _OVER: Final = ("failed", "cancelled", "finished")
-#: Columns of the processes that are hidden if room is short, in this order.
+#: Columns of the processes that are hidden in a narrow terminal, in this order.
 _LEAVE: Final = ("MEMORY", "CPU", "SINCE", "HOST")
 #: Columns of numbers.
 _RIGHT: Final = ("SINCE", "CPU", "MEMORY")
@@ -70,8 +70,8 @@ class TopView:
 
     Attributes:
         snapshot: listing with hosts and processes; its events are shown, if any.
-        rows: most processes shown.
-        events: most events shown.
+        rows: highest number of processes.
+        events: highest number of events.
         note: text beside the title.
         sort: order of the processes, a key of `SORTS`.
         foot: the last line.
@@ -238,7 +238,7 @@ def _why(row: ProcessRow) -> str:
 
 
 def _reasons(rows: Sequence[ProcessRow], room: int) -> list[str]:
-    """Return the reason of each process's state; too long ones begin where they differ."""
+    """Return the reason of each process's state, too long ones without their common beginning."""
     known = {row.reason for row in rows if cell_len(_why(row)) > room}
     return [
         _why(replace(row, reason=_without_beginning(row, known, room)))
@@ -249,12 +249,12 @@ def _reasons(rows: Sequence[ProcessRow], room: int) -> list[str]:
 
 
 def _without_beginning(row: ProcessRow, reasons: set[str], room: int) -> str:
-    """Return a reason from the word on at which it differs visibly from the other reasons."""
+    """Return a reason from the word at which it differs from the other reasons."""
     shared = max((_alike(row.reason, other) for other in reasons - {row.reason}), default=0)
     beginning = _BEGINNINGS.get(row.state, "")
     begin = len(beginning) if beginning and row.reason.startswith(beginning) else 0
     if shared > max(begin, room // 2):
-        enough = max(0, len(row.reason) - room)  # from there on the rest fits
+        enough = max(0, len(row.reason) - room)  # the rest from here fits
         begin = max(begin, row.reason.find(" ", min(shared - 1, enough)) + 1)
     return f"…{row.reason[begin:]}" if begin else row.reason
 
@@ -280,7 +280,7 @@ def _total(columns: Mapping[str, Sequence[Text]]) -> int:
 def _lines(
     columns: Mapping[str, Sequence[Text]], width: int, right: Sequence[str]
 ) -> Iterator[Text]:
-    """Lay out columns below their heads; too long cells are cut at the right end."""
+    """Return lines with columns below their heads; cut too long cells at the right."""
     widths = {head: _width(head, cells) for head, cells in columns.items()}
     heads = {head: Text(head, "bold") for head in columns}
     count = len(next(iter(columns.values())))

@@ -20,19 +20,19 @@ from rosrm.cli.output import tables, top
 from rosrm.errors import ConfigError, NoMaster
 from rosrm.model.rows import Listing
 
-#: Least seconds between two views.
+#: Shortest time between two views, in seconds.
 LEAST_PERIOD: Final = 0.1
 #: Sort order of each key.
 KEYS: Final = {"s": "state", "c": "cpu", "m": "memory", "n": "name"}
 _QUIT: Final = "q"
 _HINT: Final = "q quits; sort: s state, c CPU, m memory, n name"
-#: Lines that are not of hosts and processes: title (two), heads, events, hint and gaps.
+#: Lines beside those of hosts and processes: title (two), heads, events, hint and gaps.
 _OTHER_LINES: Final = 13
 _LEAST_ROWS: Final = 5
 
 
 def sort_of(text: str) -> str:
-    """Return the option --sort if there is such an order; raises `ConfigError`."""
+    """Return the option --sort; raises `ConfigError` for an unknown order."""
     if text not in top.SORTS:
         raise ConfigError(f"--sort: {text!r} is not one of {', '.join(top.SORTS)}")
     return text
@@ -42,9 +42,9 @@ def show(look: Callable[[], Listing], period: float, count: int, sort: str) -> N
     """Show views until q or Ctrl-C, or until `count` of them; 0: no limit.
 
     Args:
-        look: asks the master; raises `NoMaster`.
+        look: requests a listing from the master; raises `NoMaster`.
         period: seconds between two views.
-        count: of views.
+        count: number of views.
         sort: order of the processes.
     """
     console = tables.console()
@@ -89,7 +89,7 @@ def _look_again(look: Callable[[], Listing], before: Listing) -> tuple[Listing, 
 
 @contextlib.contextmanager
 def _keyboard() -> Iterator[Callable[[float], str]]:
-    """Read keys without echo; yield a function that waits so many seconds for a key."""
+    """Read keys without echo; yield a function that waits up to some seconds for a key."""
     if not sys.stdin.isatty():
         yield _no_key
         return
@@ -108,6 +108,6 @@ def _no_key(seconds: float) -> str:
 
 
 def _key(terminal: int, seconds: float) -> str:
-    """Return the key that is pressed within so many seconds; "" if none is."""
+    """Return the key that is pressed within some seconds; "" if none is."""
     ready, _, _ = select.select([terminal], [], [], seconds)
     return os.read(terminal, 1).decode(errors="replace") if ready else ""

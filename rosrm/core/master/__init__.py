@@ -1,15 +1,15 @@
-"""The master's core: one event in, commands out.
+"""The master's core: one event goes in, commands come out.
 
-reducer.py     one row for each event
+reducer.py     the transition table: the handler of each event
 events.py, commands.py, outcomes.py, settings.py
-master_state.py, state/   data only
+master_state.py, state/   data and the rules that keep it consistent
 tick.py        periodic work
-requests.py    what users request; pruning.py, graph_names.py
-answers.py     what slaves answer to orders
-lifecycle.py   from start to end of an instance
-listing.py     the rows that users read; plugin_failures.py
-scheduling/    on which host a process is placed
-assignment/    a waiting process gets a host, and its load is reserved there
+requests.py    requests of clients; pruning.py, graph_names.py
+answers.py     answers of slaves to orders
+lifecycle.py   an instance from start to end
+listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
+scheduling/    choice of a host for a process: filter, score, pick
+assignment/    assignment of waiting processes, reservation of their load
 hosts/         registration, readings, loss, fencing, re-adoption
 migration/     plans, their steps, eviction, standbys, failover
 checkpoint/    replicas of snapshots, checkpoint images

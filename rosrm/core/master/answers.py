@@ -17,7 +17,7 @@ from rosrm.core.master.state.pending_orders import (
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
-    """Handle the answer of a slave to an order: accepted, refused, or none in time."""
+    """Handle the answer of a slave to an order: accepted, refused, or no answer in time."""
     purpose = state.pending_orders.pop(event.order)
     match purpose:
         case None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.model.orders import Order, StartInstance, StopInstance
 from rosrm.model.plan import HandoffPhase
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import Assignment, InstanceId
 
 #: Id of an order, unique within one run of the master: its number, or its series and number
@@ -43,7 +43,7 @@ class Withdraw:
     """Withdraw an assignment.
 
     An assignment that the slave has not fetched yields `AssignmentWithdrawn`. For a fetched one,
-    `if_fetched` goes to the slave, so that the instance never runs or ends.
+    `if_fetched` is sent to the slave, which then never starts the instance or stops it.
     """
 
     order_id: OrderId
@@ -92,7 +92,7 @@ class PublishStateConfig:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Answer a request that came with an event; `code` is that of a refusal."""
+    """Answer a request that came with an event; `code` is "" unless the request is refused."""
 
     request: int
     accepted: bool = True

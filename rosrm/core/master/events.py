@@ -28,7 +28,7 @@ from rosrm.model.values import (
 
 
 class OrderOutcome(Enum):
-    """Outcome of an order by its answer."""
+    """Outcome of an order, by the answer of its slave."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -36,10 +36,10 @@ class OrderOutcome(Enum):
     TIMEOUT = "timeout"
 
 
-#: Code of the answer of an executor that ran to its end, but returned no JSON object.
+#: Answer code of an executor that ran to its end, but returned no JSON object.
 BAD_RESULT: Final = OrderOutcome.BAD_RESULT.value
 
-#: The outcomes that the code of an answer tells apart; every other code is a refusal.
+#: Outcomes by answer code; every other code is a refusal.
 _BY_CODE: Final = {one.value: one for one in (OrderOutcome.BAD_RESULT, OrderOutcome.TIMEOUT)}
 
 
@@ -48,8 +48,9 @@ class HostRegistered:
     """A slave registered its host.
 
     Attributes:
-        instances: all that it holds already.
-        journal_seen: newest record that a former run of this master has reported to it; 0: none.
+        instances: all instances on the host.
+        journal_seen: sequence of the newest record that a former run of this master has reported
+            to the slave; 0: none.
         kept: all snapshots and replicas on the host.
     """
 
@@ -65,8 +66,8 @@ class HostLeft:
     """A slave is being stopped.
 
     Attributes:
-        kept: all instances of a slave that leaves them running; (): it stops them, and reports
-            their ends.
+        kept: instances that the slave leaves running; (): the slave stops all of its instances and
+            reports their ends.
     """
 
     request: int
@@ -77,7 +78,7 @@ class HostLeft:
 
 @dataclass(frozen=True, slots=True)
 class ProcessRequested:
-    """A slave is under all its limits and asks for work."""
+    """A slave is under all its limits and requests work."""
 
     request: int
     host_id: int
@@ -107,11 +108,13 @@ class ReadingsReceived:
 
 @dataclass(frozen=True, slots=True)
 class StatusesReceived:
-    """Changes of instances on a host; `complete`: these are all that the host holds.
+    """A slave reported statuses of its instances, and every plugin that fails on its host.
 
-    Complete in each are `failing`, resource to the reason why its probe gives no readings,
-    `failing_strategies`, migration strategy to the reason why its executors fail there, and
-    `failing_launchers`, launcher to the reason why it could not be made.
+    Attributes:
+        complete: True if `statuses` has all instances on the host, not only the changed ones.
+        failing: resource to the reason why its probe gives no readings.
+        failing_strategies: migration strategy to the reason why its executors fail.
+        failing_launchers: launcher to the reason why it could not be created.
     """
 
     host_id: int
@@ -124,7 +127,7 @@ class StatusesReceived:
     failing_launchers: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
     def failing_plugins(self) -> dict[Plugin, str]:
-        """Return all plugins that fail there by kind and name, and why."""
+        """Return the kind and name of each failing plugin with the reason."""
         by_kind: tuple[tuple[PluginKind, Mapping[str, str]], ...] = (
             ("probe", self.failing),
             ("migration", self.failing_strategies),
@@ -182,7 +185,7 @@ class RestartRequested:
 
 @dataclass(frozen=True, slots=True)
 class MigrationRequested:
-    """A client moves a process; `host` None: the core chooses."""
+    """A client requests the migration of a process; `host` None: the core chooses the host."""
 
     request: int
     name: str
@@ -192,7 +195,7 @@ class MigrationRequested:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointRequested:
-    """A client has a process dumped into a checkpoint image, and stopped."""
+    """A client requests to dump a process into a checkpoint image, and to stop it."""
 
     request: int
     name: str
@@ -201,7 +204,7 @@ class CheckpointRequested:
 
 @dataclass(frozen=True, slots=True)
 class RestoreRequested:
-    """A client has a process restored from its checkpoint image."""
+    """A client requests to restore a process from its checkpoint image."""
 
     request: int
     name: str
@@ -223,8 +226,8 @@ class PruneRequested:
     """A client removes ended processes and departed hosts from the listings.
 
     Attributes:
-        names: of processes.
-        hosts: their names; with no names either: all that ended, and all hosts that left.
+        names: processes to remove.
+        hosts: hosts to remove. Both empty: all ended processes and all departed hosts.
     """
 
     request: int
@@ -238,7 +241,7 @@ class OrderAnswered:
     """A slave answered a `SendOrder`, or did not in time.
 
     Attributes:
-        code: of a refusal, as the slave sent it, or the value of an `OrderOutcome`.
+        code: the slave's code of a refusal, or the value of an `OrderOutcome`.
     """
 
     order: OrderId
@@ -261,7 +264,7 @@ class OrderAnswered:
 
     @property
     def reason(self) -> str:
-        """Return why the order was not accepted, in words where the slave gave any."""
+        """Return the slave's message on an order that was not accepted, or else the code."""
         return self.message or self.code
 
 
@@ -277,9 +280,9 @@ class HandoffReported:
     """The source or the destination of a handoff reported its phase.
 
     Attributes:
-        destination: instance number of the destination; it names the handoff.
+        destination: instance number of the destination; it identifies the handoff.
         instance: number of the reporting instance.
-        sequence: cycles that its newest snapshot covers.
+        sequence: number of cycles that the instance's newest snapshot covers.
         message: a sentence for listings and logs.
     """
 
@@ -293,7 +296,7 @@ class HandoffReported:
 
 @dataclass(frozen=True, slots=True)
 class PeerRefused:
-    """A message was refused at the network edge: another version, or malformed."""
+    """The network layer refused a message: another protocol version, or malformed."""
 
     who: str
     reason: str

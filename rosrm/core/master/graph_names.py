@@ -1,11 +1,11 @@
-"""Node names in the ROS graph that several processes share, as far as specs tell."""
+"""Node names that several processes share in the ROS graph, derived from their specs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Final
 
-from rosrm.model.values import ProcessSpec
+from rosrm.model.values import ProcessSpec, qualified_name
 from rosrm.wording import listed
 
 _RUN: Final = ("ros2", "run")
@@ -21,16 +21,16 @@ def shared_nodes(processes: Iterable[tuple[str, str]]) -> list[str]:
         if node:
             users.setdefault(node, []).append(name)
     return [
-        f"{listed(names)} put {node} into the ROS graph; give each node a name of its own"
+        f"{listed(names)} put {node} into the ROS graph; give each node its own name"
         for node, names in users.items()
         if len(names) > 1
     ]
 
 
 def node_of(spec: ProcessSpec) -> str:
-    """Return the node that a process adds to the graph, in words; "" if its spec does not tell.
+    """Return a phrase for the node that a process adds to the graph; "" if its spec names none.
 
-    rosrm appends its name rule to the arguments of the user, and the first rule counts.
+    rosrm appends its remapping rule to the user's arguments, and ROS applies the first rule.
     """
     words = (*spec.command, *spec.arguments)
     rules = dict(
@@ -38,8 +38,7 @@ def node_of(spec: ProcessSpec) -> str:
     )
     name = rules.get("__node") or (spec.name if spec.ros else "")
     if name:
-        namespace = rules.get("__ns", spec.namespace).strip("/")
-        return f"the node /{namespace}/{name}" if namespace else f"the node /{name}"
+        return f"the node {qualified_name(rules.get('__ns', spec.namespace), name)}"
     if spec.command[:2] == _RUN and len(spec.command) >= 4:
         return f"the default node of {' '.join(spec.command[2:4])}"
     return ""

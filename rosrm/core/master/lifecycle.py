@@ -44,7 +44,7 @@ _EVENT: Final = {
     ProcessPhase.FAILED: EventKind.FAILED,
     ProcessPhase.CANCELLED: EventKind.CANCELLED,
 }
-#: States that a slave reports of an instance whose restart it has begun.
+#: Reported states that show that the slave has begun to restart the instance.
 _RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
 _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
 
@@ -122,12 +122,12 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
     if process is None:
         return
     if process.restarts != status.restarts:
-        process.phase_before_loss = None  # it was restarted while its host was silent
+        process.phase_before_loss = None  # restarted while its host was silent
     process.restarts = status.restarts
     if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_instance(state, instance, now)
     if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
-        stop_instance(state, instance, now)  # its standby is ready sooner, and with the snapshot
+        stop_instance(state, instance, now)  # the standby is ready sooner, and has the snapshot
     if process.name not in state.migrations:
         _follow(state, process, instance, status, now, repeated=before is status.state)
 
@@ -174,12 +174,12 @@ def _handle_unknown_instance(
         return
     if status.state.ended:
         return
-    if status.instance.number in state.instances:  # it is intended, but elsewhere
+    if status.instance.number in state.instances:  # desired, but on another host
         if status.state is not InstanceState.STOPPING:
             state.send(host, StopInstance(status.instance))
         return
     followed = readoption.has_successor(state, status)
-    how = "has it killed: another instance owns its name" if followed else "stops it"
+    how = "fences it: another instance owns its name" if followed else "stops it"
     state.record(
         now, EventKind.FENCED if followed else EventKind.UNASSIGNED_STOPPED,
         f"{status.instance} is not assigned to {host.name}: the master {how}",
@@ -195,14 +195,14 @@ def _handle_unknown_instance(
 
 
 def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
-    """Track an instance that is only to end; the readings show its usage, so none is reserved."""
+    """Track an instance until it has stopped; reserve nothing, because readings show its usage."""
     adopted = state.add_instance(instance, host, now, NO_NEEDS)
     adopted.stopping = True
     return adopted
 
 
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
-    """Order an instance to stop for good; `tick` repeats the order until it has ended."""
+    """Order an instance to stop for good; `tick` repeats the order until the instance has ended."""
     instance.stopping = True
     order: Order = FenceInstance(instance.id) if instance.at_once else StopInstance(instance.id)
     state.send(instance.host, order)
@@ -237,7 +237,7 @@ def _ended(
         return
     if migration is not None:
         return  # the current plan handles this end
-    if instance.restarting:  # it ended before the order to restart arrived
+    if instance.restarting:  # the instance ended before the order to restart arrived
         missed = replace(status, message="it ended before it was restarted")
         end = End(missed, gone=True)
     conclude(state, process, end, instance.host, now)
@@ -251,7 +251,7 @@ def _end(
         process.spec.kind is Kind.JOB
         and status.succeeded
         and before is not InstanceState.STOPPING
-        and status.run_time > 0.0  # otherwise it was stopped before it was started
+        and status.run_time > 0.0  # 0: stopped before its start
     )  # fmt: skip
     ordered = (
         instance.stopping
@@ -263,7 +263,7 @@ def _end(
 
 
 def _note_end(state: MasterState, instance: Instance, end: End) -> Migration | None:
-    """Note an end in the migration of the process, which is returned, or in that of its standby."""
+    """Note an end in the migration and the standby of its process; return the migration."""
     name, number = instance.id.process, instance.id.number
     standby, migration = state.standbys.get(name), state.migrations.get(name)
     if standby is not None and standby.destination == instance.id:
@@ -275,7 +275,7 @@ def _note_end(state: MasterState, instance: Instance, end: End) -> Migration | N
 
 
 def conclude(state: MasterState, process: Process, end: End, host: Host, now: float) -> None:
-    """Finish or requeue a process without a plan whose owning instance has ended."""
+    """Finish or requeue a process outside a migration, after its owning instance has ended."""
     if failover.take_over(state, process, end, now):
         return
     status = end.status
@@ -349,7 +349,7 @@ def _requeue(state: MasterState, process: Process, host: Host, now: float, reaso
 
 
 def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
-    """Mark a process to be queued at its place once none of its instances runs."""
+    """Return a process to its place in the queue as soon as none of its instances runs."""
     state.unqueue(process)
     process.wanted = DesiredState.REQUEUE
     note_awaited_ends(state, process, now)
@@ -357,7 +357,7 @@ def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
 
 
 def note_awaited_ends(state: MasterState, process: Process, now: float) -> None:
-    """Set the phase of a process without an owner whose last instances must still end."""
+    """Set the phase of a process without owner: it waits until its last instances have ended."""
     left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
     state.set_phase(process, ProcessPhase.STOPPING, now, f"waits until {left} has ended")
 
@@ -380,15 +380,18 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
 
 
 def gone(
-    state: MasterState, instance: Instance, now: float, reason: str, *, comes_again: bool = True
+    state: MasterState, instance: Instance, now: float, reason: str, *, requeue: bool = True
 ) -> None:
-    """Drop an instance that is missing or counts as lost; its end is unknown."""
+    """Drop an instance that is missing or counts as lost; its end is unknown.
+
+    `requeue`: False fails a process whose owner it was, instead of queueing it again.
+    """
     process = state.processes.get(instance.id.process)
     state.drop_instance(instance)
     if process is None:
         return
     status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
-    end = End(status, gone=comes_again)
+    end = End(status, gone=requeue)
     if _note_end(state, instance, end) is not None:
         return  # the current plan handles this end
     if process.owner == instance.id.number:
@@ -407,7 +410,7 @@ def assignment_withdrawn(
 
 
 def note_phase(state: MasterState, process: Process, owner: Instance, now: float) -> None:
-    """Set the phase of a process without a plan, by its owner and by the owner's host."""
+    """Set the phase of a process outside a migration, by its owner and the owner's host."""
     host = owner.host
     unreachable = state.hosts.why_unreachable(host)
     if process.wanted is DesiredState.CANCEL:

@@ -9,11 +9,10 @@ from rosrm.core.master.assignment.assign import decide_now
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration import handoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
-from rosrm.model.values import InstanceState, StopPolicy
+from rosrm.model.values import InstanceState, StopPolicy, qualified_name
 
 _CONDITION: Final = {
     HostCondition.UP: "up",
@@ -23,10 +22,10 @@ _CONDITION: Final = {
     HostCondition.EXPECTED: "lost",
     HostCondition.DETACHED: "detached",
 }
-#: Conditions in which a host reports: one that leaves reports until its instances have ended.
+#: Conditions in which a host reports; a host that leaves reports until its instances have ended.
 _REPORTING: Final = (HostCondition.UP, HostCondition.LEFT)
 _OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
-#: Phases that a slave observes: while its host is silent they are unknown.
+#: Phases that a slave observes, and that are unknown while its host is silent.
 _OBSERVED: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF)
 
 
@@ -90,7 +89,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
 
 
 def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
-    """Return why readings of an instance are old; "" if its host reports."""
+    """Return a phrase on how long the host of an instance has been silent; "" if it reports."""
     if owner is None or state.hosts.condition_of(owner.host) in _REPORTING:
         return ""
     age = now - float(state.hosts.last_contact[owner.host.column])
@@ -98,7 +97,7 @@ def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
 
 
 def _stopped_by_slave(state: MasterState, owner: Instance, stop: StopPolicy, reason: str) -> str:
-    """Return the reason, extended by cause and longest duration where the slave is stopping."""
+    """Return the reason; where the slave is stopping, with the cause and the time until SIGKILL."""
     if state.hosts.condition_of(owner.host) is not HostCondition.LEFT:
         return reason
     until = f"SIGKILL after {stop.interrupt_grace + stop.terminate_grace:g} s"
@@ -106,7 +105,7 @@ def _stopped_by_slave(state: MasterState, owner: Instance, stop: StopPolicy, rea
 
 
 def _awaited(state: MasterState, host: Host, now: float) -> str:
-    """Return the time for which a cancelled process waits for its host; "" if it does not."""
+    """Return a phrase on how long a cancelled process has waited for its host; "" for none."""
     condition = state.hosts.condition_of(host)
     if condition is HostCondition.DETACHED:
         return f" {now - host.detached_since:.0f} s ago"
@@ -123,18 +122,18 @@ def _host_of(process: Process, owner: Instance | None) -> str:
 
 
 def _awaited_node(process: Process, owner: Instance | None) -> str:
-    """Return the node that a running process must show to be ready; "" for none."""
+    """Return a phrase on the node that must join the ROS graph before a process is ready."""
     if owner is None or process.phase is not ProcessPhase.STARTING:
         return ""
     spec = process.spec
     if owner.state is not InstanceState.RUNNING or not spec.ros or spec.readiness.kind == "running":
         return ""
-    node = handoff.qualified(spec, owner.node_name or spec.name)
+    node = qualified_name(spec.namespace, owner.node_name or spec.name)
     return f"waits for its node {node} in the ROS graph, for at most {spec.readiness.timeout:g} s"
 
 
 def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] | None:
-    """Return why a process is where it is, or waits; None: no such process."""
+    """Return the reasons for the state and the host of a process; None: no such process."""
     process = state.processes.get(name)
     if process is None:
         return None
@@ -177,7 +176,7 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         awaited = _awaited_node(process, state.instances.get(process.owner))
         return reason_of(state, process) or awaited
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
-    return ahead if state.settings.backfill else f"{ahead}, and those behind wait with it"
+    return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"
 
 
 def _advice(state: MasterState, process: Process) -> str:

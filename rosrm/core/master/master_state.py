@@ -27,39 +27,41 @@ from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.replicas import ReplicationState
-from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
+from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 
-#: Records of one process that `explain` shows.
+#: Number of the newest records of a process that `explain` shows.
 _HISTORY: Final = 12
-#: Instance numbers that are reserved durably at a time.
+#: Number of instance numbers that one intent reserves.
 _RESERVED: Final = 1000
 #: Phases between the rejoin of a host and its report of its instances.
 _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
-#: Most removed processes of which replicas are still dropped.
+#: Number of removed processes whose replicas are dropped when a host returns with one.
 _MOST_REMOVED: Final = 10_000
-#: Faster than `fields_to_plain`, because a process is saved in the turn of its decision.
+#: Faster than `fields_to_plain`: each decision waits until its process is saved.
 _journaled_of: Final = attrgetter(*JOURNALED)
-#: No instance gets a number as large as this.
+#: Exclusive upper bound of instance numbers and record sequences.
 _LARGEST: Final = 2**53
 
 
 @dataclass(slots=True)
 class JournalGap:
-    """Journal gap: the end of the journal as it was when this master started.
+    """Records that the journal may have lost before this master started.
 
     Attributes:
-        newest: sequence of its newest record.
+        newest: sequence of the newest record at the start.
         started: time of the start.
-        machine_rebooted: the machine had rebooted, and not every host has rejoined.
+        machine_rebooted: True if the machine had rebooted, until every host has rejoined or is
+            lost.
         lost: number of records that are known to be lost.
-        records_missing: some are lost, and some hosts may not have had the time to report since.
+        records_missing: True if records are lost, until one lease after the start.
     """
 
     newest: int = _LARGEST
@@ -76,11 +78,13 @@ class MasterState:
         declared: declarations in the offers of the selected plugins.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
-        wants_standby: names of the processes that ask for one and are not terminal.
-        held_since: time since when placement waits for first requests for work; inf: it does not.
+        wants_standby: names of the processes that ask for a standby and are not terminal, in order
+            of submission, because a replay must begin them in the same order.
+        held_since: time since when placement waits for first requests for work; inf: no wait.
         contact_since: time since when at least one host reports; inf: none does.
-        unowned_instances: name to the instances of it that may still run, without a process.
-        capability_answers: by strategy and host, for strategies that do not work on every host.
+        unowned_instances: name of a removed process to its instances that may still run.
+        capability_answers: answers of hosts, by strategy and host, for each strategy that must
+            check its hosts.
         plugins: guards every call of a plugin.
     """
 
@@ -110,7 +114,7 @@ class MasterState:
         self.instances: dict[int, Instance] = {}
         self.migrations: dict[str, Migration] = {}
         self.standbys: dict[str, Migration] = {}
-        self.wants_standby: set[str] = set()
+        self.wants_standby: dict[str, None] = {}
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.set_aside: set[str] = set()
@@ -138,14 +142,14 @@ class MasterState:
         self._unsaved: dict[str, Process] = {}
         self._unsaved_migrations: dict[str, Migration] = {}
 
-    # --- what handlers emit --------------------------------------------------------------
+    # --- commands ------------------------------------------------------------------------
 
     def emit(self, command: Command) -> None:
         """Add a command to the outcome of the current event."""
         self._out.append(command)
 
     def take(self) -> list[Command]:
-        """Return the commands of the current event; the next event begins with none."""
+        """Return and clear the commands of the current event."""
         for process in self._unsaved.values():
             self._out.append(self._intent_of(process))
         self._unsaved.clear()
@@ -239,7 +243,7 @@ class MasterState:
     def _begin_phase(self, process: Process, phase: ProcessPhase, now: float) -> None:
         """Change the phase and note its start.
 
-        A process that was unreachable and then has its former phase again keeps the former start.
+        A process that was unreachable and returns to its former phase keeps that phase's start.
         """
         before, began = process.phase, (now, self.wall)
         if phase is ProcessPhase.UNREACHABLE:
@@ -262,10 +266,10 @@ class MasterState:
         if not process.phase.is_terminal:
             self.terminal.pop(process.name, None)
             if process.spec.standby.wanted:
-                self.wants_standby.add(process.name)
+                self.wants_standby.setdefault(process.name)
         else:
             self.terminal.setdefault(process.name)
-            self.wants_standby.discard(process.name)
+            self.wants_standby.pop(process.name, None)
 
     def collect_garbage(self) -> None:
         """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
@@ -277,19 +281,20 @@ class MasterState:
             self.remove_process(name)
 
     def is_gone(self, process: Process) -> bool:
-        """Return True if no instance of a terminal process may run, and no standby."""
+        """Return True if neither an instance nor a standby of a terminal process may run."""
         return not process.instances and process.name not in self.standbys
 
     def remove_process(self, name: str) -> None:
         """Remove a terminal process from memory and journal; none of its instances may run."""
         del self.terminal[name]
+        self.replication.last_orders.pop(name, None)
         if self.declared.has_snapshots(self.processes.pop(name).spec):
             self._note_removed(name)
         self._unsaved.pop(name, None)
         self.emit(Intent("process", name, None))
 
     def _note_removed(self, name: str) -> None:
-        """Journal the removal of a process with state: a host may return with a replica."""
+        """Journal the removal of a stateful process, because a host may return with a replica."""
         removed = self.replication.removed
         removed.pop(name, None)  # oldest first
         removed[name] = self.next_instance
@@ -300,7 +305,7 @@ class MasterState:
             self.emit(Intent("removed", oldest, None))
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
-        """Queue a process at its place."""
+        """Queue a process at its place, given by its priority and order of submission."""
         process.owner, process.ended_on = 0, ""
         process.wanted = DesiredState.RUN
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
@@ -329,7 +334,7 @@ class MasterState:
     # --- instances -----------------------------------------------------------------------
 
     def new_instance_id(self, process: Process) -> InstanceId:
-        """Return a new instance id; no instance has had its number in any run of the master."""
+        """Return an instance id with a number that no run of the master has used."""
         if self.next_instance >= self.reserved_instances:
             self._reserve_numbers()
         self.next_instance += 1
@@ -340,20 +345,20 @@ class MasterState:
         self.emit(Intent("cluster", "instances", {"next": self.reserved_instances}))
 
     def skip_numbers(self, seen: int) -> None:
-        """Skip instance numbers up to one that a slave reports, because the journal lost them.
+        """Skip instance numbers that a slave reports and the journal has lost.
 
-        Other instances may have had later numbers, and have ended.
+        Instances that have ended since may have had later numbers, so a reserve is skipped too.
         """
         if self.next_instance <= seen < _LARGEST:
             self.next_instance = seen + _RESERVED
-            self._reserve_numbers()  # the slave may never report it again
+            self._reserve_numbers()  # at once, because no slave may report the number again
 
     def estimate(self, spec: ProcessSpec) -> Estimate:
         """Return the needs of one instance of a spec."""
         return self.learned.estimate(spec, self.settings.default_needs)
 
     def _numbers_of(self, name: str) -> set[int]:
-        """Return the set of instance numbers of a name, with a process or without one."""
+        """Return the instance numbers of a name, also if its process was removed."""
         process = self.processes.get(name)
         if process is not None:
             return process.instances
@@ -401,7 +406,7 @@ class MasterState:
         kept_from = 0
         if self.declared.has_snapshots(spec):
             first_instance = self.processes[spec.name].born
-            kept_from = max(1, first_instance)  # 0 says that there are no snapshots
+            kept_from = max(1, first_instance)  # 0: no snapshots
             if not shadow and not restored:
                 kept_on = self.replication.in_reach(spec.name, first_instance, self.hosts)
         return Assignment(

@@ -26,7 +26,7 @@ def note_on_host(state: MasterState, host: Host, failing: Mapping[Plugin, str], 
     """Note the failing plugins of a host from its slave's report, and record the changes.
 
     Args:
-        failing: all that fail there, and why. A probe is named after the resource that it reads.
+        failing: every failing plugin to the reason; a probe has the name of its resource.
     """
     for plugin in sorted(failing.keys() | host.failing.keys()):
         if plugin not in failing:

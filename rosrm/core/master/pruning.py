@@ -13,15 +13,15 @@ from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.requests import count, known_host, known_processes
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent
 from rosrm.wording import counted, listed
 
 _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
 
 
 def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
-    """Remove the named processes and hosts, or all that ended or left; all of them, or none."""
+    """Remove all named processes and hosts, or refuse; without names, all that ended or left."""
     if event.names or event.hosts:
         processes, hosts = _named(state, event, now)
     else:
@@ -97,10 +97,11 @@ def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:
 
 
 def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
-    """Give up the instances that may still run on a host; stop them there if the host returns.
+    """Remove a host, and give up its instances; they are stopped if the host returns.
 
     Returns:
-        the processes that may still run there, and the command that stops them; "" if none may.
+        A sentence: the processes that may still run there, and the command that stops them; ""
+        if none may.
     """
     ends_all = state.hosts.condition_of(host) is HostCondition.LEFT
     state.hosts.prune(host)

@@ -1,17 +1,17 @@
-"""The master's reducer: (state, event, now) -> commands. Each kind of event is one row below.
+"""The master's reducer: (state, event, now) -> commands. One row for each kind of event.
 
 ======================  =========================================================================
 event                   action of the core
 ======================  =========================================================================
 HostRegistered          registers the host, reconciles its instances with the desired ones
-HostLeft                gives it no more work; its processes return to the queue as they end, or
-                        are out of reach if the slave left them running
+HostLeft                marks the host as left, and queues its processes as they end; or marks it as
+                        detached, if its slave leaves processes running
 ProcessRequested        notes the open request of the host; places queued processes
 ReadingsReceived        stores readings; places queued processes
 StatusesReceived        moves processes through their phases; drives migrations
 UsagesReceived          lowers reservations by the usage that readings now show
 KeptStatesReceived      replaces the known snapshots and replicas of a host
-SubmissionReceived      refuses or queues all of them; places queued processes
+SubmissionReceived      queues all submitted processes, or refuses all; places queued processes
 CancelRequested         removes processes from the queue, or stops them
 RestartRequested        restarts running processes in place, or queues ended ones again
 MigrationRequested      begins a migration
@@ -19,9 +19,9 @@ CheckpointRequested     begins to dump a process into an image
 RestoreRequested        begins to restore a process from its image
 HostStateRequested      cordons, uncordons, drains
 PruneRequested          removes ended processes and departed hosts from the listings
-OrderAnswered           notes that a slave has accepted or refused an order
+OrderAnswered           notes whether the slave accepted the order, and the result of an executor
 HandoffReported         notes the reported phase of a handoff's source or destination
-AssignmentWithdrawn     queues the process again at its old place
+AssignmentWithdrawn     returns the process to its place in the queue
 PeerRefused             records the refusal
 TimePassed              checks every deadline: silence, delivery, steps, hysteresis
 ======================  =========================================================================
@@ -45,7 +45,7 @@ from rosrm.core.master.outcomes import RequestRefused
 
 _Handler = Callable[[MasterState, Any, float], None]
 
-#: The transition table.
+#: Handler of each event.
 HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
     {
         happened.HostRegistered: registration.host_registered,
@@ -81,7 +81,7 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
         now: seconds by the master's monotonic clock; never less than before.
 
     Returns:
-        Commands to carry out, in order; records and intents first become durable.
+        Commands in the order of execution, once their records and intents are durable.
     """
     try:
         HANDLERS[type(event)](state, event, now)

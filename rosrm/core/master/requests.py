@@ -87,7 +87,7 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
 
 
 def _in_use(state: MasterState, taken: list[str]) -> list[str]:
-    """Return sentences: the names belong to live processes, and what frees them."""
+    """Return sentences on the live processes that use the names, and how to free the names."""
     live = [name for name in taken if state.processes[name].wanted is not DesiredState.CANCEL]
     ending: dict[str, list[str]] = {}
     for name in taken:
@@ -199,7 +199,7 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
 def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
     process.wanted, process.left_behind = DesiredState.CANCEL, None
     state.record(
-        now, EventKind.CANCEL_REQUESTED, f"{process.name} is to be cancelled",
+        now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
         process=process.name, by=by,
     )  # fmt: skip
     if process.phase in WAITING:
@@ -214,7 +214,7 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
         # Its owner has ended, and former instances are being stopped.
         if not lifecycle.requeue_if_clear(state, process, now):
             lifecycle.note_awaited_ends(state, process, now)
-    elif process.name not in state.migrations:  # otherwise the current plan turns back first
+    elif process.name not in state.migrations:  # otherwise the plan is undone first
         owner = state.instances[process.owner]
         lifecycle.note_phase(state, process, owner, now)
         lifecycle.stop_instance(state, owner, now)
@@ -256,15 +256,15 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
     )  # fmt: skip
     if process.phase.is_terminal or process.image is not None:
         images.drop(state, process)
-        replication.begin_anew(state, process)
+        replication.drop_former_replicas(state, process)
         process.excluded.clear()
         process.demand = None
         process.order = state.next_order
         state.next_order += 1
         state.enqueue(process, now)
     elif (owner := state.instances[process.owner]).state is not None:
-        # An instance that its slave has not accepted yet starts anyway. An order to restart that
-        # arrives before the assignment would prevent the start for good.
+        # An instance that its slave has not accepted yet starts without this order. An order to
+        # restart that arrives before the assignment would prevent the start for good.
         owner.restarting = True
         state.send(owner.host, RestartInstance(owner.id))
     state.save(process)
@@ -320,7 +320,7 @@ def _begin(
 
 
 def _cause(by: str) -> str:
-    """Return the cause, for records, of a change that a client requested."""
+    """Return the cause of a client's change, for records."""
     return f"requested by {by}" if by else "requested"
 
 

@@ -12,19 +12,19 @@ class CoreSettings:
     """Settings of the master's core.
 
     Attributes:
-        backfill: processes behind one that waits for room may pass it.
+        backfill: True: processes may be placed before an earlier one that waits for room.
         default_needs: base units by resource, for a process without declared or learned needs.
         settle: seconds after which an estimate (not a declared need) no longer counts.
         suspect: seconds of silence after which a host gets no new work.
         lease: seconds of silence after which a host is lost.
         delivery_timeout: seconds within which a slave must accept an assignment.
         cooldown: seconds after a migration in which the core does not migrate a process again.
-        hysteresis: seconds that a host must be over a limit before anything moves.
+        hysteresis: seconds for which a host must be over a limit before an eviction.
         headroom: fraction by which a destination stays under each of its limits.
-        max_migrations: most migrations in flight.
-        automatic: the core moves processes from hosts that are over a limit.
+        max_migrations: highest number of migrations in flight.
+        automatic: True: the core evicts processes from hosts that are over a limit.
         order_retry: seconds after which an unanswered order is repeated.
-        keep_ended: most terminal processes that stay known.
+        keep_ended: number of the newest terminal processes that are not garbage-collected.
     """
 
     backfill: bool = False

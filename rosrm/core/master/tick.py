@@ -23,7 +23,7 @@ from rosrm.model.orders import ReportInstances
 
 #: Seconds between two ticks; this work need not be done with every event.
 _REVIEW_EVERY: Final = 0.2
-#: Seconds for which a status batch may be missing before the host is asked for all statuses.
+#: Seconds for which a status batch may be missing before the slave must report all statuses.
 _PATIENCE: Final = 1.0
 
 
@@ -61,7 +61,7 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
 
 
 def _review_delivery(state: MasterState, instance: Instance, age: float, now: float) -> None:
-    """Redeliver or withdraw an assignment without a report: the answer with it may be lost."""
+    """Redeliver or withdraw an assignment without a report, because it may be lost on its way."""
     process = state.owned_by(instance)
     if process is None or process.phase is not ProcessPhase.ASSIGNED or instance.stopping:
         return
@@ -75,7 +75,7 @@ def _review_delivery(state: MasterState, instance: Instance, age: float, now: fl
 
 
 def _cancel_prefetch(state: MasterState, instance: Instance, now: float) -> None:
-    """Return a prefetched process to its place in the queue, because its slot stays taken."""
+    """Return a prefetched process to the queue, because its slot stays taken."""
     review_slots(state, instance.host, now)
     process = state.owned_by(instance)
     if process is None or process.name in state.migrations:

@@ -1,10 +1,10 @@
-"""The slave's core: one event in, commands out.
+"""The slave's core: one event goes in, commands come out.
 
-reducer.py       one row for each event
+reducer.py       table of events and their effects
 events.py, commands.py
 orders.py        orders of the master as events
 handlers.py      one handler for each event
-state.py         the instances that the slave holds
-watches.py       the values of readiness and health; health.py judges health
+state.py         the instances on this host
+watches.py       readiness and health checks; health.py evaluates the checks
 fencing.py, master_clock.py
 """

@@ -10,21 +10,21 @@ from rosrm.model.values import Assignment, InstanceId, InstanceStatus, RestartPo
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """Have the supervisor start instances."""
+    """Order the supervisor to start instances."""
 
     assignments: tuple[Assignment, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Have the supervisor stop an instance."""
+    """Order the supervisor to stop an instance."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class Fence:
-    """Have the supervisor end an instance at once."""
+    """Order the supervisor to kill an instance."""
 
     instance: InstanceId
 
@@ -46,18 +46,18 @@ class Renew:
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """Have the supervisor restart an instance."""
+    """Order the supervisor to restart an instance."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class Fail:
-    """Have the supervisor end a run as failed, and apply its restart policy.
+    """Order the supervisor to end a run as failed, and to apply the restart policy.
 
     Attributes:
-        pid: of the run.
-        kill: SIGKILL at once, because the process is stopped by a signal.
+        pid: pid of the run.
+        kill: send SIGKILL at once, because a signal has stopped the process.
     """
 
     instance: InstanceId
@@ -68,7 +68,7 @@ class Fail:
 
 @dataclass(frozen=True, slots=True)
 class Amend:
-    """Have the supervisor keep another restart policy; `RestartPolicyRecorded` follows."""
+    """Order the supervisor to replace a restart policy; `RestartPolicyRecorded` follows."""
 
     instance: InstanceId
     restart: RestartPolicy
@@ -76,7 +76,7 @@ class Amend:
 
 @dataclass(frozen=True, slots=True)
 class Settle:
-    """Answer the order to set this restart policy; `refusal`: why that failed; "": it is set."""
+    """Answer the order to set a restart policy; `refusal`: why that failed; "": success."""
 
     instance: InstanceId
     restart: RestartPolicy
@@ -85,7 +85,7 @@ class Settle:
 
 @dataclass(frozen=True, slots=True)
 class Remember:
-    """Have the supervisor keep these facts for a later run of this slave."""
+    """Order the supervisor to store facts for a later run of this slave."""
 
     instance: InstanceId
     memo: Memo
@@ -93,14 +93,14 @@ class Remember:
 
 @dataclass(frozen=True, slots=True)
 class Forget:
-    """Let the supervisor forget ended instances."""
+    """Order the supervisor to forget ended instances."""
 
     instances: tuple[InstanceId, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Report statuses to the master; `complete`: these are all."""
+    """Report statuses to the master; `complete`: all instances are in the report."""
 
     statuses: tuple[InstanceStatus, ...]
     complete: bool = False

@@ -14,7 +14,7 @@ class Registered:
     """The master registered this host.
 
     Attributes:
-        renumbers: the master has lost its journal, and may use instance numbers a second time.
+        renumbers: the master has lost its journal, and may use instance numbers again.
     """
 
     epoch: int
@@ -23,7 +23,7 @@ class Registered:
 
 @dataclass(frozen=True, slots=True)
 class MasterLost:
-    """The contact with the master is lost: later ends may not reach it."""
+    """The contact with the master is lost, so it may not receive reports of later ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +48,14 @@ class LaunchRefused:
 
 @dataclass(frozen=True, slots=True)
 class StopOrdered:
-    """The master ordered an instance to end for good."""
+    """The master ordered to stop an instance for good."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class FenceOrdered:
-    """The master ordered an instance to end at once, because it has a successor."""
+    """The master ordered to kill an instance, because it has a successor."""
 
     instance: InstanceId
 
@@ -65,7 +65,7 @@ class ContactConfirmed:
     """The master reported that it receives messages from this host.
 
     Attributes:
-        at: time at which the master sent this, by the slave's clock; not the time of arrival.
+        at: send time of the master's message by the slave's clock, not its time of arrival.
     """
 
     at: float
@@ -73,14 +73,14 @@ class ContactConfirmed:
 
 @dataclass(frozen=True, slots=True)
 class RestartOrdered:
-    """The master ordered an instance to restart on this host."""
+    """The master ordered to restart an instance on this host."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class RestartPolicySet:
-    """The master set another restart policy for an instance; it is no shadow any more."""
+    """The master replaced the restart policy of an instance, which is no shadow from then on."""
 
     instance: InstanceId
     restart: RestartPolicy
@@ -96,7 +96,7 @@ class RestartPolicyRecorded:
 
 @dataclass(frozen=True, slots=True)
 class ReportRequested:
-    """The master asked for the status of every instance."""
+    """The master requested the status of every instance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +111,9 @@ class SupervisorReplaced:
     """Another supervisor took over, or this slave found one at its start.
 
     Attributes:
-        statuses: all that it holds.
+        statuses: statuses of all its instances.
         memos: facts about instances that earlier runs of this slave stored there.
-        fenced: the instances that have a fence.
+        fenced: instances with a fence.
     """
 
     statuses: tuple[InstanceStatus, ...]
@@ -123,7 +123,7 @@ class SupervisorReplaced:
 
 @dataclass(frozen=True, slots=True)
 class SeenInGraph:
-    """This instance, not another one of the same name, is in the ROS graph."""
+    """The node of this instance, not of another one of the same name, is in the ROS graph."""
 
     instance: InstanceId
 
@@ -133,7 +133,7 @@ class LookedAt:
     """A watched instance was observed.
 
     Attributes:
-        pid: of the observed run.
+        pid: pid of the observed run.
     """
 
     instance: InstanceId

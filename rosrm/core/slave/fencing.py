@@ -1,7 +1,8 @@
-"""Fences of instances on the slave's side: each ends before a successor starts elsewhere.
+"""Fences on the slave's side: a fenced instance ends before a successor starts elsewhere.
 
 The supervisor ends an instance with a fence when too much time has passed since the last contact
-with the master. The slave reports the last contact to it, because only the slave receives beats.
+with the master. The slave sends the last contact to the supervisor, because only the slave receives
+beats.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from rosrm.core.slave.events import ContactConfirmed
 from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import Assignment, InstanceId
 
-#: Least seconds between two `Renew` commands to the supervisor.
+#: Shortest time, in seconds, between two `Renew` commands to the supervisor.
 RENEW_PERIOD: Final = 0.1
 
 
@@ -24,12 +25,12 @@ def contact_confirmed(state: SlaveState, event: ContactConfirmed, now: float) ->
 
 
 def renew_in_time(state: SlaveState, now: float) -> list[Command]:
-    """Renew the fences, unless they were renewed a moment ago."""
+    """Renew the fences, at most once per `RENEW_PERIOD`."""
     return renew(state, now) if now - state.renewed_at >= RENEW_PERIOD else []
 
 
 def renew(state: SlaveState, now: float) -> list[Command]:
-    """Send the supervisor the last contact, if any instance that has not ended has a fence."""
+    """Send the last contact to the supervisor, if a live instance has a fence."""
     if not any(held.fenced and not held.status.state.ended for held in state.held.values()):
         return []
     state.renewed_at = now
@@ -37,7 +38,7 @@ def renew(state: SlaveState, now: float) -> list[Command]:
 
 
 def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
-    """Return why an instance must not be started any more; "" if it may."""
+    """Return why the fence of an instance forbids its start; "" if it may start."""
     fence = assignment.fence
     if fence is None or fence.alive or now < state.last_contact + fence.after:
         return ""
@@ -58,7 +59,7 @@ def too_old(state: SlaveState, assignment: Assignment, age: float) -> str:
 
 
 def late(state: SlaveState, now: float) -> dict[InstanceId, str]:
-    """Return the waiting instances that must not be started any more, with the reason."""
+    """Return the waiting instances that must not start any more, with the reason."""
     return {
         instance: why
         for instance, assignment in state.waiting.items()

@@ -9,13 +9,19 @@ from typing import Any, Final
 
 from rosrm.core.slave import commands, events, fencing
 from rosrm.core.slave.health import InstanceHealth, watch_of
-from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph, qualified_name
+from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph
 from rosrm.core.slave.watches import Awaited, Memo
-from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
+from rosrm.model.values import (
+    Assignment,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    qualified_name,
+)
 
-#: Seconds for which the end of an instance is kept for a master that may not have received it.
+#: Seconds for which an end is remembered for a master that may not have received its report.
 REMEMBER_END: Final = 60.0
-#: Most remembered orders to stop an unknown instance.
+#: Highest number of tombstones.
 _TOMBSTONES: Final = 10_000
 
 _Commands = list[commands.Command]
@@ -28,11 +34,11 @@ def _registered(state: SlaveState, event: events.Registered, now: float) -> _Com
     if event.renumbers:
         state.tombstones.clear()
     for held in state.held.values():
-        held.ended_at = max(held.ended_at, now)  # reported with the registration, not before
+        held.ended_at = max(held.ended_at, now)  # the registration is the first report of the end
     if not state.report_unconfirmed:
         return []
     state.report_unconfirmed = False
-    # Not complete: a late report must not deny assignments made since.
+    # Not complete, because a complete report would deny assignments made since the registration.
     return [commands.Report(state.statuses())]
 
 
@@ -80,7 +86,7 @@ def _refused(
 def _waiting(assignment: Assignment) -> HeldInstance:
     spec = assignment.spec
     awaited = None
-    if awaits_graph(spec) and not assignment.restored:  # a restored one joins the graph later
+    if awaits_graph(spec) and not assignment.restored:  # a restored node rejoins the graph later
         name = qualified_name(spec.namespace, assignment.node_name)
         awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)
@@ -89,7 +95,7 @@ def _waiting(assignment: Assignment) -> HeldInstance:
 
 
 def _start_waiting(state: SlaveState, now: float) -> _Commands:
-    """Launch waiting instances, as far as the bounds allow."""
+    """Launch waiting instances within the bounds."""
     refused = _refuse_late(state, now)
     launches = []
     while state.waiting and not state.why_wait():
@@ -100,7 +106,7 @@ def _start_waiting(state: SlaveState, now: float) -> _Commands:
 
 
 def _refuse_late(state: SlaveState, now: float) -> _Commands:
-    """Refuse waiting instances whose fence has passed: successors may run elsewhere by now."""
+    """Refuse waiting instances whose fence has expired, because successors may run elsewhere."""
     late = fencing.late(state, now)
     for instance, why in late.items():
         del state.waiting[instance]
@@ -114,7 +120,7 @@ def _why_not(state: SlaveState, assignment: Assignment) -> str:
     if assignment.epoch < state.epoch:
         return f"assigned in epoch {assignment.epoch}, this is epoch {state.epoch}"
     if assignment.instance in state.tombstones:
-        return "it was stopped or refused here before this order came"
+        return "it was stopped or refused here before this order arrived"
     return ""
 
 
@@ -161,7 +167,7 @@ def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float
     if held is None or held.status.state.ended:
         return [] if held is None else [commands.Report((held.status,))]
     if event.instance in state.waiting:
-        return []  # it starts as soon as it can
+        return []  # the start itself still waits
     held.ready_by, held.unready = None, ""
     return [commands.Restart(event.instance)]
 
@@ -169,12 +175,12 @@ def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float
 def _restart_policy_set(state: SlaveState, event: events.RestartPolicySet, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is None:
-        return [_not_held(event)]
+        return [_unknown(event)]
     if held.status.state.ended:
         return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
     news = _pause_or_watch(held, event)
     waiting = state.waiting.get(event.instance)
-    if waiting is not None:  # the supervisor does not know it yet
+    if waiting is not None:  # the supervisor does not know the instance yet
         spec = replace(waiting.spec, restart=event.restart)
         state.waiting[event.instance] = replace(waiting, spec=spec, shadow=False)
         return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
@@ -184,10 +190,10 @@ def _restart_policy_set(state: SlaveState, event: events.RestartPolicySet, now: 
 
 
 def _pause_or_watch(held: HeldInstance, order: events.RestartPolicySet) -> bool:
-    """Pause or resume the health watch by the restart policy; return True if that changed.
+    """Pause or resume the health checks by the restart policy; return True if that changed.
 
-    A migration turns the restarts off and on again. An instance that is never restarted shows no
-    such change; it is watched all the time.
+    A migration turns restarts off and on again. The checks of an instance without restarts cannot
+    follow that change, so they are never paused.
     """
     watch = held.watch
     if watch is None:
@@ -198,7 +204,7 @@ def _pause_or_watch(held: HeldInstance, order: events.RestartPolicySet) -> bool:
     return paused != watch.paused
 
 
-def _not_held(order: events.RestartPolicySet) -> commands.Settle:
+def _unknown(order: events.RestartPolicySet) -> commands.Settle:
     never = f"{order.instance} is not known here: it never ran on this host, or ended long ago"
     return commands.Settle(order.instance, order.restart, never)
 
@@ -227,7 +233,7 @@ def _supervisor_reported(
         for reported in event.statuses
         if (status := _follow(state, reported, now)) is not None
     ]
-    # Starts first, because the report of an end is less urgent.
+    # Launches first, because the report of an end is less urgent.
     return [*_start_waiting(state, now), *([commands.Report(tuple(changed))] if changed else [])]
 
 
@@ -241,7 +247,7 @@ def _supervisor_replaced(
         if lost and not held.status.state.ended:
             del state.held[instance]
             _bury(state, instance)
-        held.judgement = None  # its order may be lost
+        held.judgement = None  # judge again, because the order to fail the run may be lost
         again += [
             _amend_again(events.RestartPolicySet(instance, restart), held, lost=lost)
             for restart in held.unsettled
@@ -259,10 +265,10 @@ def _supervisor_replaced(
 def _amend_again(
     order: events.RestartPolicySet, held: HeldInstance, *, lost: bool
 ) -> commands.Command:
-    """Return the command that repeats an order which may be lost with the supervisor."""
+    """Return the command that repeats an order, because the former supervisor may have lost it."""
     if held.status.state.ended:
         return commands.Settle(order.instance, order.restart)
-    return _not_held(order) if lost else commands.Amend(order.instance, order.restart)
+    return _unknown(order) if lost else commands.Amend(order.instance, order.restart)
 
 
 def _follow(
@@ -291,7 +297,7 @@ def _follow(
 
 
 def _running(held: HeldInstance, reported: InstanceStatus, now: float) -> InstanceStatus:
-    """Return the status of a new run: ready at once, or after it is seen in the graph."""
+    """Return the status of a new run: ready at once, or after its node appears in the graph."""
     if held.awaited is None or held.awaited.seen == reported.pid:
         return replace(reported, state=InstanceState.READY)
     held.ready_by = now + held.awaited.timeout
@@ -327,7 +333,7 @@ def _looked_at(state: SlaveState, event: events.LookedAt, now: float) -> _Comman
     reason = held.judgement.look(event.look, now)
     if not reason:
         return []
-    held.judgement = None  # judge again, in case the order is lost
+    held.judgement = None  # judge again, because the order may be lost
     return [commands.Fail(event.instance, event.pid, reason, kill=event.look.stopped)]
 
 
@@ -359,7 +365,7 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
 
 _Handler = Callable[[SlaveState, Any, float], _Commands]
 
-#: The transition table.
+#: Handler of each event.
 HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
     {
         events.Registered: _registered,

@@ -1,7 +1,7 @@
-"""Health of ready instances: observations in, verdicts out.
+"""Health of ready instances: observations go in, verdicts come out.
 
-A check fails only if every look for longer than the spec's `timeout` found it failing. Only time in
-which the slave looked counts. A slave that was itself stopped, or got no CPU, therefore blames no
+A check fails only if every observation for longer than the spec's `timeout` found it failing. Only
+time in which the slave observed counts. So a slave that was stopped, or got no CPU, fails no
 instance.
 """
 
@@ -14,14 +14,14 @@ from typing import Final
 from rosrm.core.slave.watches import NoState, Observation, Watch
 from rosrm.model.values import Assignment, Health
 
-#: Seconds between two looks.
+#: Seconds between two observations.
 LOOK_PERIOD: Final = 0.2
-#: Share of `timeout` over which a rate is counted, and the least number of periods of that rate.
+#: Window over which a rate is counted: a share of `timeout`, but at least this number of periods.
 _WINDOW: Final = 0.25
 _PERIODS: Final = 3.0
 #: A count may lack this many messages, because the window begins at a random phase.
 _SLACK: Final = 1.0
-#: Most that one look counts: a share of `timeout`, but at least these seconds.
+#: Longest time that one observation counts: this share of `timeout`, but at least these seconds.
 _STRIDE: Final = 0.25
 _LEAST_STRIDE: Final = 1.5 * LOOK_PERIOD
 
@@ -44,7 +44,7 @@ def watch_of(assignment: Assignment) -> Watch | None:
 
 
 def _names(name: str, assignment: Assignment, scheme: str) -> tuple[str, ...]:
-    """Return absolute names: below the node's visible name first, then below its alias, if any."""
+    """Return absolute names: resolved for the node's visible name, then for its alias, if any."""
     spec = assignment.spec
     nodes = dict.fromkeys((spec.name, assignment.node_name))
     resolved = (resolve(name, spec.namespace, node, spec.remappings, scheme) for node in nodes)
@@ -58,7 +58,7 @@ def resolve(
 
     Args:
         name: absolute, relative to the namespace, or below the node ("~/scan").
-        scheme: "rostopic://" or "rosservice://": rules that begin so hold for this kind alone.
+        scheme: "rostopic://" or "rosservice://"; a rule with the other scheme does not apply.
     """
     absolute = _absolute(name, namespace, node)
     for source, target in remappings.items():
@@ -66,7 +66,7 @@ def resolve(
         if source.startswith(scheme):
             rest = source.removeprefix(scheme)
         elif "://" in source or source.startswith("__") or (colon and before != node):
-            continue  # of another kind, the node's own name, or for another node
+            continue  # rule of the other kind, of the node's own name, or of another node
         if _absolute(rest, namespace, node) == absolute:
             return _absolute(target.removeprefix(scheme), namespace, node)
     return absolute
@@ -85,7 +85,7 @@ def _absolute(name: str, namespace: str, node: str) -> str:
 
 
 class _Lasting:
-    """Duration for which a check has failed without a break, since the first failing look."""
+    """Duration for which a check has failed without a break, since the first failure."""
 
     __slots__ = ("amiss", "seconds")
 
@@ -103,11 +103,11 @@ class InstanceHealth:
 
     Args:
         watch: the checks.
-        pid: of the run.
+        pid: pid of the run.
         now: time at which the run was ready.
 
     Attributes:
-        pid: of the run.
+        pid: pid of the run.
     """
 
     __slots__ = ("_lifecycle", "_looked", "_rate", "_stopped", "_stride", "_watch", "pid")
@@ -122,7 +122,7 @@ class InstanceHealth:
         self._rate = _Rate(watch.checks)
 
     def look(self, seen: Observation, now: float) -> str:
-        """Add a look; return the checks that have failed for too long, as text; "": none."""
+        """Add an observation; return a text on the checks that failed for too long; "": none."""
         gap = now - self._looked
         passed = min(gap, self._stride)
         self._looked = now
@@ -165,7 +165,7 @@ class _Rate:
         self._window = _WINDOW * wanted.timeout
         if wanted.rate > 0.0:
             self._window = max(self._window, _PERIODS / wanted.rate)
-        self._idle = wanted.timeout  # seconds that a node has until it must publish
+        self._idle = wanted.timeout  # seconds until the node must publish at its rate
         self._counts: deque[tuple[float, int]] = deque()
         self._messages = 0
         self._messages_amiss = 0
@@ -176,7 +176,7 @@ class _Rate:
         return self._messages_amiss / self.amiss.seconds
 
     def look(self, seen: Observation, now: float, passed: float, *, missed: bool) -> None:
-        """Count messages; `missed`: the last look is so long ago that some may have been lost."""
+        """Count messages; `missed`: so long since the last observation that some may be lost."""
         if seen.messages is None or missed:
             self._counts.clear()
         self._messages += seen.messages or 0

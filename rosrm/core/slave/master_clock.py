@@ -1,21 +1,21 @@
-"""Send times of the master's beats, by the clock of the slave."""
+"""Estimate of the send times of the master's beats, by the slave's clock."""
 
 from __future__ import annotations
 
 from typing import Final
 
-#: Share by which one monotonic clock may run faster than another: twice what `adjtimex` allows.
+#: Share by which one monotonic clock may run faster than another: twice the limit of `adjtimex`.
 _DRIFT: Final = 1e-3
 
 
 class BeatClock:
-    """Estimates the send time of beats, to tell a beat that waited in a socket from a prompt one.
+    """Estimator of the send time of beats, which recognizes beats that waited in a socket.
 
-    A slave that was stopped (SIGSTOP) finds old beats in its sockets. They name the hosts in
-    contact at their send time, not now. The monotonic clocks of two machines share only their rate.
-    So the fastest beat since the handshake gives the difference of the clocks, and a beat that took
-    longer was sent earlier by that time. The result is too late only by the transport time of the
-    fastest beat.
+    A slave that was stopped (SIGSTOP) finds old beats in its sockets. They name the silent hosts at
+    their send time, not now. The monotonic clocks of two machines share only their rate. So the
+    fastest beat since the handshake gives the difference of the clocks. A beat with a longer
+    transport was sent earlier by the additional time. The estimate is late only by the transport
+    time of the fastest beat.
     """
 
     def __init__(self) -> None:
@@ -23,11 +23,16 @@ class BeatClock:
         self._noted_at = 0.0
 
     def restart(self) -> None:
-        """Forget the difference of the clocks: a new or returned master may have another clock."""
+        """Forget the difference of the clocks, because a new master may have another clock."""
         self._ahead = None
 
     def sent_at(self, beat: float, now: float) -> float:
-        """Return the send time of a beat that arrives `now`; seconds, by master's and own clock."""
+        """Return the send time of a beat by the slave's clock, in seconds.
+
+        Args:
+            beat: send time by the master's clock.
+            now: time of arrival by the slave's clock.
+        """
         ahead = now - beat
         if self._ahead is not None:
             ahead = min(ahead, self._ahead + _DRIFT * (now - self._noted_at))

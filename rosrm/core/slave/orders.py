@@ -1,4 +1,4 @@
-"""Translation of the master's orders to events of the slave's core."""
+"""Conversion of the master's orders to events of the slave's core."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from rosrm.model import orders
 
 
 def event_of(order: orders.InstanceOrder, given_at: float | None = None) -> events.Event:
-    """Return the event of an order; all other orders are for the slave's runtime.
+    """Return the event of an order to the core; the slave's runtime handles all other orders.
 
     `given_at` is the earliest time of the order, by the slave's clock; None: just now.
     """

@@ -1,29 +1,29 @@
-"""The slave's reducer: (state, event, now) -> commands. Each kind of event is one row below.
+"""The slave's reducer: (state, event, now) -> commands. One row for each kind of event.
 
 ======================  =========================================================================
-event                   what the core does
+event                   action of the core
 ======================  =========================================================================
 Registered              stores the master's epoch, and refuses older ones from then on; repeats a
-                        report that may have reached no master
-MasterLost              keeps every end until a master has registered this host again
-AssignmentsReceived     launches each once, or holds it until a slot is free and those that are
-                        starting are ready; refuses one that was stopped before
+                        report that no master may have received
+MasterLost              remembers every end until a master has registered this host again
+AssignmentsReceived     launches each instance once, as soon as the bounds on running and starting
+                        instances allow; refuses an instance that was stopped before
 LaunchRefused           reports that the host cannot run the instance, and why
-StopOrdered             stops the instance; an unknown one will never be started
-FenceOrdered            the same, but at once
-ContactConfirmed        sends the contact to the supervisor, where there is a fence to renew
-RestartOrdered          stops the instance, and starts it again here
-RestartPolicySet        has the supervisor record the policy; for an instance that has ended or is
-                        not known, the order is settled
-RestartPolicyRecorded   settles the order
-ReportRequested         reports everything
-SupervisorReported      follows the instances; a new run must become ready again
+StopOrdered             stops the instance; an unknown instance will never be started
+FenceOrdered            kills the instance; an unknown instance will never be started
+ContactConfirmed        sends the last contact to the supervisor, if a live instance has a fence
+RestartOrdered          stops the instance, and starts it again on this host
+RestartPolicySet        orders the supervisor to record the policy; answers at once for an instance
+                        that waits, has ended or is unknown
+RestartPolicyRecorded   answers the order
+ReportRequested         reports all instances
+SupervisorReported      updates the statuses; a new run must become ready again
 SupervisorReplaced      the same; drops the instances that the new supervisor does not know,
-                        reports everything, and repeats orders that may be lost
-SeenInGraph             the instance is ready, also for a later run of this slave
+                        reports all instances, and repeats orders that may be lost
+SeenInGraph             marks the instance as ready, also for a later run of this slave
 LookedAt                ends an instance as failed if it has been unhealthy for too long
-TimePassed              stops an instance that is not ready in time, refuses one whose fence passed
-                        before its start, and drops old ends
+TimePassed              stops an instance that is not ready in time, refuses an instance whose fence
+                        expired before its start, and drops old ends
 ======================  =========================================================================
 """
 
@@ -51,14 +51,14 @@ def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
 def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:
     """Handle several events, in order.
 
-    A later event may drop an instance that an earlier one launches; then it is not launched.
+    An instance that an earlier event launches and a later event drops is not launched.
     """
     commands = [command for event in events for command in step(state, event, now)]
     return [
-        _still_held(state, command) if isinstance(command, Launch) else command
+        _without_dropped(state, command) if isinstance(command, Launch) else command
         for command in commands
     ]
 
 
-def _still_held(state: SlaveState, launch: Launch) -> Launch:
+def _without_dropped(state: SlaveState, launch: Launch) -> Launch:
     return Launch(tuple(one for one in launch.assignments if one.instance in state.held))

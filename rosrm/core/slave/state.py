@@ -1,4 +1,4 @@
-"""State of the slave's core, and rules that depend only on readings or a spec."""
+"""State of the slave's core, and rules that depend on readings or a spec alone."""
 
 from __future__ import annotations
 
@@ -30,16 +30,17 @@ class HeldInstance:
     """One instance on this host.
 
     Attributes:
-        status: as it was reported last.
-        spec: None where this slave found it running at its own start.
-        awaited: None: it is ready as soon as it runs.
-        ready_by: deadline for becoming ready; None: it is ready, or does not run.
-        watch: its health checks; None: none.
-        judgement: health of the watched run; None: not watched, or not begun yet.
+        status: newest reported status.
+        spec: None: the instance already ran when this slave started.
+        awaited: None: the instance is ready as soon as it runs.
+        ready_by: time by which it must be ready; None: it is ready, or does not run.
+        watch: health checks; None: no checks.
+        judgement: health of the watched run; None: not watched, or not observed yet.
         fenced: it has a fence.
-        unready: why it was stopped, where it did not become ready in time.
+        unready: why it was stopped, if it did not become ready in time; "": it did.
         unsettled: restart policies that the master has set and the supervisor has not recorded
             yet, in order.
+        ended_at: time of its end, or of the report of the end to a newly registered master.
     """
 
     status: InstanceStatus
@@ -60,7 +61,7 @@ class HeldInstance:
 
     @property
     def watched(self) -> Watch | None:
-        """Return the health checks in force now; None: none."""
+        """Return the health checks that apply now; None: none."""
         ready = self.status.state is InstanceState.READY
         return self.watch if ready and self.watch is not None and not self.watch.paused else None
 
@@ -70,15 +71,18 @@ class SlaveState:
     """The state of the slave's core.
 
     Attributes:
-        max_processes: most that run at a time; 0: no bound.
-        max_starting: most that are started at a time, until they are ready; 0: no bound.
-        max_age: seconds after which an assignment that was under way is not accepted.
-        waiting: assignments to be started as soon as the bounds allow, in order.
-        report_unconfirmed: a report was made while no master had registered this host: perhaps
-            after the registration was sent.
-        last_contact: last contact: newest known time at which the master received from this host;
-            0: unknown.
+        max_processes: highest number of running processes; 0: no bound.
+        max_starting: highest number of processes that are starting and not ready; 0: no bound.
+        max_age: age in seconds from which an assignment is not accepted.
+        registered: a master has registered this host.
+        report_unconfirmed: a report was made while this host was not registered, perhaps after the
+            registration was sent.
+        last_contact: newest known time at which the master received a message of this host; 0:
+            unknown.
         renewed_at: time of the last `Renew` to the supervisor.
+        held: all instances, including ended ones that may still be reported.
+        waiting: assignments that start as soon as the bounds allow, in order.
+        tombstones: ended and refused instances, which never start on this host again.
     """
 
     max_processes: int = 0
@@ -94,15 +98,15 @@ class SlaveState:
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
     def awaited_in_graph(self) -> Mapping[InstanceId, HeldInstance]:
-        """Return the instances that become ready when seen in the ROS graph."""
+        """Return the instances that become ready when their node appears in the ROS graph."""
         return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
 
     def watched(self) -> Mapping[InstanceId, HeldInstance]:
-        """Return the instances whose health is watched now."""
+        """Return the instances with health checks that apply now."""
         return {one: held for one, held in self.held.items() if held.watched is not None}
 
     def statuses(self) -> tuple[InstanceStatus, ...]:
-        """Return the status of every instance, including ended ones that are still remembered."""
+        """Return the status of every instance, including ended ones that may still be reported."""
         return tuple(held.status for held in self.held.values())
 
     def has_slot(self) -> bool:
@@ -110,7 +114,7 @@ class SlaveState:
         return not self.max_processes or self.live() - len(self.waiting) < self.max_processes
 
     def why_wait(self) -> str:
-        """Return why no more instances are started now; "" if they are."""
+        """Return why a further instance must wait for its start; "" if it need not."""
         if not self.has_slot():
             return "waits for a free slot there"
         if self.max_starting and self.starting() >= self.max_starting:
@@ -132,11 +136,11 @@ class SlaveState:
 def under_limits(
     usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
 ) -> bool:
-    """Return True if a host may ask for work: each limited reading is fresh and under its limit.
+    """Return True if a host may request work: each limited reading is fresh and under its limit.
 
     Args:
-        usage, limit: (slots,) fractions; 1 stands for no limit.
-        present, stale: bit i stands for slot i.
+        usage, limit: (slots,) fractions; limit 1: no limit.
+        present, stale: bit i is slot i.
     """
     limited = limit < 1.0
     used = limited & ((present & _SLOTS) != 0)
@@ -146,12 +150,6 @@ def under_limits(
 
 
 def awaits_graph(spec: ProcessSpec) -> bool:
-    """Return True if an instance is ready when seen in the ROS graph, not as soon as it runs."""
+    """Return True if an instance is ready when its node appears, False as soon as it runs."""
     kind = spec.readiness.kind
     return kind == "graph" or (kind == "auto" and bool(spec.ros))
-
-
-def qualified_name(namespace: str, node_name: str) -> str:
-    """Return a node's name with its namespace: `/robot/camera`."""
-    inside = namespace.strip("/")
-    return f"/{inside}/{node_name}" if inside else f"/{node_name}"

@@ -1,4 +1,4 @@
-"""Readiness and health of an instance, as a slave watches them."""
+"""Readiness and health checks of an instance."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from rosrm.model.values import Health
 class NoState(Enum):
     """Reason why the lifecycle state of a node is not known."""
 
-    NOT_YET = "the node has not been asked, or may still answer"
+    NOT_YET = "no request was sent to the node, or its answer may still arrive"
     NO_ANSWER = "the node does not answer"
 
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """Readiness of an instance that must be seen in the ROS graph.
+    """Readiness of an instance whose node must appear in the ROS graph.
 
     Attributes:
         node_name: fully qualified name of its node.
-        timeout: seconds that each of its runs has for it.
-        seen: pid of the run that was seen; 0: none was.
+        timeout: seconds in which the node of each run must appear.
+        seen: pid of the run whose node has appeared; 0: none.
     """
 
     node_name: str
@@ -35,11 +35,11 @@ class Watch:
     """Health checks of an instance that is ready.
 
     Attributes:
-        checks: as its spec declares.
-        topics: absolute names, on one of which it must publish; (): none.
-        services: absolute names under which its lifecycle state is queried; (): it is not.
-        restarts: its slave restarts it, unless a migration is under way.
-        paused: it is not watched for now: it is a shadow, or is being moved and may be silent.
+        checks: checks that the spec declares.
+        topics: absolute names, on one of which the node must publish; (): no check.
+        services: absolute names of services that return the lifecycle state; (): no check.
+        restarts: the slave restarts the instance, except during a migration.
+        paused: the checks are paused, because a shadow or a migrating instance may be silent.
     """
 
     checks: Health
@@ -51,13 +51,13 @@ class Watch:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Observation of an instance since the previous look.
+    """Observation of an instance since the previous observation.
 
     Attributes:
-        stopped: a signal has stopped its session leader.
-        messages: messages on its topic; None: the topic cannot be received.
+        stopped: a signal (SIGSTOP) has stopped its session leader.
+        messages: number of messages on its topic; None: the topic cannot be received.
         trouble: why the topic cannot be received; "": it can.
-        state: label of its lifecycle state, or the reason why there is none.
+        state: label of its lifecycle state, or the reason why the state is unknown.
     """
 
     stopped: bool = False
@@ -71,8 +71,8 @@ class Memo:
     """Facts about an instance for a later run of this slave, which does not know its spec.
 
     Attributes:
-        awaited: None: it is ready as soon as it runs.
-        watch: None: its health is not watched.
+        awaited: None: the instance is ready as soon as it runs.
+        watch: None: the instance has no health checks.
     """
 
     awaited: Awaited | None = None

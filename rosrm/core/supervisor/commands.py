@@ -8,13 +8,13 @@ from rosrm.core.supervisor.rules import Key
 
 
 class Spawn(NamedTuple):
-    """Start the instance; answered by Spawned or SpawnFailed."""
+    """Start the instance; `Spawned` or `SpawnFailed` follows."""
 
     instance: Key
 
 
 class Unspawn(NamedTuple):
-    """Give up a spawn that was not tried yet; then answered by SpawnFailed."""
+    """Cancel a spawn that has not begun; `SpawnFailed` follows, unless the spawn has begun."""
 
     instance: Key
 
@@ -27,19 +27,19 @@ class Signal(NamedTuple):
 
 
 class ReportStatus(NamedTuple):
-    """Record the status of the instance, then send it to the client."""
+    """Persist the status of the instance, then send it to the client."""
 
     instance: Key
 
 
 class Drop(NamedTuple):
-    """Forget the instance durably."""
+    """Remove the instance from the persisted state."""
 
     instance: Key
 
 
 class Leave(NamedTuple):
-    """End the supervisor: every instance has ended (or cannot be ended)."""
+    """End the supervisor, because every instance has ended or is stuck in the kernel."""
 
 
 Command = Spawn | Unspawn | Signal | ReportStatus | Drop | Leave

@@ -12,8 +12,8 @@ class StartOrdered(NamedTuple):
 
     Attributes:
         fence: None: no deadline stops the instance, even without contact to the master.
-        heard: last contact: newest time at which the master received from this host, as far as the
-            client knows; None: just now.
+        heard: last contact: newest time known to the client at which the master received a message
+            of this host; None: now.
     """
 
     instance: Key
@@ -24,19 +24,19 @@ class StartOrdered(NamedTuple):
 
 
 class StopOrdered(NamedTuple):
-    """The client ordered the instance to end, without a restart."""
+    """The client ordered to stop the instance for good."""
 
     instance: Key
 
 
 class FenceOrdered(NamedTuple):
-    """The client ordered all of the instance to end at once, because it has a successor."""
+    """The client ordered to kill the instance, because it has a successor."""
 
     instance: Key
 
 
 class ContactReported(NamedTuple):
-    """The client reported the last contact: the master received from this host at that time.
+    """The client reported the time at which the master last received a message of this host.
 
     Attributes:
         at: time of the last contact, by the monotonic clock.
@@ -64,9 +64,9 @@ class FailOrdered(NamedTuple):
     """The client found a run unhealthy: it counts as failed.
 
     Attributes:
-        pid: of the unhealthy run; another run is left alone.
-        reason: a text for listings and logs.
-        kill: the run is stopped (SIGSTOP) and cannot handle SIGINT: SIGKILL at once.
+        pid: pid of the unhealthy run; another run is not changed.
+        reason: text for listings and logs.
+        kill: send SIGKILL at once, because SIGSTOP has stopped the run, so it cannot handle SIGINT.
     """
 
     instance: Key
@@ -76,13 +76,13 @@ class FailOrdered(NamedTuple):
 
 
 class StatusStored(NamedTuple):
-    """The client has stored the final status: the supervisor need not keep it."""
+    """The client has stored the final status, so the supervisor may drop it."""
 
     instance: Key
 
 
 class Resumed(NamedTuple):
-    """A restarted supervisor found a start that was ordered and never tried."""
+    """A restarted supervisor found a start that was ordered and has not begun."""
 
     instance: Key
 
@@ -95,7 +95,7 @@ class Spawned(NamedTuple):
 
 
 class SpawnFailed(NamedTuple):
-    """The instance could not be started; `transient`: a retry may work."""
+    """The instance could not be started; `transient`: a retry may succeed."""
 
     instance: Key
     message: str
@@ -106,8 +106,8 @@ class Exited(NamedTuple):
     """The session leader has ended.
 
     Attributes:
-        code: exit code; UNKNOWN_EXIT: its end was not observed.
-        signal: that killed it; 0: none.
+        code: exit code; UNKNOWN_EXIT: the end was not observed.
+        signal: signal that killed it; 0: none.
         leftovers: other processes of its session still run.
     """
 
@@ -120,7 +120,7 @@ class Exited(NamedTuple):
 
 
 class SessionEnded(NamedTuple):
-    """The other processes of the session have ended too, after the session leader."""
+    """The other processes of the session have ended, after the session leader."""
 
     instance: Key
 
@@ -136,11 +136,11 @@ class TimePassed(NamedTuple):
 
 
 class ShutdownOrdered(NamedTuple):
-    """All instances are to end, and the supervisor with them."""
+    """A client or a signal ordered to stop all instances and the supervisor."""
 
 
 class ClientLost(NamedTuple):
-    """The client is gone. The instances keep running, each as long as its fence allows."""
+    """The connection to the client has ended; instances run on as long as their fences allow."""
 
 
 Event = (

@@ -1,4 +1,4 @@
-"""One instance of the supervisor: its state, and texts about it for listings."""
+"""State of one instance of the supervisor, and its texts for listings."""
 
 from __future__ import annotations
 
@@ -22,40 +22,40 @@ FENCED: Final = "fenced"
 WITHDRAWN: Final = "withdrawn"
 ENDED: Final[frozenset[Phase]] = frozenset({EXITED, FAILED, REFUSED, FENCED, WITHDRAWN})
 
-#: Next action for a stopping instance once no process of it is left; "": it is not being stopped.
+#: Next action for a stopping instance once none of its processes is left; "": it is not stopping.
 Then = Literal["", "end", "restart", "policy"]
 THEN_END: Final = "end"
 THEN_RESTART: Final = "restart"
 THEN_POLICY: Final = "policy"
 
 STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-#: Seconds between one SIGKILL and the next, for child processes forked in between.
+#: Seconds between two SIGKILLs, which also reach children that were forked in between.
 KILL_AGAIN: Final = 1.0
-#: SIGKILLs after which a shutdown no longer waits (a process stuck in the kernel).
+#: Number of SIGKILLs after which a shutdown stops waiting for a process stuck in the kernel.
 MOST_KILLS: Final = 5
-#: The exit code of a run whose end was not observed.
+#: Exit code of a run without an observed end.
 UNKNOWN_EXIT: Final = -1
 
 
 class Instance:
-    """The state of one instance; JSON can hold every field.
+    """The state of one instance; every field is valid JSON.
 
     Attributes:
-        then: next action once no process of it is left; "": it is not being stopped.
-        pid: of its session leader; 0: none.
-        started: time at which its last run began.
+        then: next action once none of its processes is left; "": it is not being stopped.
+        pid: pid of its session leader; 0: none.
+        started: start of its last run.
         recent: times of the restarts within the policy's window.
-        deadline: of the next step (signal or restart); None: none is due.
+        deadline: time of the next step (signal or restart); None: none is due.
         kills: number of SIGKILLs in this stop.
-        step: the last step of the stop, an index of STEPS; -1: none.
-        stop_began: time at which its stop began.
-        trail: the steps of the stop, as text.
-        fault: why its last run counts as failed, however it ended; "": its exit alone decides.
-        fence: None: none; never changes after the start.
-        heard: last contact: newest known time at which the master received from this host, or the
-            time of the start.
-        fenced: why it was fenced, as text; "": it was not, or was to end already.
-        kill_by: latest time of SIGKILL, once it is fenced; None: it is not.
+        step: last step of the stop, an index of STEPS; -1: none.
+        stop_began: start of its stop.
+        trail: text on the steps of the stop.
+        fault: why its last run counts as failed, regardless of its exit; "": its exit decides.
+        fence: None: no fence; never changes after the start.
+        heard: last contact: newest known time at which the master received a message of this host,
+            or the time of the start.
+        fenced: text on why it was fenced; "": not fenced, or already being stopped for good.
+        kill_by: latest time of SIGKILL after it was fenced; None: not fenced.
         withdrawn: the shutdown of the supervisor stops it, not an order of the client.
     """
 
@@ -101,7 +101,7 @@ class Instance:
 
     @property
     def fence_at(self) -> float | None:
-        """Return the time of its fence if there is no further contact; None: never (again)."""
+        """Return the time of its fence without further contact; None: no fence, or fenced."""
         if self.fence is None or self.kill_by is not None or self.ended:
             return None
         return self.heard + self.fence.after
@@ -117,7 +117,7 @@ def end(instance: Instance, phase: Phase, message: str) -> None:
 
 
 def stopping(instance: Instance) -> str:
-    """Return the cause and progress of a stop, as text."""
+    """Return a text on the cause and the progress of a stop."""
     why = {
         THEN_RESTART: "to restart it: ",
         THEN_POLICY: f"{ending(instance)}; {_left_to_stop(instance)}: ",
@@ -132,7 +132,7 @@ def _left_to_stop(instance: Instance) -> str:
 
 
 def ending(instance: Instance) -> str:
-    """Return the end of its last run, as text."""
+    """Return a text on the end of its last run."""
     if instance.fault:
         return instance.fault
     if instance.exit_signal:
@@ -143,7 +143,7 @@ def ending(instance: Instance) -> str:
 
 
 def signal_name(number: int) -> str:
-    """Return the name of a signal: SIGTERM for 15; a real-time signal by its number."""
+    """Return the name of a signal: "SIGTERM" for 15, "signal 34" for a real-time signal."""
     try:
         return signal.Signals(number).name
     except ValueError:

@@ -1,62 +1,62 @@
 """The supervisor's reducer for the instances of one host: a pure state machine.
 
-    phase     event            what follows                                  next phase
+    phase     event            commands and signals                          next phase
     -         StartOrdered     Spawn                                         starting
-                               its number is dead, or all is stopped: -      refused
-    -         StopOrdered      - (a start that comes late is refused)        refused
+                               its number is dead, or in a shutdown: -       refused
+    -         StopOrdered      - (a later order to start is refused)         refused
               FenceOrdered     -                                             refused
               RestartOrdered   -                                             refused
               AmendOrdered     -                                             refused
     starting  Spawned          -                                             running
-                               a stop came in between: SIGINT                stopping
+                               stop ordered in between: SIGINT               stopping
               SpawnFailed      this host cannot start it: -                  refused
                                transient: by policy                          failed, backoff
-              StopOrdered      Unspawn (one in hand is stopped later)        starting
-              FencePassed      Unspawn (one in hand is stopped later)        starting
-              FenceOrdered     Unspawn (one in hand is killed later)         starting
+              StopOrdered      Unspawn (a begun spawn is stopped later)      starting
+              FencePassed      Unspawn (a begun spawn is stopped later)      starting
+              FenceOrdered     Unspawn (a begun spawn is killed later)       starting
               Resumed          Spawn (the supervisor was restarted)          starting
-              AmendOrdered     - (the new policy holds from now on)          starting
+              AmendOrdered     - (the new policy applies from now on)        starting
     running   Exited           by policy                                     exited, failed, backoff
                                others of its session live: SIGINT            stopping
               StopOrdered      SIGINT                                        stopping
-              FencePassed      SIGINT; dead within the grace of its fence    stopping
+              FencePassed      SIGINT; SIGKILL within the fence's grace      stopping
               FenceOrdered     SIGKILL                                       stopping
-              RestartOrdered   SIGINT, to start again afterwards             stopping
+              RestartOrdered   SIGINT; restarts afterwards                   stopping
               FailOrdered      SIGINT, or SIGKILL at once; then by policy    stopping
               AmendOrdered     -                                             running
     stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
               Exited           as intended (end, restart, policy)            exited, starting, ...
                                others of its session live: -                 stopping
               SessionEnded     as intended (end, restart, policy)            exited, starting, ...
-              StopOrdered      from now on to end it                         stopping
-              FencePassed      the same, within the grace                    stopping
-              FenceOrdered     the same; SIGKILL                             stopping
-              RestartOrdered   unless it is to end: to start again           stopping
+              StopOrdered      - (ends afterwards, does not restart)         stopping
+              FencePassed      - (the same, within the fence's grace)        stopping
+              FenceOrdered     SIGKILL (the same)                            stopping
+              RestartOrdered   - (restarts afterwards, unless it must end)   stopping
               AmendOrdered     -                                             stopping
     backoff   TimePassed       Spawn                                         starting
-              RestartOrdered   Spawn, with the restarts at 0                 starting
+              RestartOrdered   Spawn (the count of restarts begins at 0)     starting
               StopOrdered      -                                             exited
               FencePassed      -                                             fenced
               FenceOrdered     -                                             fenced
               AmendOrdered     - (if the policy now allows no restart)       failed, backoff
     ended     StatusStored     Drop; its number is dead                      -
 
-An instance may have a fence: `FencePassed` follows without an order when the last contact with the
-master (`ContactReported`; the start counts as one) is too long ago. Where the fence is `alive`, a
-running slave counts as contact. A fenced instance is not restarted here, whatever its policy and
-whatever is ordered afterwards.
+An instance may have a fence: `FencePassed` occurs without an order when the last contact with the
+master (`ContactReported`; the start counts as one) is too long ago. If the fence is `alive`, a
+running slave counts as contact. A fenced instance is not restarted on this host, regardless of its
+policy and of later orders.
 
 `ShutdownOrdered` stops every instance as `StopOrdered` does. An instance that no order had stopped
-before ends as withdrawn, not exited, so that the master knows: neither the process nor the master
-ended it.
+before ends as withdrawn, not exited. So the master can distinguish this end from an end by its own
+order or by the process.
 
-`ClientLost` changes nothing: each instance keeps running as long as its fence allows.
+`ClientLost` changes nothing: each instance runs on as long as its fence allows.
 
-An event that is not in the table changes nothing. An order that changes nothing has its status
-reported again, because DDS may repeat it. Every change of an instance is reported (`ReportStatus`).
-A signal goes to every process that is left of an instance, and none is sent after its end.
+An event that is not in the table changes nothing. An order that changes nothing repeats the report
+of the status, because DDS may repeat the order. Every change of an instance is reported
+(`ReportStatus`). A signal goes to every remaining process of an instance, and never after its end.
 
-The supervisor imports this package and must stay small. So the package uses nothing of
+The supervisor imports this package and must stay small. So the package does not import
 `rosrm.model.values` (dataclasses alone cost 2 MiB); a test compares the values that are in both.
 """
 
@@ -71,10 +71,10 @@ from rosrm.core.supervisor.instance import BACKOFF, MOST_KILLS, REFUSED, THEN_EN
 from rosrm.core.supervisor.rules import Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS
 
-#: Process names whose dead numbers are remembered.
+#: Highest number of process names with a dead number.
 MOST_TOMBSTONES: Final = 2000
-#: Most restarts by policy within `RESTART_SPAN` seconds, so that instances that crashed together do
-#: not start together.
+#: Highest number of restarts by policy within `RESTART_SPAN` seconds, so that instances that
+#: crashed together do not restart together.
 MOST_RESTARTS: Final = 8
 RESTART_SPAN: Final = 1.0
 
@@ -89,8 +89,8 @@ class SupervisorState:
     """The instances of one host.
 
     Attributes:
-        instances: all that are not forgotten.
-        dead: process name to the highest forgotten number; instances up to it never start.
+        instances: all instances that were not dropped.
+        dead: process name to the highest dropped number; instances up to that number never start.
         closing: a shutdown was ordered.
     """
 
@@ -107,7 +107,7 @@ class SupervisorState:
         self._watch_deadline(instance)
 
     def deadline(self) -> float | None:
-        """Return the time at which `TimePassed` is due; None: never, as things are."""
+        """Return the time at which `TimePassed` is due; None: no deadline is set."""
         return min(self._timed.values(), default=None)
 
     @property
@@ -144,7 +144,7 @@ class SupervisorState:
             yield from self._unknown(event, now)
 
     def _renew(self, at: float, alive: float) -> None:
-        """Renew the fences; instances that are fenced already stay so."""
+        """Renew the fences of instances that are not fenced yet."""
         for instance in self.instances.values():
             if instance.fence is None or instance.fence_at is None:
                 continue
@@ -160,7 +160,7 @@ class SupervisorState:
         return self._apply(instance, events.FencePassed(instance.key), now)
 
     def _has_turn(self, instance: Instance, now: float) -> bool:
-        """Return True if its step is due and a restart may begin; otherwise it is due later."""
+        """Return True if its step is due; delay a restart beyond `MOST_RESTARTS`."""
         if instance.deadline is None or now < instance.deadline:
             return False
         if instance.phase != BACKOFF:

@@ -1,4 +1,4 @@
-"""The policies by which the supervisor restarts, stops and fences an instance."""
+"""Policies for the restart, stop and fence of an instance."""
 
 from __future__ import annotations
 

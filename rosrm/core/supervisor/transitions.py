@@ -1,4 +1,4 @@
-"""The supervisor's table of transitions: each changes an instance and returns commands."""
+"""Transition table of the supervisor; a transition changes an instance and returns commands."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from rosrm.core.supervisor.rules import RestartRule
 from rosrm.wording import counted
 
 _KILL: Final = len(STEPS) - 1
-#: Share of a wait by which a restart may be earlier, so that instances that crashed together do not
-#: start together.
+#: Largest share by which a back-off is shortened, so that instances that crashed together do not
+#: restart together.
 _JITTER: Final = 0.2
 
 Transition = Callable[[Instance, events.Event, float], list[Command]]
@@ -107,7 +107,7 @@ def _restart(instance: Instance, event: events.Event, now: float) -> list[Comman
 def _fail(instance: Instance, event: events.Event, now: float) -> list[Command]:
     assert isinstance(event, events.FailOrdered)
     if event.pid != instance.pid:
-        return []  # that run has already ended
+        return []  # the unhealthy run has already ended
     instance.fault = event.reason
     return _begin_stop(instance, THEN_POLICY, now, _KILL if event.kill else 0)
 
@@ -122,14 +122,14 @@ def _mean_to_end(instance: Instance, event: events.Event, now: float) -> list[Co
 
 def _mean_to_restart(instance: Instance, event: events.Event, now: float) -> list[Command]:
     if instance.then != THEN_POLICY or instance.fenced:
-        return []  # it is meant to end, or to start again already
+        return []  # the stop already leads to the end or to a restart
     instance.then = THEN_RESTART
     instance.message = stopping(instance)
     return [ReportStatus(instance.key)]
 
 
 def _escalate(instance: Instance, event: events.Event, now: float) -> list[Command]:
-    """Take the next step of a stop; after SIGKILL only SIGKILL again."""
+    """Send the next signal of a stop; repeat SIGKILL, which is the last one."""
     instance.step = _KILL if _must_be_gone(instance, now) else min(instance.step + 1, _KILL)
     number = STEPS[instance.step]
     after = f" after {now - instance.stop_began:.1f} s" if instance.trail else ""
@@ -257,7 +257,7 @@ def _begin_stop(instance: Instance, then: Then, now: float, first: int = 0) -> l
 
 
 def _take_fence(instance: Instance, event: events.Event, now: float) -> None:
-    """Fence an instance: it ends in time; one that was to end anyway ends as ordered."""
+    """Set the latest time of SIGKILL, and the reason unless a stop for good has begun before."""
     if isinstance(event, events.FenceOrdered) or instance.fence is None:
         why, by = "it has a successor", now
     else:
@@ -275,7 +275,7 @@ def _must_be_gone(instance: Instance, now: float) -> bool:
 
 
 def _grace(instance: Instance, now: float) -> float:
-    """Return the seconds until the next step; SIGINT and SIGTERM share the time left by a fence."""
+    """Return the seconds until the next signal; a fence scales the graces to the time left."""
     if instance.step == _KILL:
         return KILL_AGAIN
     graces = (instance.stop.interrupt_grace, instance.stop.terminate_grace)
@@ -335,13 +335,13 @@ def _recent_restarts(instance: Instance, now: float) -> int:
 
 
 def _chance(instance: Instance) -> float:
-    """Return a number from 0 to below 1, constant for each restart of each instance."""
+    """Return a pseudo-random number in [0, 1), constant for each restart of each instance."""
     name, number = instance.key
     return zlib.crc32(f"{name}#{number}/{instance.restarts}".encode()) / 2**32
 
 
 def backoff(rule: RestartRule, done: int) -> float:
-    """Return the seconds before the next restart, after `done` of them within the window."""
+    """Return the seconds before the next restart, after `done` restarts within the window."""
     wait = rule.delay
     for _ in range(done):
         wait = min(wait * rule.factor, rule.max_delay)

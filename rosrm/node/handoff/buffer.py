@@ -1,4 +1,4 @@
-"""Buffer of inputs that a shadow or a silent source keeps until one of them is active. Pure."""
+"""Input buffer of a shadow or a silent source, until one of them is active. Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-#: Covered time stamps per input that are remembered for messages that arrive after their mark.
+#: Stored covered time stamps per input, for messages that arrive after their mark.
 _REMEMBERED: Final = 4096
 
 
@@ -16,7 +16,7 @@ class Sent(NamedTuple):
 
     Attributes:
         stamp: source time stamp, ns.
-        number: position in its publisher's gapless order; None: not known.
+        number: position in its publisher's gapless order; None if unknown.
     """
 
     stamp: int
@@ -27,7 +27,7 @@ class BufferedMessage(NamedTuple):
     """One message in the buffer.
 
     Attributes:
-        topic: of the input.
+        topic: key of the input.
         stamp: source time stamp, ns.
         item: the message with all data needed to serve it.
         size: bytes.
@@ -46,8 +46,7 @@ class _Track:
     Attributes:
         covered: newest covered time stamps, in the order in which they were reported.
         newest: newest covered time stamp; None: none was covered.
-        mixed: time stamps are not in one order: several publishers, or one that was restarted
-            with its clock behind.
+        mixed: time stamps may decrease: several publishers, or one restarted with its clock behind.
         overlap: a message was received that the source has processed too.
         arrived_at: arrival of the last message, here or at the source, seconds.
         held: messages in the buffer.
@@ -141,7 +140,7 @@ class InputBuffer:
         self._messages = left
 
     def overlaps(self, topic: str) -> bool:
-        """Return True if a received message is covered too: from there on none is missing."""
+        """Return True if a received message is covered too; after that message none is missing."""
         return self._track(topic).overlap
 
     def misses_one(self, topic: str) -> bool:

@@ -12,8 +12,8 @@ from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport
 
 STATE: Final = latched(depth=1)
-#: For a follower of a state of several parts, because a newer message of one part must not replace
-#: the one that belongs to the other parts.
+#: For a follower of a state of several parts: a newer message of one part must not replace the one
+#: that belongs to the other parts.
 STATE_FOLLOWED: Final = latched(depth=10)
 MARK: Final = latched(depth=100)
 
@@ -28,12 +28,12 @@ class Channel:
     """Topic on which source, destination and master report the progress of a handoff.
 
     Args:
-        plain: rclpy's own methods of the node.
-        topic: as the master named it.
+        plain: gives access to rclpy's own methods of the node.
+        topic: name given by the master.
         destination: instance number that names the handoff.
         instance: this node's own number.
         peer: instance number of the other side.
-        take_report: called with each report of the other side.
+        take_report: receives each report of the other side.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Shadow: follows the source's state, and becomes active when the source is silent."""
+"""Destination of a handoff: follows the source's state until it takes over."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
 #: Seconds without a message after which an input counts as idle.
 _IDLE: Final = 1.0
-#: Seconds without a part or mark after which nothing more is expected of an ended source.
+#: Seconds without a part or mark after which an ended source counts as drained.
 _QUIET: Final = 0.2
 #: Seconds for which all readers have to be matched. A reader discovers a writer later than the
-#: writer discovers the reader: 0.4 s on a busy machine, and after a lost announcement only when
-#: Fast DDS repeats it (with 0.5 s here, outputs came 1.3 to 1.9 s late in 5 of 200 migrations
-#: beside other load).
+#: writer discovers the reader: 0.4 s on a busy machine. After a lost announcement it waits until
+#: Fast DDS repeats the announcement. (With 0.5 s here, outputs came 1.3 to 1.9 s late in 5 of 200
+#: migrations beside other load.)
 _MATCHED: Final = 1.5
 #: Seconds between two checks of the conditions that a shadow waits for.
 _REVIEW: Final = 0.1
 
 
 class Destination:
-    """The role of a shadow until it is active; then `activated` is called."""
+    """Role of a shadow until it is active; then `activated` is called."""
 
     def __init__(
         self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str,
@@ -68,7 +68,7 @@ class Destination:
         if channel is None:
             channel = self._open(config)
         else:
-            channel.repeat()  # a new master may be asking, after the first was lost
+            channel.repeat()  # the request may come from a new master, after the first was lost
         if config.phase == StateConfig.DONE:
             self.close()
         elif self._ended:
@@ -93,7 +93,7 @@ class Destination:
             channel.report(HandoffReport.FAILED, 0, self._fault)
             return channel
         self._assembler = CutAssembler()
-        # Marks first, also in `_catch_up`: they name the parts that are worth keeping.
+        # Marks first, also in `_catch_up`, because they name the parts to store.
         self._follow(StateMark, self._mark_topic, self._take_mark, topics.MARK)
         for part in self._parts:
             self.follow_part(part)
@@ -103,7 +103,7 @@ class Destination:
         return channel
 
     def follow_part(self, part: StateTopic) -> None:
-        """Subscribe to a part of the state, also to one that the author names later."""
+        """Subscribe to a part of the state; the author may name parts later."""
         if self._assembler is not None:
             take = partial(self._assembler.add_part, part.topic)
             self._assembler.expect(part.topic)
@@ -122,8 +122,8 @@ class Destination:
                 event_callbacks=topics.NO_SUBSCRIPTION_EVENTS,
             )  # fmt: skip
             self._followed.append((subscription, take))
-        except Exception as error:  # noqa: BLE001 - rclpy raises what the middleware says
-            # An entity of the author's may have another type on that topic.
+        except Exception as error:  # noqa: BLE001 - rclpy passes on any error of the middleware
+            # An entity of the author may have another type on that topic.
             self._end(HandoffReport.FAILED, f"{topic} cannot be followed: {error}")
 
     # --- messages of the source ------------------------------------------------------------
@@ -150,7 +150,7 @@ class Destination:
             self._go_on()
 
     def _catch_up(self) -> None:
-        """Take all received messages; one at a time, a shadow would stay behind a fast source."""
+        """Take all received messages: with one a round, a shadow would lag behind a fast source."""
         for subscription, take in self._followed:
             for message, _ in waiting(subscription):
                 if self._ended:
@@ -166,7 +166,7 @@ class Destination:
             self._assembler.add_mark(mark, time.monotonic())
 
     def _fault_of(self, mark: StateMark) -> str:
-        """Return a reason why this node cannot use the source's state; "": there is none."""
+        """Return the reason why this node cannot use the source's state; "" if it can."""
         if mark.protocol_version != PROTOCOL_VERSION:
             return (
                 f"the source speaks protocol version {mark.protocol_version}, this node "
@@ -177,10 +177,9 @@ class Destination:
         differing = differing_part(self._parts, mark)
         if differing is None:
             return ""
-        topic, ours, theirs = differing
         return (
-            f"the state on {topic} is {theirs} at the source, and {ours} here: both must be the "
-            f"same program"
+            f"the state on {differing.topic} is {differing.theirs} at the source, and "
+            f"{differing.ours} here: both must be the same program"
         )
 
     # --- following -------------------------------------------------------------------------
@@ -233,14 +232,14 @@ class Destination:
             self._channel.report(HandoffReport.SWITCHING, self._sequence())
 
     def _is_last(self, cut: Cut) -> bool:
-        """Return True for this handoff's last state; an earlier handoff's may be latched too."""
+        """Return True for the last state of this handoff; an earlier one may be latched too."""
         return bool(cut.mark.last) and cut.mark.sequence == self._silent_at
 
     def _sequence(self) -> int:
         return int(self._cut.mark.sequence) if self._cut is not None else 0
 
     def _still_missing(self) -> str:
-        """Return the condition that keeps this node from being ready; "": there is none."""
+        """Return the condition that this node waits for before it is ready; "" if it is ready."""
         if not self._attached:
             return "for the source to answer: is it up, and does it use rosrm.node?"
         if self._cut is None:
@@ -286,7 +285,7 @@ class Destination:
         return f"for the first state, marked on {self._mark_topic}"
 
     def _follows(self, topic: str, now: float) -> bool:
-        """Return True if no message of an input can be missing both here and in the state."""
+        """Return True if each message of an input is in the buffer or covered by the state."""
         buffer = self._entities.buffer
         if all(one.key != topic for one in self._entities.inputs) or buffer.overlaps(topic):
             return True
@@ -295,7 +294,7 @@ class Destination:
     # --- the end ---------------------------------------------------------------------------
 
     def _take_over_when_quiet(self) -> None:
-        """Become active after the source's end, once the last of its messages have arrived."""
+        """Become active after the source's end, when its last messages have arrived."""
         if time.monotonic() - self._last_report < _QUIET:
             return
         if self._cut is None:
@@ -332,7 +331,7 @@ class Destination:
             self._channel.report(HandoffReport.ACTIVE, self._sequence())
 
     def _end(self, phase: int, message: str) -> None:
-        """Give up for good; this process then runs until its slave stops it."""
+        """Abandon the handoff for good; this process then runs until its slave stops it."""
         self._ended, self._fault = True, message
         self._entities.node.get_logger().warning(f"will not take over: {message}")
         if self._channel is not None:

@@ -15,12 +15,12 @@ _END: Final = object()
 
 
 class InputReplay:
-    """Serves buffered messages in the executor, so a callback's exception reaches the author.
+    """Replay in the executor, so that a callback's exception reaches the author.
 
     Args:
-        plain: rclpy's own methods of the node.
-        turn: held while a callback runs.
-        serve_next: serves the oldest buffered message; False: none is left.
+        plain: gives access to rclpy's own methods of the node.
+        turn: lock that is held while a callback runs.
+        serve_next: serves the oldest buffered message; returns False if none is left.
     """
 
     def __init__(self, plain: Any, turn: Any, serve_next: Callable[[], bool]) -> None:
@@ -34,13 +34,13 @@ class InputReplay:
 
     @property
     def is_on(self) -> bool:
-        """True while buffered messages may be left; new messages then have to queue behind them."""
+        """Return True while buffered messages may be left; new messages then queue behind them."""
         return self._timer is not None
 
     def begin(self, beside: Iterator[None]) -> None:
         """Serve all buffered messages, in slices, from the executor's next round on.
 
-        After each slice `beside`, further work, is advanced by one step.
+        After each slice the generator `beside` (further work) is advanced by one step.
         """
         self._beside = beside
         self._start()

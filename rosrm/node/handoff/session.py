@@ -20,9 +20,9 @@ _PARAMETERS: Final = "_rosrm/parameters"
 
 
 class HandoffSession:
-    """The handoffs of one node: first perhaps as a destination, later as a source.
+    """Handoffs of one node: possibly first as a destination, later as a source.
 
-    `plain` has rclpy's own methods of the node.
+    `plain` gives access to rclpy's own methods of the node.
     """
 
     def __init__(self, node: Any, plain: Any, identity: NodeIdentity) -> None:
@@ -38,7 +38,7 @@ class HandoffSession:
         self._subscription: Any = None
 
     def begin(self) -> None:
-        """Take the first role; called by the node's constructor, before the author's continues."""
+        """Take the first role; called by `Node`'s constructor, before the author's continues."""
         node = self.entities.node
         for fault in self._damaged:
             node.get_logger().warning(f"ignoring a damaged snapshot: {fault}")
@@ -94,12 +94,12 @@ class HandoffSession:
         with self.entities.turn:
             try:
                 role.configure(config)
-            except Exception as error:  # noqa: BLE001 - no message of the master ends the node
+            except Exception as error:  # noqa: BLE001 - no message of the master may end the node
                 what = f"{type(error).__name__}: {error}"
                 self.entities.node.get_logger().error(f"a state_config cannot be followed: {what}")
 
     def _fault_of(self, config: StateConfig) -> str:
-        """Return a reason to ignore this message; "": it comes from this node's master."""
+        """Return the reason to ignore this message; "" if it comes from this node's master."""
         if config.protocol_version != PROTOCOL_VERSION:
             return (
                 f"its protocol version is {config.protocol_version}, this node's {PROTOCOL_VERSION}"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-#: Newest parts of one topic that are kept although no mark names them yet.
+#: Newest stored parts of one topic that no mark names yet.
 _KEPT: Final = 16
 
 
@@ -33,7 +33,7 @@ class Cut:
     """A complete state.
 
     Attributes:
-        mark: as received.
+        mark: the mark as received.
         passed: skipped earlier marks; this state covers everything that they cover.
         parts: serialised messages by topic.
         arrived: arrival of the mark, monotonic seconds.
@@ -46,7 +46,7 @@ class Cut:
 
 
 class CutAssembler:
-    """Finds the newest state of which every part has arrived."""
+    """Assembly of the newest state whose parts have all arrived."""
 
     def __init__(self) -> None:
         self._at_hand: dict[str, dict[PartKey, bytes]] = {}

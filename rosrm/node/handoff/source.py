@@ -28,7 +28,7 @@ _AT_ONCE: Final = Duration(nanoseconds=0)
 
 
 class HandoffSource:
-    """The role of the active node towards a successor."""
+    """Role of the active node towards a successor."""
 
     def __init__(self, entities: NodeEntities, parts: list[StateTopic], mark_topic: str) -> None:
         self._entities = entities
@@ -76,7 +76,7 @@ class HandoffSource:
     def _show(self, *, last: bool = False) -> bool:
         """Publish the state between two cycles, and the mark that lists the covered inputs.
 
-        Returns False if that fails; the master has received the reason.
+        Return False on a failure, which has been reported to the master.
         """
         try:
             for part in self._parts:
@@ -96,7 +96,7 @@ class HandoffSource:
                     self._entities.node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
     def _failed(self, fault: str) -> None:
-        """Report that the state cannot be published: this handoff fails, the node stays active."""
+        """Report that the state cannot be published; the handoff fails, the node stays active."""
         if not self._fault:
             self._entities.node.get_logger().error(f"{fault}. This node stays where it is")
         self._fault = fault
@@ -179,7 +179,7 @@ class HandoffSource:
         entities, wanted = self._entities, self._finishing
         self._finishing = False
         if self._channel is None or not wanted or self._fault:
-            return  # the handoff was called off
+            return  # the handoff was aborted
         self._timers_due = entities.fall_silent()
         self._silent_since = time.monotonic()
         if not self._show(last=True):
@@ -189,7 +189,10 @@ class HandoffSource:
         self._release_timer = steady_timer(entities.plain, _LOOK, self._release)
 
     def _release(self) -> None:
-        """Report RELEASED when all outputs are acknowledged (a stop loses others) or time is up."""
+        """Report RELEASED when all outputs are acknowledged, or after the time-out.
+
+        An output without an acknowledgement is lost when the process stops.
+        """
         with self._entities.turn:
             received = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
             if received or time.monotonic() - self._silent_since >= _ACK_PATIENCE:

@@ -1,9 +1,9 @@
-"""The parts of a node's state: saved and published by the source, restored by the destination."""
+"""Parts of a node's state: saved and published by the source, restored by the destination."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
@@ -18,14 +18,14 @@ LARGEST_PART: Final = 256 << 20
 
 
 class StateError(Exception):
-    """A state cannot be saved or restored; the text names it and the reason."""
+    """A state cannot be saved or restored; the text names the state and the reason."""
 
 
 class StateTopic:
     """One topic of a node's state; the arguments are those of `Migratable.keep_state`.
 
     Attributes:
-        retained: the saved message is held after publishing too, because snapshots store it.
+        retained: the saved message stays in memory after publishing, because snapshots store it.
     """
 
     def __init__(
@@ -137,13 +137,21 @@ class StateTopic:
         self._key, self._data, self._published = key, data, None
 
 
-def differing_part(parts: Iterable[StateTopic], mark: StateMark) -> tuple[str, str, str] | None:
-    """Return topic, own type and marked type of a part that differs; a missing one is "none"."""
+class DifferingPart(NamedTuple):
+    """A part of which this node and a mark name different types; a missing one is "none"."""
+
+    topic: str
+    ours: str
+    theirs: str
+
+
+def differing_part(parts: Iterable[StateTopic], mark: StateMark) -> DifferingPart | None:
+    """Return the first part that differs; None: all are the same."""
     ours = {part.topic: part.type_name for part in parts}
     marked = {part.topic: part.type for part in mark.parts}
     for topic in sorted(ours.keys() | marked.keys()):
         if ours.get(topic) != marked.get(topic):
-            return topic, ours.get(topic, "none"), marked.get(topic, "none")
+            return DifferingPart(topic, ours.get(topic, "none"), marked.get(topic, "none"))
     return None
 
 

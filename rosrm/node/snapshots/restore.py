@@ -18,7 +18,7 @@ from rosrm.snapshots.reader import newest
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 
-#: Seconds for the author's constructor to name all parts if it spins first; check interval.
+#: Seconds for the author's constructor to name all parts, if it spins first; check interval.
 _PATIENCE: Final = 10.0
 _LOOK: Final = 0.02
 _REMEDY: Final = (
@@ -28,21 +28,21 @@ _REMEDY: Final = (
 
 
 def newest_snapshot(identity: NodeIdentity) -> tuple[Listing | None, list[str]]:
-    """Return a process's snapshot, or None, and the faults of its damaged files."""
+    """Return a process's newest snapshot, None without one, and faults of damaged files."""
     if identity.shadow or not identity.keep:
         return None, []
     return newest(Path(identity.keep), up_to=identity.instance)
 
 
 class SnapshotRestore:
-    """Restores a snapshot in the executor's first round; until then the node is like a shadow.
+    """Restore of a snapshot in the executor's first round; until then the node acts as a shadow.
 
     By then the author's constructor has returned (or has named all parts), and no callback of the
     author has run.
 
     Args:
         entities: the node, at rest.
-        parts: of its state; parts that the author names later are added to this very list.
+        parts: parts of its state; those that the author names later are appended to this list.
         snapshot: the snapshot.
         done: called when the node is active.
     """
@@ -74,7 +74,7 @@ class SnapshotRestore:
             self._start(mark)
 
     def _is_incomplete(self) -> bool:
-        """Return True if the author's constructor spins and has not named all parts yet."""
+        """Return True if the author's constructor spins before it has named all parts."""
         return len(self._parts) < len(self._snapshot.blocks) - 1
 
     def _restored(self) -> StateMark:
@@ -105,10 +105,9 @@ class SnapshotRestore:
         differing = differing_part(self._parts, mark)
         if differing is None:
             return ""
-        topic, ours, theirs = differing
         return (
-            f"its part on {topic} is {theirs}, and this program's {ours}: it is of another version "
-            f"of the program"
+            f"its part on {differing.topic} is {differing.theirs}, and this program's "
+            f"{differing.ours}: it is of another version of the program"
         )
 
     def _start(self, mark: StateMark) -> None:

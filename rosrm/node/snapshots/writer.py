@@ -1,6 +1,6 @@
-"""Storage of an active node's newest snapshot in a file, for the next start of its process.
+"""Writer of an active node's newest snapshot, for the next start of its process.
 
-In the author's cycle the state is only saved, as for a following shadow; a thread writes the file.
+The author's cycle only saves the state, as for a shadow; a thread writes the file.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _LOGGED_EVERY: Final = 60.0
 
 
 class SnapshotSaver:
-    """Saves snapshots between cycles, as often as `_SHARE` allows, at least each `keep_every` s.
+    """Periodic saving between cycles, as often as `_SHARE` allows, at least each `keep_every` s.
 
     Args:
         entities: the node, whose identity names the directory.
-        parts: of its state; parts that the author names later are added to this very list.
+        parts: parts of its state; those that the author names later are appended to this list.
         run: random number of this run of the node.
     """
 
@@ -140,7 +140,7 @@ class SnapshotSaver:
             return
         self._closed = True
         atexit.unregister(self.close)
-        # Another thread of the executor may be stuck in a callback: waiting for it has a limit.
+        # The wait is limited, because another thread of the executor may be stuck in a callback.
         if self._entities.turn.acquire(timeout=_CLOSE_PATIENCE):
             try:
                 if self._may_keep():
@@ -151,7 +151,7 @@ class SnapshotSaver:
 
 
 class _Writer:
-    """A thread that writes the newest snapshot; newer ones replace any that still wait."""
+    """Thread that writes the newest snapshot; a newer one replaces one that still waits."""
 
     def __init__(self, entities: NodeEntities) -> None:
         self._entities = entities
@@ -167,7 +167,9 @@ class _Writer:
         with self._changed:
             self._waiting = sequence, blocks
             self._changed.notify()
-        if self._thread is None:  # not sooner, because it would delay a successor's announcement
+        if (
+            self._thread is None
+        ):  # not earlier, because writing would delay a successor's announcement
             self._thread = threading.Thread(target=self._work, name="rosrm snapshots", daemon=True)
             self._thread.start()
 
@@ -193,7 +195,7 @@ class _Writer:
             self._slots.close()
 
     def _write(self, sequence: int, blocks: Sequence[Block]) -> bool:
-        """Write a snapshot; return False if a newer instance writes there: this one then stops."""
+        """Write a snapshot; return False, to end the thread, if a newer instance writes there."""
         identity = self._entities.identity
         try:
             if self._slots is None:

@@ -305,7 +305,7 @@ class SlaveEndpoint:
         self._reporter.note_master(beat)
         return self._beat_clock.sent_at(beat / 1e9, now)
 
-    # --- asking for work -----------------------------------------------------------------
+    # --- requesting work -----------------------------------------------------------------
 
     def ask(self, now: float) -> None:
         """Ask for work, unless a request is open already.

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.core.slave.state import qualified_name
-from rosrm.model.values import Assignment
+from rosrm.model.values import Assignment, qualified_name
 from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
 from rosrm.runtime.ros_wheels import without_bootstrapper

@@ -17,8 +17,8 @@ from rosrm.extensions.contracts import (
     ProcessTreeLauncher,
 )
 from rosrm.extensions.discovery import FAULTS
+from rosrm.extensions.made import MadeLauncher, MadeLaunchers
 from rosrm.extensions.plugin_calls import implements, required
-from rosrm.extensions.registry import MadeLauncher, MadeLaunchers
 from rosrm.extensions.time_limit import limited
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 

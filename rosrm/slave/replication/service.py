@@ -99,7 +99,7 @@ class ReplicationService:
         self._endpoint = endpoint
         self._post, self._publish = post, publish
         self._store = SnapshotStore(root, settings.max_bytes)
-        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._shipments: dict[str, _Shipment] = {}
         self._transfers: dict[str, _Transfer] = {}
         #: Instances that wait for a snapshot; None: the local search is running.
@@ -116,8 +116,8 @@ class ReplicationService:
     # --- the thread ----------------------------------------------------------------------
 
     def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            job()
+        while True:
+            self._jobs.get()()
 
     def _in_thread(
         self, work: Callable[[], Any], then: Callable[[Any], None], otherwise: Any = None
@@ -177,7 +177,7 @@ class ReplicationService:
         if now >= self._next_scan:
             self._next_scan = now + _SCAN_EVERY
             if self._snapshots or self._store.is_used():
-                self._in_thread(self._store.scan, self._scanned)
+                self._in_thread(partial(self._scan, now), self._scanned)
         for shipment in list(self._shipments.values()):
             self._begin_due(shipment, now)
         for transfer in list(self._transfers.values()):
@@ -189,6 +189,10 @@ class ReplicationService:
     def states(self) -> tuple[SnapshotReport, ...]:
         """Return the snapshots on this host, as of the last scan."""
         return self._snapshots
+
+    def _scan(self, now: float) -> tuple[SnapshotReport, ...]:
+        self._store.abandon_interrupted(now)
+        return self._store.scan()
 
     def _scanned(self, states: tuple[SnapshotReport, ...] | None) -> None:
         if states is not None:
@@ -295,7 +299,10 @@ class ReplicationService:
                 self._next_scan = 0.0  # the master may need the new replica at once
             answer(refusal)
 
-        self._in_thread(partial(self._store.take, part, bounded=True), taken, _FAILED)
+        self._in_thread(partial(self._take, part, bounded=True), taken, _FAILED)
+
+    def _take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
+        return self._store.take(part, time.monotonic(), bounded=bounded)
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,
@@ -355,7 +362,7 @@ class ReplicationService:
         fetch.advance(time.monotonic())
 
     def _take_fetched(self, part: TransferPart, then: Callable[[NotStored | None], None]) -> None:
-        self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)
+        self._in_thread(partial(self._take, part, bounded=False), then, _FAILED)
 
     def is_preparing(self, instance: InstanceId) -> bool:
         """Return True if the start of an instance waits for a snapshot."""

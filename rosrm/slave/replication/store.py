@@ -17,6 +17,8 @@ from rosrm.snapshots.writer import CopyWriter, drop_snapshots
 
 #: Seconds for which a snapshot stays in memory between reads of its parts.
 _READ_FOR: Final = 10.0
+#: Seconds without a part after which a transfer to this host counts as interrupted.
+_INTERRUPTED: Final = 30.0
 
 
 @dataclass(slots=True)
@@ -25,6 +27,7 @@ class _Incoming:
     total: int
     writer: CopyWriter
     digest: int = 0
+    until: float = 0.0
 
 
 @dataclass(slots=True)
@@ -93,7 +96,7 @@ class SnapshotStore:
 
     # --- incoming snapshots --------------------------------------------------------------
 
-    def take(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
+    def take(self, part: TransferPart, now: float, *, bounded: bool) -> NotStored | None:
         """Write a part of a snapshot; return why it was refused, or None. The last completes it.
 
         With `bounded` it is of another host's process, and `max_bytes` limits all such replicas.
@@ -105,6 +108,7 @@ class SnapshotStore:
         coming = self._incoming.get(part.process)
         if coming is None or coming.age != part.age or coming.writer.size != part.offset:
             return NotStored("order", "it does not follow the part before it: send all parts again")
+        coming.until = now + _INTERRUPTED
         try:
             coming.writer.append(part.data)
             coming.digest = zlib.crc32(part.data, coming.digest)
@@ -159,6 +163,11 @@ class SnapshotStore:
         if head.process != part.process:
             drop_snapshots(self.directory(part.process), head.instance)
             raise Damaged(f"it is a state of {head.process!r}")
+
+    def abandon_interrupted(self, now: float) -> None:
+        """Delete the unfinished replicas whose senders send no more; they take room."""
+        for process in [name for name, one in self._incoming.items() if now >= one.until]:
+            self._abandon(process)
 
     def _abandon(self, process: str) -> None:
         coming = self._incoming.pop(process, None)

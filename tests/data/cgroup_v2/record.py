@@ -27,7 +27,7 @@ def record(target: Path) -> None:
 
 
 def copy(source: Path, target: Path) -> None:
-    """Of the mounts only those of control groups: the others are nobody's business."""
+    """Copy a file of /proc; of the mounts only those of control groups, for privacy."""
     if not source.exists():
         return
     text = source.read_text()

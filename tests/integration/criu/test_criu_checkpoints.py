@@ -15,7 +15,7 @@ import pytest
 from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
-from rosrm_criu.executors import artifacts, request
+from rosrm_criu.executors import artifacts, attempts
 from rosrm_criu.executors import checkpoint as steps
 from tests.criu_kit import TIMEOUT, eventually
 
@@ -77,8 +77,8 @@ class Slave:
 @pytest.fixture
 def slave(theatre, tmp_path):
     """Return a slave that was just started and remembers no attempt."""
-    artifacts._flights.clear()
-    request._turned_back.clear()
+    attempts._flights.clear()
+    attempts._turned_back.clear()
     return Slave(theatre, tmp_path / "state")
 
 
@@ -125,7 +125,7 @@ def test_a_process_continues_from_its_image_with_its_port(slave, counter):
     assert not is_free(port)
     slave.ask("take", destination=3)
     restored = slave.shim(3)
-    assert slave.ask("await_kept", destination=3)["seconds"]["restore"] > 0.0
+    assert slave.ask("await_checkpoint", destination=3)["seconds"]["restore"] > 0.0
     restored.counts()
     assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
     nothing_left(slave)
@@ -138,14 +138,14 @@ def test_a_restored_process_can_be_checkpointed_again(slave, counter):
     before = checkpointed(slave, counter)
     slave.ask("take", destination=3)
     restored = slave.shim(3)
-    slave.ask("await_kept", destination=3)
+    slave.ask("await_checkpoint", destination=3)
     restored.counts()
     slave.ask("keep", source=3, destination=4)
     slave.ask("kill", source=3, destination=4)
     restored.process.wait(TIMEOUT)
     slave.ask("take", source=3, destination=5)
     again = slave.shim(5)
-    slave.ask("await_kept", source=3, destination=5)
+    slave.ask("await_checkpoint", source=3, destination=5)
     again.counts()
     told = before + restored.numbers() + again.numbers()
     assert told == list(range(1, told[-1] + 1))
@@ -206,12 +206,12 @@ def test_an_undone_restore_leaves_the_image_as_it_was(slave, counter):
     page.unlink()  # only the hard link
     failed = slave.shim()
     with pytest.raises(CriuError, match="damaged"):
-        slave.ask("await_kept")
+        slave.ask("await_checkpoint")
     failed.process.wait(TIMEOUT)
     assert slave.ask("put_back") == {}
     slave.ask("take")
     restored = slave.shim()
-    slave.ask("await_kept")
+    slave.ask("await_checkpoint")
     restored.counts()
     assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
     slave.end(restored)
@@ -227,7 +227,7 @@ def test_an_image_that_changed_on_the_disk_is_not_restored(slave, counter):
     slave.ask("take")
     failed = slave.shim()
     with pytest.raises(CriuError, match=r"damaged: criu/pages-1\.img .* `rosrm restart p`"):
-        slave.ask("await_kept")
+        slave.ask("await_checkpoint")
     failed.process.wait(TIMEOUT)
     assert slave.ask("put_back") == {}
     assert numbers(slave.state, "kept") == [1]

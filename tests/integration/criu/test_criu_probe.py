@@ -42,6 +42,7 @@ def test_as_a_program_it_says_so_in_one_line(criu):
     ("suite", "version"), [("bookworm", "3.17"), ("trixie", "4.1")], ids=["3.17", "4.1"]
 )
 @pytest.mark.slow  # the packages are downloaded once
+@pytest.mark.timeout(600)
 def test_a_criu_that_is_too_old_is_reported(old, suite, version):
     """The probe rejects Debian 12's CRIU on current kernels, and Debian 13's at the socket."""
     found = old(suite)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.extensions.contracts import LauncherContext
-from rosrm.extensions.registry import MadeLauncher
+from rosrm.extensions.made import MadeLauncher
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 from rosrm_criu.launcher import CriuLauncher

@@ -108,7 +108,7 @@ def test_environments_of_one_batch_stay_apart(host, client):
     )
     for name, said in (("first", "1,2,\n"), ("second", "3,,4\n")):
         log = host.log(name)
-        wait_until(partial(_written, log), f"a word of {name}")
+        wait_until(partial(_written, log), f"output of {name}")
         assert log.read_text() == said
 
 

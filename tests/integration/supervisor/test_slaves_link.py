@@ -137,7 +137,7 @@ def test_a_supervisor_that_reads_no_orders_is_reconnected(loop, monkeypatch) -> 
         lambda: any("takes no orders" in one for one in loop.log.messages), "a log line about it"
     )
     os.kill(loop.pid, signal.SIGCONT)
-    loop.wait(lambda: len(loop.replaced()) == 2, "it is connected to anew")
+    loop.wait(lambda: len(loop.replaced()) == 2, "a second connection")
     assert {status.instance for status in loop.replaced()[1].statuses} == set(MANY)
     assert loop.supervisor() == loop.pid
     loop.wait(lambda: len(loop.host.alive()) == COUNT, "each runs, once")

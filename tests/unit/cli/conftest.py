@@ -140,7 +140,7 @@ class FakeClient:
             last_sequence=max((row.sequence for row in self.events), default=0),
             hosts=self.hosts if hosts else (), processes=self.processes if processes else (),
             plugins=[row for row in self.plugins if plugins and plugins in (True, row.state)],
-            events=chosen[-newest:] if events and newest else chosen if events else (),
+            events=chosen[-(newest or 1000) :] if events else (),
         )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from types import SimpleNamespace
 
 import pytest
@@ -56,6 +57,21 @@ def test_the_kind_of_a_right_file_is_known_by_its_keys(check, text, said):
     result = check(text)
     assert result.code == 0
     assert f"f.yaml: {said}" in result.out
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("processes: [{name: a, command: x, kind: job}]", "-: ok, work: 1 job\n"),
+        ("host: h1", "-: ok, a host: h1, probes cpu\n"),
+        ("scoring: {policy: weighted}", "-: ok, a cluster: scoring weighted,"),
+    ],
+)
+def test_the_standard_input_is_checked(rosrm, monkeypatch, text, said):
+    """One read must do for the kind of the file and for its content."""
+    stdin = SimpleNamespace(buffer=io.BytesIO(text.encode()))
+    monkeypatch.setattr("rosrm.config.documents.sys", SimpleNamespace(stdin=stdin))
+    assert said in rosrm("config", "check", "-").out
 
 
 @pytest.mark.parametrize(
@@ -166,7 +182,7 @@ processes: [{name: a}, {name: b, arguments: [--ros-args, -r, '__node:=a']}]
         ("processes: [{name: a, command: x, needs: {cpus: 1}}]",
          ":1:43: warning: needs: no probe reads 'cpus'; did you mean 'cpu'?"),
         (NAMESAKES,
-         ": warning: a and b put the node /a into the ROS graph; give each node a name of"),
+         ": warning: a and b put the node /a into the ROS graph; give each node its own name"),
     ],
 )  # fmt: skip
 def test_what_may_be_a_mistake_is_a_warning(check, tmp_path, text, warning):

@@ -188,4 +188,4 @@ def test_a_domain_of_the_environment_is_checked_before_ros_is_joined(monkeypatch
             f"rosrm: ROS_DOMAIN_ID={word!r} is not a whole number from 0 to 232; set the variable "
             f"to one, or give --domain N\n"
         )
-    RosSettings(domain=3).check_domain()
+    RosSettings(domain=3).check()

@@ -9,10 +9,11 @@ import pytest
 
 from rosrm.cli.commands import runtimes
 from rosrm.config.settings import ClusterConfig, HostConfig
-from rosrm.extensions.contracts import Intent, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.extensions.installed import installed_plugins
 from rosrm.extensions.registry import Registry
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.records import Intent
 from rosrm.runtime.bootstrap import take_over
 from rosrm.runtime.state_lock import only_one
 from rosrm.testing import FakeProbe

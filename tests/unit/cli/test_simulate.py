@@ -156,9 +156,9 @@ def test_a_replay_with_other_decisions_is_reported(rosrm, tmp_path, content):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda whole: whole[:-5], "the record is cut short at byte"),
-        (lambda whole: whole.replace(b"record 1", b"record 9", 1), "is a record of version 9"),
-        (lambda whole: whole[:500] + b"\0" + whole[501:], "the record is damaged at byte"),
+        (lambda whole: whole[:-5], "the recording is cut short at byte"),
+        (lambda whole: whole.replace(b"record 1", b"record 9", 1), "is a recording of version 9"),
+        (lambda whole: whole[:500] + b"\0" + whole[501:], "the recording is damaged at byte"),
     ],
 )
 def test_a_bad_record_is_one_clear_error(rosrm, tmp_path, content, change, said):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm import Client, ConfigError, NoMaster, ProcessSpec, Refused
+from rosrm import Client, ConfigError, NoMaster, ProcessSpec, Refused, RosSettings
 from tests.unit.cli.conftest import FakeClient, event, host, process
 
 
@@ -25,6 +25,21 @@ def client(master, notes, monkeypatch):
     with Client(connection=master, notify=notes.append) as client:
         yield client
     assert master.closed
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"domain": 500}, "the ROS domain 500 is not a whole number from 0 to 232"),
+        ({"domain": -1}, "the ROS domain -1 is not a whole number"),
+        ({"domain": "7"}, "the ROS domain '7' is not a whole number"),
+        ({"ros": RosSettings(domain=7, namespace="lab")}, "'lab' is not an absolute ROS namespace"),
+    ],
+)
+def test_settings_that_ros_cannot_use_are_refused(settings, message):
+    """DDS would end the program of a user whose domain is too high."""
+    with pytest.raises(ConfigError, match=message):
+        Client(timeout=0.1, **settings)
 
 
 def test_submit_takes_files_mappings_and_specs(client, master, tmp_path):
@@ -82,6 +97,19 @@ def test_events_follow_until_their_time_out(client, master, monkeypatch):
     monkeypatch.setattr("time.sleep", later)
     following = client.events(follow=True, timeout=0.2)
     assert [one.sequence for one in following] == [1, 2, 3]
+
+
+def test_followed_events_are_complete(client, master, monkeypatch):
+    """More events than one listing has by default may follow between two requests."""
+    many = [event(number) for number in range(3, 2003)]
+
+    def later(seconds):
+        master.events += many
+        many.clear()
+
+    monkeypatch.setattr("time.sleep", later)
+    following = client.events(follow=True, timeout=0.2)
+    assert [one.sequence for one in following] == list(range(1, 2003))
 
 
 def test_events_that_are_not_followed_do_not_wait_for_a_master(client, master):

@@ -241,7 +241,7 @@ def test_options_that_nothing_takes_are_refused(refusal, registry, text, said):
 
 def test_a_default_plugin_that_is_not_installed_is_reported(refusal):
     said = refusal(load_cluster, "", Registry.of())
-    assert "unknown scoring policy 'weighted'. None is installed; rosrm-scoring brings" in said
+    assert "unknown scoring policy 'weighted'. None is installed; rosrm-scoring has" in said
     assert "unknown migration strategy 'relaunch'" in said
 
 
@@ -257,7 +257,7 @@ class ByResource:
     ("text", "said"),
     [
         ("scoring: {policy: w, options: {weights: {memroy: 1.0}}}",
-         "weights: unknown resource 'memroy'; did you mean 'memory'? Allowed: memory (what"),
+         "weights: unknown resource 'memroy'; did you mean 'memory'? Allowed: memory (resources"),
         ("scoring: {policy: w, options: {watch: [memory, dsk]}}",
          "f.yaml:1:48: options of scoring policy 'w': watch: unknown resource 'dsk'. Allowed"),
         ("scoring: {policy: w}\ndefaults: {needs: {memroy: 1MB}}", "2:20: defaults.needs: unknown"),

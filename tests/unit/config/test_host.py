@@ -136,7 +136,7 @@ def test_a_resource_that_no_probe_reads_is_refused_with_the_nearest(refusal, wit
     said = refusal(load_host, f"{section}: {{dsik: 0.5}}", with_fds)
     assert said == (
         f"f.yaml:1:{len(section) + 4}: {section}: unknown resource 'dsik'; did you mean 'disk'? "
-        "Allowed: disk, fds (what the probes that are installed here read)"
+        "Allowed: disk, fds (resources of the probes that are installed here)"
     )
 
 

@@ -159,18 +159,27 @@ def test_braces_are_plain_without_foreach(file):
         ("{i: range(3)}", "n{i:zz}", "'n{i:zz}': 'zz' is no format for 0"),
         ("{i: range(3)}", "n{i:099999}", "'099999' is no format for 0"),
         ("{i: range(3)}", "n{i.x}", "unknown name 'i.x'"),
+        (f"{{i: range({'9' * 5000})}}", "n{i}", "a list or range(first, end) is required, not"),
+        ("{i: [1]}", "n{i:c}{i:1000c}", "is no format for 1"),
+        (f"{{i: [{10**12}]}}", "n{i:c}", f"'c' is no format for {10**12}"),
         ("{i: range(0)}", "n{i}", "f.yaml:1:37: foreach: makes no process"),
         ("{i: 'range(0,5,0)'}", "n{i}", "f.yaml:1:41: foreach.i: a step of 0"),
         ("{i: range(10001)}", "n{i}", "foreach: makes more than 10000 processes"),
+        (f"{{i: range({'9' * 5000})}}", "n{i}", "foreach.i: a list or range(first, end) is requi"),
+        ("{i: [-1]}", "n{i:c}", "'n{i:c}': 'c' is no format for -1"),
         (
             "{i: 5}",
             "n{i}",
             "f.yaml:1:41: foreach.i: a list or range(first, end) is required, not 5",
         ),
         ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is required, not a list"),
-        ("[{i: 1}, {j: 1}]", "n{i}", "f.yaml:1:46: foreach: gives j, and the first of the list i"),
+        (
+            "[{i: 1}, {j: 1}]",
+            "n{i}",
+            "f.yaml:1:46: foreach: this entry has the names j, and the first entry i",
+        ),
         ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is required"),
-        ("[1]", "n", "f.yaml:1:35: foreach: each of a list is a mapping from names to values"),
+        ("[1]", "n", "f.yaml:1:35: foreach: each entry of a list must map names to values"),
     ],
 )
 def test_a_wrong_foreach_is_refused_with_its_place(refusal, foreach, name, said):
@@ -235,7 +244,7 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
     [
         ("command: x, module: y, prioritty: 1", "module and command are given; give one of"),
         ("command: x, health: {topic: /scan}, prioritty: 1", "health.topic and health.rate"),
-        ("command: x, isolation: {after: 1s}, priority: high", "isolation.after goes with"),
+        ("command: x, isolation: {after: 1s}, priority: high", "isolation.after requires"),
         ("command: x, migration: relunch, prioritty: 1", "unknown migration strategy 'relunch'"),
         ("command: x, migration: {strategy: relunch, overlapp: true}, prioritty: 1",
          "unknown migration strategy 'relunch'"),
@@ -343,10 +352,10 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
     [
         ("", "f.yaml:1:1: processes: a list of at least one process is required"),
         ("processes: []", "f.yaml:1:12: processes: a list of at least one"),
-        ("processes: [a]", "f.yaml:1:13: processes: each of the list is a mapping"),
+        ("processes: [a]", "f.yaml:1:13: processes: each entry must be a mapping"),
         ("- {name: a}", "f.yaml:1:1: a work file is a mapping, not a list; put the list under `pr"),
         ("exec python3 robot", "f.yaml:1:1: a work file is a mapping, not text; it has `proces"),
-        ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name belongs to one"),
+        ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name is allowed in"),
         ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is required"),
     ],
 )
@@ -388,9 +397,9 @@ def test_a_standby_needs_a_strategy_that_can_shadow(file, refusal):
     follow = MigrationOffer("follow", lambda options: options, capabilities=follows)
     registry = registry_of(RELAUNCH, follow)
     said = refusal(load_work, text.replace("STRATEGY", "relaunch"), registry)
-    assert "f.yaml:1:44: a standby follows the state of its process, and relaunch cannot" in said
-    assert "say `migration: follow`" in said
-    assert "without a migration strategy" in refusal(load_work, text.replace("STRATEGY", "null"))
+    assert "f.yaml:1:44: a standby needs a migration strategy that copies state" in said
+    assert "relaunch has no standby: write `migration: follow`" in said
+    assert "no migration strategy is given" in refusal(load_work, text.replace("STRATEGY", "null"))
     for known in (registry, None):
         (spec,) = load_work(file(text.replace("STRATEGY", "follow")), known)
         assert spec.standby.wanted

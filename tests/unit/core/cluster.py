@@ -27,7 +27,7 @@ from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.process import Process
 from rosrm.core.slave import events
-from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
+from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.registry import Registry
@@ -45,6 +45,7 @@ from rosrm.model.plan import (
     Start,
     Stop,
 )
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import (
     EMPTY,
     InstanceStatus,
@@ -421,12 +422,12 @@ class Cluster(World[Machine]):
         """Deliver all messages between the master and a host; return True if there were any."""
         if not machine.connected:
             return False
-        busy = bool(machine.polled or machine.ordered or machine.said)
+        busy = bool(machine.polled or machine.ordered or machine.status_batches)
         machine.fetch(self.now)
         while machine.ordered:
             self.tell(machine.obey(machine.ordered.popleft(), self.now))
-        while machine.said:
-            self.tell(machine.said.popleft())
+        while machine.status_batches:
+            self.tell(machine.status_batches.popleft())
         return busy
 
     def nodes_talk(self, *, heard: bool = True) -> bool:

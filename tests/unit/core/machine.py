@@ -224,7 +224,7 @@ class Machine(Host[Program]):
         self.incarnation += 1000
         self.fresh = True
         self.sequence = self.batches = 0
-        self.said.clear()
+        self.status_batches.clear()
         self.ordered.clear()
         self.polled.clear()
         self.slave = SlaveState(max_processes=self.max_processes)

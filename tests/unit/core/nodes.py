@@ -33,7 +33,7 @@ class Node:
         quirks: shared with its machine, so that they may change while it runs.
         handoff: number of the destination of the handoff that it takes part in; 0: none.
         heard: reports received from the other node in this handoff.
-        said: reports sent in this handoff; a late subscriber receives all of them.
+        sent: reports sent in this handoff; a late subscriber receives all of them.
         configs, reports: messages on their way to this node.
     """
 
@@ -43,7 +43,7 @@ class Node:
     active: bool = True
     handoff: int = 0
     heard: set[ReportPhase] = field(default_factory=set)
-    said: list[HandoffReported] = field(default_factory=list)
+    sent: list[HandoffReported] = field(default_factory=list)
     configs: deque[PublishStateConfig] = field(default_factory=deque)
     reports: deque[HandoffReported] = field(default_factory=deque)
     switched: bool = False
@@ -55,12 +55,12 @@ class Node:
         self.active = not self.shadow
 
     def has_said(self, phase: ReportPhase) -> bool:
-        return any(report.phase is phase for report in self.said)
+        return any(report.phase is phase for report in self.sent)
 
     def say(self, phase: ReportPhase, message: str = "") -> None:
         number = self.instance.number
         report = HandoffReported(self.instance.process, self.handoff, number, phase, 7, message)
-        self.said.append(report)
+        self.sent.append(report)
         if self.air is not None:
             self.air.spread(self, report)
 
@@ -71,7 +71,7 @@ class Node:
             return
         if config.destination != self.handoff:
             self.handoff, self.switched, self.resumed = config.destination, False, False
-            self.said.clear()
+            self.sent.clear()
             self.heard.clear()
             if self.air is not None:
                 self.air.open(self)
@@ -205,7 +205,7 @@ class Air:
             self.channels.add(channel)
             for machine, node in self.nodes():
                 if (node.instance.process, node.handoff) == channel:
-                    self.to_master += [(machine, report) for report in node.said]
+                    self.to_master += [(machine, report) for report in node.sent]
         for _, node in self.nodes():
             if _names(config, node):
                 node.configs.append(config)
@@ -224,7 +224,7 @@ class Air:
         """Subscribe a node to its channel; it receives all earlier reports."""
         for _, node in self.nodes():
             if node is not listener and _together(node, listener):
-                listener.reports.extend(node.said)
+                listener.reports.extend(node.sent)
 
     def others(self, node: Node) -> list[Node]:
         """Return the other nodes of a process that run and are reachable from this node."""

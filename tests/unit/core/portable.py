@@ -12,7 +12,16 @@ from rosrm.model.orders import RunExecutor
 from rosrm.model.values import InstanceId, InstanceState
 from rosrm_criu.engine.compatibility import FACTS
 from rosrm_criu.options import CriuOptions
-from rosrm_criu.plans import ABILITY, AWAIT_RESTORED, CHECKPOINT, END, FETCH, GO_ON, INTRODUCE, JOIN
+from rosrm_criu.plans import (
+    AWAIT_RESTORED,
+    CHECKPOINT,
+    END,
+    FETCH,
+    GO_ON,
+    HOST_CHECK,
+    INTRODUCE,
+    JOIN,
+)
 from rosrm_criu.strategy import Criu
 from tests.unit.core.machine import Machine
 from tests.unit.core.nodes import Node
@@ -57,7 +66,7 @@ class Portable(Machine):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.executors |= {
-            ABILITY: lambda _: _ALIKE, INTRODUCE: lambda _: {}, FETCH: lambda _: {},
+            HOST_CHECK: lambda _: _ALIKE, INTRODUCE: lambda _: {}, FETCH: lambda _: {},
             CHECKPOINT: self._checkpoint, GO_ON: self._go_on, END: self._end_source,
             AWAIT_RESTORED: self._await_restored, JOIN: self._join,
         }  # fmt: skip

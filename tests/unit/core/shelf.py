@@ -17,7 +17,7 @@ PATIENCE = 5.0
 class Freezer(StartFirstOrStopFirst):
     """Strategy that moves like `relaunch` and takes checkpoint images."""
 
-    ability = "can_freeze"
+    host_check = "can_freeze"
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         return ""
@@ -110,7 +110,7 @@ class Shelf:
             answer = task(arguments) or {}
             if name in self.mute:
                 self.mute -= {name} if self.passing else set()
-                raise RuntimeError("nothing was heard")
+                raise RuntimeError("no answer")
             return answer
 
         return execute

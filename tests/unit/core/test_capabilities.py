@@ -18,7 +18,7 @@ from tests.unit.core.machine import Machine
 class Freezing:
     """Strategy that restores an image of the source at the destination, like `criu`."""
 
-    ability = "can_freeze"
+    host_check = "can_freeze"
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         same = source["version"] == destination["version"]
@@ -51,9 +51,9 @@ class Host:
 
     def __init__(self, name: str, version: str = "4.2", **fields: Any) -> None:
         self.asked: list[tuple[str, Mapping[str, Any]]] = []
-        self.ability: Any = {"version": version}
+        self.facts: Any = {"version": version}
         results = {
-            "can_freeze": lambda: self.ability,
+            "can_freeze": lambda: self.facts,
             "freeze": lambda: {"port": 4242},
             "fetch": dict,
         }
@@ -120,7 +120,7 @@ def test_a_process_moves_to_a_host_of_the_same_capability(killed: bool) -> None:
 def test_a_host_without_the_capability_is_no_destination():
     """The reply names the host's own reason."""
     there = busy("b")
-    there.ability = RuntimeError("CRIU 3.17 is too old")
+    there.facts = RuntimeError("CRIU 3.17 is too old")
     cluster = frozen(Host("a"), there)
     reply = cluster.migrate("p", "b")
     assert not reply.accepted
@@ -152,7 +152,7 @@ def test_hosts_without_the_plugin_are_no_destinations() -> None:
     )
 
 
-def test_a_strategy_that_fails_to_name_its_capability_is_called_again():
+def test_a_strategy_that_fails_to_name_its_host_check_is_called_again():
     """One late plugin call must not exclude the strategy from every host until a slave restarts."""
     host, cluster = Host("a"), Cluster(strategies={"freezing": Freezing()})
     limit, cluster.state.plugins.limit = cluster.state.plugins.limit, late

@@ -104,7 +104,7 @@ class Life(RuleBasedStateMachine):
         numbers = {one.number for one in self.machine.programs}
         holds = set(shelf.taken)
         whole = (numbers - shelf.frozen - holds) & (shelf.alive | {self.first})
-        assert numbers - shelf.frozen - holds == whole, "it has begun anew"
+        assert numbers - shelf.frozen - holds == whole, "the process began again"
         assert len(whole) <= 1, "it is there twice"
         copies = len(shelf.images) + len(shelf.taken)
         assert len(whole) + copies == 1, f"awake {whole}, images {shelf.images}, {shelf.taken}"

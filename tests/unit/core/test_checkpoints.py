@@ -187,7 +187,7 @@ def test_a_cancelled_restore_that_has_succeeded_is_stopped() -> None:
     def cancel_meanwhile(arguments: Any) -> Any:
         restored(arguments)
         shelf.machine.executors["await"] = restored
-        raise RuntimeError("nothing was heard")
+        raise RuntimeError("no answer")
 
     shelf.machine.executors["await"] = cancel_meanwhile
     shelf.trouble["put_back"] = "busy"
@@ -241,7 +241,7 @@ def test_without_a_strategy_that_takes_images_there_is_no_checkpoint() -> None:
     """The refusal names the strategy to use."""
     cluster = Cluster("a").with_processes(movable("p"))
     said = cluster.checkpoint("p").message
-    assert "nothing that is selected here can checkpoint p: name `criu`" in said
+    assert "no selected strategy can checkpoint p: name `criu`" in said
 
 
 def test_a_host_without_the_capability_takes_no_image() -> None:
@@ -297,7 +297,7 @@ def test_a_host_that_is_closed_or_away_restores_nothing() -> None:
     assert "on a alone, which is lost" in cluster.restore("p").message
     assert cluster.explain("p")["reason"] == "its image is on a, which is lost"
     cluster.kill_master()
-    assert "a, which has not come back" in cluster.explain("p")["reason"]
+    assert "a, which has not reported" in cluster.explain("p")["reason"]
     cluster.rejoin("a", 0.5)
     assert cluster.explain("p")["reason"] == "its image is on a"
     assert cluster.restore("p").accepted
@@ -536,7 +536,7 @@ def look(shelf: Shelf, cluster: Cluster, first: int) -> None:
         assert (running, len(shelf.images), shelf.taken) == ([], 1, {})
     else:
         assert awake == running == [cluster["p"].owner]
-        assert set(running) <= shelf.alive | {first}, "it has begun anew"
+        assert set(running) <= shelf.alive | {first}, "the process began again"
         assert not shelf.images
 
 

@@ -57,7 +57,7 @@ class Life(RuleBasedStateMachine):
         self.cluster = story(then, delay=delay)
         self.cluster.air.left = GivenUp(self.cluster)  # type: ignore[assignment]
         self.patience = LEASE + delay + 25.0
-        self.may_begin_anew = then != "wait"
+        self.may_restart = then != "wait"
         self.begun: set[int] = set()
         self.changed_at = self.cluster.now
 
@@ -111,7 +111,7 @@ class Life(RuleBasedStateMachine):
     def lose(self, machine: Portable, power: bool) -> None:
         if machine.connected and power:
             machine.lose_power(self.cluster.now)
-            self.may_begin_anew = True
+            self.may_restart = True
         machine.connected = False
         self.changed_at = self.cluster.now
 
@@ -192,7 +192,7 @@ class Life(RuleBasedStateMachine):
         for machine in self.machines:
             for instance, program in machine.programs.items():
                 self.begun |= set() if program.assignment.restored else {instance.number}
-        assert self.may_begin_anew or len(self.begun) == 1, self.begun
+        assert self.may_restart or len(self.begun) == 1, self.begun
 
     @invariant()
     def its_policy_is_followed(self) -> None:

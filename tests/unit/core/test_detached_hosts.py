@@ -75,7 +75,7 @@ def test_an_end_before_the_stop_of_the_slave_is_known() -> None:
     cluster = Cluster("a").with_processes(process("p"), job("q"))
     machine = cluster.machines["a"]
     machine.finish("q", cluster.now)
-    machine.said.clear()  # on its way, and overtaken by the last message
+    machine.status_batches.clear()  # on its way, and overtaken by the last message
     cluster.detach("a")
     assert cluster.phase("q") == "finished"
 

@@ -83,6 +83,28 @@ def test_a_reading_that_crosses_the_limit_each_second_is_recorded_once() -> None
     assert cluster.recorded("under_limit") == ["a is under its limits"]
 
 
+def test_a_silent_host_is_not_recorded_as_under_its_limits() -> None:
+    """Only a new reading shows on which side of its limit the host is."""
+    cluster = cluster_of(machine("a", memory=0.9), machine("b"))
+    cluster.wait(1.0)
+    cluster.cut("a", seconds=6.0)
+    assert (len(cluster.recorded("over_limit")), cluster.recorded("under_limit")) == (1, [])
+    cluster.machines["a"].busy["memory"] = 0.1
+    cluster.reconnect("a", seconds=4.0)
+    assert cluster.recorded("under_limit") == ["a is under its limits"]
+
+
+def test_a_limit_that_no_process_can_relieve_does_not_hide_another() -> None:
+    """The CPU load is not rosrm's; the memory limit is exceeded later, and is relieved."""
+    cluster = on_a({"p": 300}, machine("b"))
+    cluster.machines["a"].busy["cpu"] = 0.9
+    cluster.wait(3.0)
+    assert cluster.recorded("nothing_moves") == ["nothing can leave a: p uses no cpu"]
+    cluster.machines["a"].busy["memory"] = 0.6
+    cluster.wait(3.0)
+    assert cluster.where("p") == ["b"]
+
+
 def test_the_process_that_leaves_uses_the_exceeded_resource() -> None:
     """A process that uses no CPU does not leave a host over its CPU limit."""
     cluster = on_a({"fat": 400, "busy": 10})

@@ -139,7 +139,7 @@ def test_a_refreshed_ranking_equals_a_new_one(
         need = ranking.need[:, host.column] if own else np.full(len(table.resources), 0.1)
         table.add_reservation(host, need, processes=1)
         if own:
-            ranking.took()
+            ranking.note_assignment()
         ranking.refresh()
         assert ranking.value.tolist() == ranked(table, demand).value.tolist()
 

@@ -114,7 +114,7 @@ def test_the_old_instance_is_fenced_when_its_host_rejoins(restarted: bool) -> No
     assert cluster.where("p") == ["b"]
     assert [order.instance.number for order in cluster.orders(FenceInstance)] == [1]
     (message, *_) = cluster.recorded("fenced")
-    assert message.startswith("p#1 is not assigned to a: the master has it killed")
+    assert message.startswith("p#1 is not assigned to a: the master fences it")
 
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["same master", "restarted master"])
@@ -225,7 +225,7 @@ def test_a_process_that_is_being_cancelled_when_its_host_is_lost_has_the_reason(
     assert (cluster.phase("p"), cluster["p"].reason) == ("stopping", BEING_CANCELLED)
     cluster.kill_master()
     assert cluster.phase("p") == "stopping"
-    assert "a, which has not come back since the master started" in cluster["p"].reason
+    assert "a, which has not reported since the master started" in cluster["p"].reason
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.rejoin("a")
     assert cluster.phase("p") == "cancelled"

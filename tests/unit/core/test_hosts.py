@@ -271,7 +271,7 @@ def test_after_a_lost_status_batch_the_master_requests_a_full_report(last: bool)
     cluster = Cluster("a").with_processes(job("p"), process("q"))
     machine = cluster.machines["a"]
     machine.finish("p", cluster.now)
-    machine.said.clear()
+    machine.status_batches.clear()
     if last:
         cluster.wait(2.0)
     else:

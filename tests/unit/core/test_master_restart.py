@@ -53,7 +53,7 @@ def test_running_processes_keep_running_and_are_not_started_twice() -> None:
     pids = {n: m.programs[next(iter(m.programs))].pid for n, m in cluster.machines.items()}
     cluster.kill_master()
     assert cluster.phase("p") == "unreachable"
-    assert "has not come back since the master started" in cluster["p"].reason
+    assert "has not reported since the master started" in cluster["p"].reason
     cluster.restart_master()
     assert (cluster.phase("p"), cluster.phase("q")) == ("running", "running")
     assert {n: m.programs[next(iter(m.programs))].pid for n, m in cluster.machines.items()} == pids

@@ -46,7 +46,7 @@ class Host:
         self.sweeps = 0
         self.answer: Any = {"size": 5000, "seconds": {"prepare": 0.1, "dump": 0.2, "join": 0.3}}
         executors = {
-            "criu_ability": lambda _: {**HOST_FACTS, "host": name, "no_transfer": ""},
+            "criu_host_check": lambda _: {**HOST_FACTS, "host": name, "no_transfer": ""},
             "criu_dump": self._dump, "criu_sweep": self._sweep,
         }  # fmt: skip
         self.machine = Machine(name, executors=executors)
@@ -132,6 +132,19 @@ def test_the_first_checkpoint_is_recorded_and_explained():
     told = cluster.explain("p")["checkpoint"]
     assert (told["size"], told["trouble"]) == (5000, "")
     assert 0.0 <= told["elapsed"] <= 11.0
+
+
+@pytest.mark.parametrize(
+    "number", [float("inf"), float("nan"), pytest.param(10**400, id="huge"), -1, "big"]
+)
+def test_a_strange_number_in_a_result_counts_as_zero(number):
+    """A plugin's executor may answer anything that JSON can hold, and the master continues."""
+    host = Host()
+    host.answer = {"size": number, "seconds": {"dump": number}}
+    cluster = running(Pacing(), host)
+    cluster.wait(15.0)
+    assert cluster.explain("p")["checkpoint"]["size"] == 0
+    assert len(cluster.recorded("periodic_checkpoint")) == 1
 
 
 def test_a_failed_checkpoint_is_recorded_once_and_retried():

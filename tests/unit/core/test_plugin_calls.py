@@ -150,7 +150,7 @@ def leave(_plugin: object) -> Any:
 
 @pytest.mark.parametrize(
     "members",
-    ["propose", "spec_fault", "ability host_fault", "checkpoint restore",
+    ["propose", "spec_fault", "host_check host_fault", "checkpoint restore",
      "checkpoint_every periodic discard", "pace"],
 )  # fmt: skip
 def test_a_property_of_a_plugin_that_raises_costs_one_decision(members: str) -> None:

@@ -77,7 +77,10 @@ BROKEN = [
         answers(lambda n: Scores(np.zeros(n), ["no"] * n)),
         "vetoes of type <U2; booleans are required, True: vetoed",
     ),
-    (by_name, "'name' of the spec, which its offer does not declare: say ScoringOffer(..., reads="),
+    (
+        by_name,
+        "'name' of the spec, which its offer does not declare: write ScoringOffer(..., reads=",
+    ),
     (reads("name", ""), "UndeclaredField"),
     (reads("nmae"), "AttributeError: a spec has no field 'nmae'; it has name, namespace"),
     (writes, "read-only"),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rosrm.core.master import events as happened
-from rosrm.extensions.contracts import Record
 from rosrm.model.orders import StopInstance
+from rosrm.model.records import Record
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, process
 

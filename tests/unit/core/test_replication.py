@@ -316,6 +316,22 @@ def test_the_replicas_of_a_pruned_process_are_dropped():
     assert cluster.machines[third].host_id not in dropped_on
 
 
+def test_the_order_about_a_pruned_process_is_forgotten():
+    """Otherwise a master would keep one for each name that ever had a snapshot."""
+    policy = Asked()
+    cluster = running(policy)
+    policy.answer = CheckpointChoice((others(cluster)[0],))
+    cluster.wait(2.0)
+    assert "p" in cluster.state.replication.last_orders
+    for name in cluster.machines:
+        keep(cluster, name)
+    cluster.cancel("p")
+    cluster.wait(2.0)
+    assert cluster.ask(happened.PruneRequested, ("p",), ()).accepted
+    cluster.wait(2.0)
+    assert cluster.state.replication.last_orders == {}
+
+
 def test_the_next_master_drops_the_replicas_of_a_pruned_process():
     """A host that returns after a restart of the master is ordered to drop it, and nothing else."""
     cluster = running(Asked())
@@ -426,7 +442,7 @@ def test_after_a_start_of_the_master_a_process_waits_for_the_host_of_its_snapsho
     cluster.wait(1.0)
     assert cluster.phase("behind") == "running"
     assert cluster.queue() == ["p"]
-    assert "has not come back yet" in cluster["p"].reason
+    assert "has not rejoined yet" in cluster["p"].reason
     cluster.wait(4.0)  # the lease has expired
     assert cluster.phase("p") == "running"
 
@@ -454,7 +470,7 @@ def test_a_process_whose_replica_is_lost_too_waits_one_lease_for_it(rejoins: boo
     keep(cluster, keeper, ("p", cluster["p"].owner, 4))
     cluster.cut(host, keeper, seconds=4.5)  # the lease has expired, and the next one has begun
     assert cluster.queue() == ["p"]
-    assert "has not come back yet" in cluster["p"].reason
+    assert "has not rejoined yet" in cluster["p"].reason
     if rejoins:
         cluster.reconnect(keeper, seconds=1.0)
         assert assigned(cluster).kept_on == (keeper,)

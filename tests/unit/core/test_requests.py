@@ -104,7 +104,7 @@ def test_a_submission_warns_of_two_nodes_of_one_name() -> None:
     reply = cluster.submit(node("q", arguments=alias))
     assert reply.message == (
         "1 process queued. Warning: q and p put the node /robot/p into the ROS graph; give each "
-        "node a name of its own"
+        "node its own name"
     )
     cluster.cancel("p", "q")
     cluster.settle()
@@ -433,13 +433,13 @@ def test_an_instance_that_appears_after_its_withdrawal_is_stopped() -> None:
     cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
     machine = cluster.machines["a"]
     machine.fetch(cluster.now)
-    late, machine.said = list(machine.said), type(machine.said)()
+    late, machine.status_batches = list(machine.status_batches), type(machine.status_batches)()
     machine.batches = 0
     for _ in range(60):
         cluster.now += 0.1
         cluster.tell(cluster.readings([machine]))
         cluster.tell(happened.TimePassed())
-    machine.said.extend(late)
+    machine.status_batches.extend(late)
     machine.batches = len(late)
     cluster.settle()
     cluster.wait(1.0)

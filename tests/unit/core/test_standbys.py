@@ -76,6 +76,17 @@ def test_a_standby_waits_for_a_second_host_with_one_record() -> None:
     assert cluster.where("p") == ["a", "b"]
 
 
+def test_standbys_begin_in_the_order_of_submission() -> None:
+    """A replay numbers their instances alike, with any hash seed of Python."""
+    names = [f"p{number}" for number in range(8)]
+    cluster = Cluster("a").with_processes(*(stateful(name, standby=STANDBY) for name in names))
+    cluster.wait(1.0)
+    cluster.add("b")
+    cluster.wait(8.0)
+    begun = [record.process for record in cluster.records if record.kind == "standby_begun"]
+    assert begun == names
+
+
 @pytest.mark.parametrize("then", ["wait", "elsewhere"])
 def test_the_standby_takes_over_when_the_host_is_lost(then: str) -> None:
     """Under every host-loss policy the standby takes over at once; the primary is fenced later.

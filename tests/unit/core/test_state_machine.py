@@ -234,7 +234,9 @@ class Play(RuleBasedStateMachine):
         return [one for one in self.cluster.machines.values() if one.ordered and one.connected]
 
     def with_statuses(self) -> list[Machine]:
-        return [one for one in self.cluster.machines.values() if one.said and one.connected]
+        return [
+            one for one in self.cluster.machines.values() if one.status_batches and one.connected
+        ]
 
     def flow(self) -> None:
         """Deliver all messages at once while the network is prompt."""
@@ -389,7 +391,7 @@ class Play(RuleBasedStateMachine):
                 report.phase.name
                 for _, node in self.nodes()
                 if node.instance.process == name
-                for report in node.said
+                for report in node.sent
             }
             if word in phases | said:
                 return
@@ -427,9 +429,9 @@ class Play(RuleBasedStateMachine):
     )  # fmt: skip
     def statuses_arrive(self, at: int, which: int, fate: str) -> None:
         machine = self.pick(self.with_statuses(), at)
-        which %= len(machine.said)
-        batch = machine.said[which]
-        del machine.said[which]
+        which %= len(machine.status_batches)
+        batch = machine.status_batches[which]
+        del machine.status_batches[which]
         if fate == "twice":
             self.late.append(batch)
         if fate != "lost":
@@ -462,7 +464,7 @@ class Play(RuleBasedStateMachine):
         machine = self.machine(host)
         if self.known(machine):
             machine.tell(events.ReportRequested(), self.cluster.now)
-            self.late.append(machine.said[-1])
+            self.late.append(machine.status_batches[-1])
 
     @rule(prompt=chance)
     def network_is(self, prompt: bool) -> None:
@@ -750,7 +752,7 @@ class Play(RuleBasedStateMachine):
     def is_heard_well(self, machine: Machine) -> bool:
         """Return True if the contact was long enough to report all instances there."""
         calm = self.known(machine) and self.is_up(machine)
-        if not calm or machine.ordered or machine.said or machine.polled:
+        if not calm or machine.ordered or machine.status_batches or machine.polled:
             self.heard.pop(machine.name, None)
             return False
         return self.cluster.now - self.heard.setdefault(machine.name, self.cluster.now) >= (

@@ -78,7 +78,7 @@ def test_a_strategy_that_can_shadow_has_standbys():
     assert (cluster.where("p"), cluster.active()) == (["a", "b"], ["a"])
     refusal = cluster_with(Capabilities(state="topics"), "a").submit(spec)
     assert not refusal.accepted
-    assert "teleport cannot do that: install a strategy that can" in refusal.message
+    assert "teleport has no standby: install a strategy with standbys" in refusal.message
 
 
 def test_a_strategy_that_restarts_from_images_has_periodic_checkpoints():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import struct
 
 import pytest
@@ -82,3 +84,18 @@ def test_moved_there_and_back_is_the_same(names):
     there = relocation.moved(path, "/home/work", "/other/place")
     assert there.startswith("/other/place")
     assert relocation.moved(there, "/other/place", "/home/work") == path
+
+
+def test_paths_are_changed_on_a_file_system_without_hard_links(tmp_path, monkeypatch):
+    """The other files of the image are copied then."""
+    images = tmp_path / "criu"
+    images.mkdir()
+    (images / "files.img").write_bytes(b"magicnum")
+    (images / "pages-1.img").write_bytes(b"memory")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    with relocation.images(images, "/old", "/new") as changed:
+        assert (changed / "pages-1.img").read_bytes() == b"memory"

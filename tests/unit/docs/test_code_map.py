@@ -38,10 +38,10 @@ def test_every_source_file_that_is_named_exists(page: Path) -> None:
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 
-@pytest.mark.parametrize("way", ["a reading", "a submission", "a migration", "a handoff"])
-def test_each_step_of_a_way_names_one_file(way: str) -> None:
+@pytest.mark.parametrize("path", ["a reading", "a submission", "a migration", "a handoff"])
+def test_each_step_of_a_path_names_one_file(path: str) -> None:
     """Each step has a path and the action there, in order."""
-    section = re.split(r"^## ", MAP.partition(f"## The way of {way}\n")[2], flags=re.MULTILINE)[0]
+    section = re.split(r"^## ", MAP.partition(f"## Path of {path}\n")[2], flags=re.MULTILINE)[0]
     steps = re.findall(r"^(\d+)\. (.*)$", section, re.MULTILINE)
     assert [int(number) for number, _ in steps] == [*range(1, len(steps) + 1)]
     assert len(steps) > 10

@@ -19,7 +19,8 @@ from rosrm.extensions.contracts import (
     ScoringOffer,
 )
 from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import FailedProbe, Probes, Registry
+from rosrm.extensions.made import FailedProbe, Probes
+from rosrm.extensions.registry import Registry
 from rosrm.model.values import Reading, ResourceDescription
 from tests.plugin_kit import plugin, registry_of
 
@@ -167,7 +168,7 @@ def test_a_probe_reads_only_what_its_offer_declares(context):
     """Names of resources in a file can thus be checked before any probe is made."""
     registry = registry_of(offered("fds", lambda options, context: Probe("files")))
     reason = failed(registry.probes({"fds": {}}, context))["fds"]
-    assert "which its offer does not declare: say ProbeOffer(..., resources=(" in reason
+    assert "which its offer does not declare: write ProbeOffer(..., resources=(" in reason
     assert registry.resources() == ("fds",)
 
 
@@ -317,7 +318,7 @@ UNCLOSABLE = SimpleNamespace(resources=[NOTHING], read=None, close=None)  # None
         (Probe("a"), "reads 'a', as 'first' does already"),
         (Probe("b", capacity=0.0), "gives 'b' a capacity of 0.0; a number above 0"),
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
-        (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
+        (Probe(*(f"r{i}" for i in range(16))), "exceeds the 16 resources"),
         (Probe(), "describes no resource; raise SkipPlugin in `create`"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
         (UNCLOSABLE, "gives 'b' a capacity of 0.0; a number above 0"),
@@ -390,30 +391,31 @@ def test_executors_that_cannot_be_called_break_their_offer(executors, said):
     assert said in broken.reason
 
 
-def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
+def test_a_host_check_that_is_no_executor_of_the_offer_is_refused():
     """Otherwise every host would count as one without the plugin."""
-    able = SimpleNamespace(propose=None, ability="m.abel", host_fault=max)
+    able = SimpleNamespace(propose=None, host_check="m.abel", host_fault=max)
     offer = MigrationOffer("m", lambda options: able, executors={"m.able": dict})
     registry = registry_of(offer)
-    with pytest.raises(PluginError, match=r"`ability` is 'm\.abel', no executor .*are: m\.able"):
+    said = r"`host_check` is 'm\.abel', no executor .*are: m\.able"
+    with pytest.raises(PluginError, match=said):
         registry.migrations({"m": {}})
 
 
-def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
+def test_a_host_check_that_cannot_be_read_is_the_plugins_fault():
     """Report a property that raises and a value that cannot be hashed as a broken plugin."""
 
     class Angry:
         propose = host_fault = max
 
         @property
-        def ability(self):
+        def host_check(self):
             raise OSError("no")
 
-    listed = SimpleNamespace(propose=None, ability=["m.able"], host_fault=max)
+    listed = SimpleNamespace(propose=None, host_check=["m.able"], host_fault=max)
     for strategy, said in ((Angry(), "OSError: no"), (listed, "TypeError: ")):
         offer = MigrationOffer("m", lambda options, made=strategy: made)
         registry = registry_of(offer)
-        with pytest.raises(PluginError, match=f"its `ability` raised {said}"):
+        with pytest.raises(PluginError, match=f"its `host_check` raised {said}"):
             registry.migrations({"m": {}})
 
 
@@ -447,7 +449,7 @@ def test_a_hook_that_hangs_is_named_while_it_does_and_ended(monkeypatch, caplog)
     assert registry.names("probe") == ("fine",)
     (broken,) = registry.broken
     place = f"{__file__}:{register_probes.__code__.co_firstlineno}"
-    said = "failed with TimeoutError: it did not return within 0.3 s; do in `create` what takes "
+    said = "failed with TimeoutError: it did not return within 0.3 s; move slow work into "
     assert broken.reason.startswith(f"register_probes ({place}) {said}")
     assert broken.reason.endswith(f"({__file__}:{register_probes.__code__.co_firstlineno + 2})")
     said = "plugin 'slow' is still being loaded after 0.1 s: register_probes ("

@@ -14,9 +14,9 @@ from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.images import UnwantedImage
 from rosrm.core.master.state.process import WAITING
-from rosrm.extensions.contracts import Intent
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.codec import to_plain
+from rosrm.model.records import Intent
 from rosrm.model.values import ProcessSpec
 from tests.unit.core.cluster import Eq1
 
@@ -186,5 +186,5 @@ def test_hosts_numbers_and_everything_else_are_as_they_were(state: MasterState) 
     assert state.next_instance == state.reserved_instances == 1001
     assert (state.journal_gap.machine_rebooted, state.journal_gap.records_missing) == (True, True)
     assert set(state.standbys) == {"standby"}
-    assert state.wants_standby == {"standby"}
+    assert list(state.wants_standby) == ["standby"]
     assert state.next_order == 1 + max(one.order for one in state.processes.values())

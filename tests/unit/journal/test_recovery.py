@@ -9,9 +9,9 @@ import sqlite3
 import pytest
 
 from rosrm.errors import JournalError
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.recovery import recover
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.records import Intent, Record
 
 PAGE = 4096
 COUNT = 300
@@ -171,7 +171,7 @@ def test_a_whole_journal_is_left_alone(path) -> None:
 def test_where_nothing_can_be_read_nothing_is_changed(path) -> None:
     """The damaged file stays where it was."""
     path.write_bytes(b"this is no database at all, but text" * 1000)
-    with pytest.raises(JournalError, match="nothing can be read"):
+    with pytest.raises(JournalError, match="has no readable part"):
         recover(path)
     assert [one.name for one in path.parent.iterdir()] == ["journal.sqlite"]
 

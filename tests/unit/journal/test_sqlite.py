@@ -14,10 +14,10 @@ import textwrap
 import pytest
 
 from rosrm.errors import JournalBlocked, JournalError
-from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.errors import fault_of
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ WRITER = """
     import sys
     from pathlib import Path
     from rosrm.journal.sqlite import SqliteJournal
-    from rosrm.extensions.contracts import Intent, Record
+    from rosrm.model.records import Intent, Record
 
     journal = SqliteJournal(Path(sys.argv[1]))
     number = 0
@@ -231,7 +231,7 @@ def test_a_full_disk_is_reported(path, opened) -> None:
         from pathlib import Path
         from rosrm.errors import JournalError
         from rosrm.journal.sqlite import SqliteJournal
-        from rosrm.extensions.contracts import Intent, Record
+        from rosrm.model.records import Intent, Record
 
         journal = SqliteJournal(Path(sys.argv[1]))
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
@@ -313,6 +313,13 @@ def test_old_events_are_pruned(opened) -> None:
     assert 50 <= len(kept) <= 50 + 1000
     journal.close()
     assert opened(keep_events=50).last_sequence == 2500
+
+
+def test_the_events_of_many_short_runs_are_pruned(opened) -> None:
+    for _ in range(5):
+        with contextlib.closing(opened(keep_events=50)) as journal:
+            journal.write([Record("n")] * 100, [], 0.0)
+    assert len(opened().records(newest=10**6)) == 50
 
 
 def test_damaged_facts_of_an_event_hide_no_other(path, opened) -> None:

@@ -89,7 +89,7 @@ class Hung(Opened):
         self.go = threading.Event()
 
     def write(self, content):
-        assert self.go.wait(20.0), "nobody let the write go"
+        assert self.go.wait(20.0), "the write was not released"
         return self.inner.write(content)
 
 

@@ -12,7 +12,7 @@ from rosrm.errors import CriuError
 from rosrm_criu.engine import image, restore_result
 from rosrm_criu.engine.paths import incoming, outgoing
 from rosrm_criu.engine.restore_result import Outcome
-from rosrm_criu.executors import artifacts
+from rosrm_criu.executors import artifacts, attempts
 
 PATIENCE = 20.0
 _numbers = count()
@@ -35,13 +35,13 @@ def test_a_repeated_step_runs_once(attempt):
         return {"n": len(done)}
 
     with ThreadPoolExecutor(2) as threads:
-        first = threads.submit(artifacts.once, "step", attempt, work)
+        first = threads.submit(attempts.once, "step", attempt, work)
         assert begun.wait(PATIENCE)
-        second = threads.submit(artifacts.once, "step", attempt, work)
+        second = threads.submit(attempts.once, "step", attempt, work)
         may_end.set()
         assert first.result(PATIENCE) == second.result(PATIENCE) == {"n": 1}
-    assert artifacts.once("step", attempt, work) == {"n": 1}
-    assert artifacts.once("other step", attempt, work) == {"n": 2}
+    assert attempts.once("step", attempt, work) == {"n": 1}
+    assert attempts.once("other step", attempt, work) == {"n": 2}
 
 
 def test_a_failed_step_runs_again(attempt):
@@ -49,9 +49,9 @@ def test_a_failed_step_runs_again(attempt):
         raise CriuError("no room")
 
     with pytest.raises(CriuError, match="no room"):
-        artifacts.once("step", attempt, fails)
-    artifacts.after("step", attempt, 0.0)  # it has ended
-    assert artifacts.once("step", attempt, dict) == {}
+        attempts.once("step", attempt, fails)
+    attempts.after("step", attempt, 0.0)  # it has ended
+    assert attempts.once("step", attempt, dict) == {}
 
 
 def test_the_wait_for_a_step_has_a_timeout(attempt):
@@ -63,12 +63,12 @@ def test_the_wait_for_a_step_has_a_timeout(attempt):
         raise CriuError("it failed in the end")
 
     with ThreadPoolExecutor(1) as threads:
-        going = threads.submit(artifacts.once, "step", attempt, work)
+        going = threads.submit(attempts.once, "step", attempt, work)
         assert begun.wait(PATIENCE)
         with pytest.raises(CriuError, match=r"still under way after 0\.01 s"):
-            artifacts.after("step", attempt, 0.01)
+            attempts.after("step", attempt, 0.01)
         may_end.set()
-        artifacts.after("step", attempt, PATIENCE)  # its error is for the caller of the step
+        attempts.after("step", attempt, PATIENCE)  # its error is for the caller of the step
         with pytest.raises(CriuError, match="in the end"):
             going.result(PATIENCE)
 

@@ -61,6 +61,6 @@ def test_every_step_of_a_plan_has_an_executor() -> None:
     steps = [each for plan in plans for step in plan.steps for each in (step, step.undo)]
     named = {one.executor for one in steps if isinstance(one, Execute)}
     periodic = CRIU.periodic(move.spec, move.source, "a", 0)
-    assert {*named, DROP, periodic.executor, CRIU.discard, CRIU.ability} == set(EXECUTORS)
+    assert {*named, DROP, periodic.executor, CRIU.discard, CRIU.host_check} == set(EXECUTORS)
     assert set(OFFER.executors) == set(EXECUTORS)
     assert all(callable(executor(step)) for step in EXECUTORS)  # their modules are loaded late

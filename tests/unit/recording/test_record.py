@@ -168,7 +168,7 @@ def test_zeros_with_anything_behind_them_are_damage(content):
 
 @pytest.mark.parametrize("foreign", [b"", b"hosts: []\n", b"\x7fELF" * 100, b"rosrm-reco"])
 def test_another_file_is_no_record(foreign):
-    with pytest.raises(RecordError, match=r"r\.rosrec: is no record of a master's run"):
+    with pytest.raises(RecordError, match=r"r\.rosrec: is no recording of a master's run"):
         read(foreign)
 
 
@@ -177,7 +177,7 @@ def test_another_version_is_refused_and_both_are_named(content, version):
     newer = content.replace(b"rosrm-record 1\n", b"rosrm-record " + version + b"\n", 1)
     with pytest.raises(RecordError) as raised:
         read(newer)
-    assert f"is a record of version {version.decode()}; this rosrm reads" in str(raised.value)
+    assert f"is a recording of version {version.decode()}; this rosrm reads" in str(raised.value)
 
 
 def framed(body: bytes) -> bytes:
@@ -187,12 +187,12 @@ def framed(body: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        (b"H{}", "does not belong there"),
+        (b"H{}", "is not allowed there"),
         (b"E" + bytes(16) + b'{"kind":"Unheard"}', "KeyError"),
-        (b"E" + bytes(16) + b"no json", "makes no sense"),
+        (b"E" + bytes(16) + b"no json", "is invalid for"),
         (b"E" + bytes(16) + b'{"kind":"HostLeft","request":1}', "is missing"),
-        (b"R" + bytes(16) + b"\xff\xff", "makes no sense"),
-        (b"E" + struct.pack("<dd", -5.0, 0.0) + b'{"kind":"TimePassed"}', "time goes back"),
+        (b"R" + bytes(16) + b"\xff\xff", "is invalid for"),
+        (b"E" + struct.pack("<dd", -5.0, 0.0) + b'{"kind":"TimePassed"}', "its time is before"),
         (b"D{}", "a list of decisions"),
     ],
 )

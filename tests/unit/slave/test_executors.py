@@ -13,8 +13,8 @@ import pytest
 
 from rosrm.core.master.events import BAD_RESULT
 from rosrm.errors import CriuError, Refused
+from rosrm.extensions.made import OfferedExecutor
 from rosrm.extensions.plugin_calls import WORKS_AFTER
-from rosrm.extensions.registry import OfferedExecutor
 from rosrm.slave.executors import Executors
 from rosrm.testing import FakeClock
 

@@ -11,7 +11,8 @@ import pytest
 from rosrm.errors import CriuError, LaunchError
 from rosrm.extensions.contracts import Capabilities, Launch, LauncherOffer, MigrationOffer
 from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.registry import MadeLauncher, Registry
+from rosrm.extensions.made import MadeLauncher
+from rosrm.extensions.registry import Registry
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable

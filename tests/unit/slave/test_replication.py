@@ -250,6 +250,22 @@ def test_the_size_of_the_replicas_is_bounded(net):
     assert net.age("b") == (7, 1)
 
 
+def test_an_interrupted_transfer_takes_no_room(net):
+    """The sender was lost after its first part; the replica of another process needs the room."""
+    taker = net.add("b", max_bytes=10_000)
+    answers = []
+    taker.take_part(TransferPart("q", 3, 1, 0, 9_000, 0, b"x" * 50), answers.append)
+    net.settle()
+    assert answers == [None]
+    net.pass_times(3)
+    assert (net.root / "b" / "q" / "copy.new").exists()
+    net.pass_time(60.0)
+    assert not (net.root / "b" / "q").exists()
+    taker.take_part(TransferPart("p", 7, 5, 0, 9_000, 0, b"x" * 50), answers.append)
+    net.settle()
+    assert answers == [None, None]
+
+
 def test_a_snapshot_damaged_in_transfer_is_refused(net):
     """No part of the damaged replica is stored or left behind."""
     taker = net.add("b")

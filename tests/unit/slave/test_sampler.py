@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from rosrm.extensions.registry import FailedProbe
+from rosrm.extensions.made import FailedProbe
 from rosrm.model.values import RESOURCE_SLOTS, Reading, ResourceDescription
 from rosrm.slave.sampler import ANOTHER_ERROR, REPORTS, TRUSTED_AFTER, Sampler
 from rosrm.testing import FakeClock, FakeProbe, made_probe

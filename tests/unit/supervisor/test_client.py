@@ -1,15 +1,22 @@
-"""The slave's side of the supervisor connection, tested with a socket pair."""
+"""The slave's side of the supervisor connection, without a supervisor process."""
 
 from __future__ import annotations
 
+import contextlib
 import socket
+import time
 from pathlib import Path
 
 import pytest
 
 from rosrm.core.supervisor.events import ContactReported
-from rosrm.supervisor import messages
-from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
+from rosrm.supervisor import endpoint, messages
+from rosrm.supervisor.client import (
+    SupervisorClient,
+    SupervisorEnded,
+    SupervisorGone,
+    SupervisorSilent,
+)
 
 
 def test_a_supervisor_that_ended_beside_an_order_has_ended(tmp_path: Path) -> None:
@@ -20,4 +27,26 @@ def test_a_supervisor_that_ended_beside_an_order_has_ended(tmp_path: Path) -> No
         its.sendall(messages.encode_ended())
         its.close()
         with pytest.raises(SupervisorEnded):
+            client.receive(5.0)
+
+
+def test_a_stopped_supervisor_with_a_full_queue_is_silent(tmp_path: Path) -> None:
+    """Earlier clients filled the queue of its socket, so the kernel makes a connect wait."""
+    with contextlib.ExitStack() as waiting:
+        waiting.enter_context(endpoint.listen(str(tmp_path)))
+        with contextlib.suppress(TimeoutError):
+            while True:
+                waiting.enter_context(endpoint.connect(str(tmp_path), 0.05))
+        began = time.monotonic()
+        with pytest.raises(SupervisorSilent, match="did not answer in time"):
+            SupervisorClient.connect(tmp_path, timeout=0.3)
+        assert time.monotonic() - began < 5.0
+
+
+def test_a_connection_closed_by_another_thread_is_gone(tmp_path: Path) -> None:
+    """The slave ends while its receiving thread is between two waits."""
+    ours, its = socket.socketpair()
+    with its, SupervisorClient(ours, tmp_path) as client:
+        client.close()
+        with pytest.raises(SupervisorGone):
             client.receive(5.0)

@@ -192,3 +192,18 @@ def test_it_is_compacted_when_it_has_grown(tmp_path, core, record):
     assert not record.is_large()
     assert (tmp_path / "instances.jsonl").stat().st_size < 2000
     assert TALKER in rc.read(str(tmp_path)).instances
+
+
+def test_a_compaction_without_room_leaves_no_part_of_itself(tmp_path, core, record, monkeypatch):
+    """A part would take the room that the lines of the old record need."""
+    write = os.write
+
+    def write_a_part(file, data):
+        if len(data) < 20:
+            full()
+        return write(file, data[:-10])
+
+    monkeypatch.setattr(os, "write", write_a_part)
+    record.rewrite(core, {}, {}, lambda key: 0)
+    assert "No space left" in record.trouble
+    assert [path.name for path in tmp_path.iterdir()] == ["instances.jsonl"]

@@ -74,34 +74,21 @@ def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file:
         LabError: a namespace or mount could not be made.
     """
     reader, writer = os.pipe()
-    settings = {
-        "ready": writer,
-        "hostname": host.name,
-        "image": str(store.image(lab, host.name)),
-        "shm_options": f"size={host.memory // 2}" if host.memory else "",
-        "hosts_file": hosts_file,
-    }
-    namespace = names.namespace_path(names.host_namespace(lab, host.name))
-    command = [
-        *_entering(hierarchies, lab, host.name),
-        *(find_command("nsenter"), f"--net={namespace}", "--"),
-        *(find_command("unshare"), "--mount", "--uts", "--ipc", "--pid"),
-        *("--propagation", "private", "--"),
-        *(sys.executable, "-I", "-S", str(_INSIDE / "init.py"), json.dumps(settings)),
-    ]
     with os.fdopen(reader, "rb", buffering=0) as ready:
-        # A session of its own, because a Ctrl-C during the boot is for this process, which then
-        # removes everything.
-        launcher = subprocess.Popen(
-            command,
-            pass_fds=[writer],
-            env=without_bootstrapper(os.environ),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        os.close(writer)
+        try:
+            # A session of its own, because a Ctrl-C during the boot is for this process, which
+            # then removes everything.
+            launcher = subprocess.Popen(
+                _booting(hierarchies, lab, host, hosts_file, writer),
+                pass_fds=[writer],
+                env=without_bootstrapper(os.environ),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        finally:
+            os.close(writer)
         lines = _until_ready(ready.fileno(), time.monotonic() + _BOOT)
         output = _last_words(launcher)
     pid = next((int(line[4:]) for line in lines if line.startswith("pid ")), 0)
@@ -205,6 +192,27 @@ def power_off(hierarchies: Sequence[Hierarchy], lab: str, host: str, birth: Birt
                 if not _readable(descriptor, _END):
                     raise LabError(f"host {host} of lab {lab!r} did not end within {_END:g} s")
     groups.kill(hierarchies, lab, host)
+
+
+def _booting(
+    hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file: str, ready: int
+) -> list[str]:
+    """Return the command line that starts a host's first process, which reports to `ready`."""
+    settings = {
+        "ready": ready,
+        "hostname": host.name,
+        "image": str(store.image(lab, host.name)),
+        "shm_options": f"size={host.memory // 2}" if host.memory else "",
+        "hosts_file": hosts_file,
+    }
+    namespace = names.namespace_path(names.host_namespace(lab, host.name))
+    return [
+        *_entering(hierarchies, lab, host.name),
+        *(find_command("nsenter"), f"--net={namespace}", "--"),
+        *(find_command("unshare"), "--mount", "--uts", "--ipc", "--pid"),
+        *("--propagation", "private", "--"),
+        *(sys.executable, "-I", "-S", str(_INSIDE / "init.py"), json.dumps(settings)),
+    ]
 
 
 def _entering(hierarchies: Sequence[Hierarchy], lab: str, host: str) -> list[str]:

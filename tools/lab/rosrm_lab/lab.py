@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
 from rosrm.errors import ConfigError, LabError
+from rosrm.supervisor.procfs import boot_id
 from rosrm_lab import groups, needs, store
 from rosrm_lab.host import DATA, entrance
 from rosrm_lab.plan import HostPlan, LabPlan, check_name, check_usable, switch_namespace
@@ -91,7 +92,7 @@ class Lab:
                 with store.lock(""):  # two labs at once must not choose the same addresses
                     subnet = making.choose_subnet(self._subnet)
                     plan = LabPlan(self.name, self._hosts, subnet)
-                    record = LabRecord(plan, boot=store.boot_id(), owner=owner)
+                    record = LabRecord(plan, boot=boot_id(), owner=owner)
                     store.write(record)
                 making.make(self._hierarchies, record, between)
             except BaseException:
@@ -345,7 +346,7 @@ class Lab:
                 f"lab {self.name!r} is incomplete: `rosrm lab up` makes it again, "
                 "`rosrm lab down` removes its parts"
             )
-        if record.boot != store.boot_id():
+        if record.boot != boot_id():
             raise LabError(
                 f"lab {self.name!r} did not survive the restart of this machine: `rosrm lab up` "
                 "makes it again, `rosrm lab down` removes the rest of it"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from ipaddress import IPv4Network
 
 from rosrm.errors import LabError
+from rosrm.supervisor.procfs import boot_id
 from rosrm_lab import disks, groups, network, store
 from rosrm_lab.groups import Hierarchy
 from rosrm_lab.host import boot, power_off
@@ -35,7 +36,7 @@ def explained(lab: str) -> Iterator[None]:
 def refuse_if_up(lab: str) -> None:
     """Raise `LabError` where a lab of this name is up, and not abandoned."""
     record = store.read(lab)
-    if record is None or not record.complete or record.boot != store.boot_id():
+    if record is None or not record.complete or record.boot != boot_id():
         return
     if record.owner is not None and not record.owner.alive:
         return
@@ -85,11 +86,15 @@ def make(hierarchies: Sequence[Hierarchy], record: LabRecord, between: Callable[
 
 
 def switch_on(hierarchies: Sequence[Hierarchy], record: LabRecord, host: str) -> None:
-    """Connect a host and start its first process; raises `LabError`."""
+    """Connect a host and start its first process, or leave nothing of it; raises `LabError`."""
     switch_off(hierarchies, record, host)  # remains of an earlier, partly killed run of the host
     plan = record.plan
-    network.plug_in(plan, host, record.links[host])
-    record.inits[host] = boot(hierarchies, plan.name, plan.host(host), plan.hosts_file())
+    try:
+        network.plug_in(plan, host, record.links[host])
+        record.inits[host] = boot(hierarchies, plan.name, plan.host(host), plan.hosts_file())
+    except BaseException:
+        switch_off(hierarchies, record, host)
+        raise
 
 
 def switch_off(hierarchies: Sequence[Hierarchy], record: LabRecord, host: str) -> None:

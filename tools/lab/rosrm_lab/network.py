@@ -74,7 +74,7 @@ def make_switch(lab: LabPlan) -> None:
     """Make the namespace with the bridge."""
     name = names.switch_namespace(lab.name)
     netns.create(name)
-    with _inside(name) as switch:
+    with IPRoute(netns=name) as switch:
         # The lab has no querier, so that snooping would forget the receivers of multicast.
         switch.link("add", ifname=_BRIDGE, kind="bridge", br_mcast_snooping=0, br_stp_state=0)
         switch.link("set", index=_index(switch, _BRIDGE), state="up")
@@ -89,7 +89,7 @@ def plug_in(lab: LabPlan, host: str, link: Link) -> None:
     """
     name, port = names.host_namespace(lab.name, host), lab.port(host)
     netns.create(name)
-    with _inside(names.switch_namespace(lab.name)) as switch, _inside(name) as inside:
+    with IPRoute(netns=names.switch_namespace(lab.name)) as switch, IPRoute(netns=name) as inside:
         peer = {"ifname": INTERFACE, "net_ns_fd": name, "address": lab.mac(host)}
         switch.link("add", ifname=port, kind="veth", peer=peer)
         switch.link("set", index=_index(switch, port), master=_index(switch, _BRIDGE), state="up")
@@ -112,7 +112,7 @@ def unplug(lab: LabPlan, host: str) -> None:
     """Remove a host's cable, so that packets of its dying processes reach no other host."""
     if names.switch_namespace(lab.name) not in existing():
         return
-    with _inside(names.switch_namespace(lab.name)) as switch:
+    with IPRoute(netns=names.switch_namespace(lab.name)) as switch:
         for index in switch.link_lookup(ifname=lab.port(host)):
             switch.link("del", index=index)
 
@@ -166,7 +166,7 @@ def set_delays(lab: LabPlan, host: str, before: Link, after: Link) -> None:
 
 
 def _set_delay(name: str, interface: str, wire: Wire) -> None:
-    with _inside(name) as namespace:
+    with IPRoute(netns=name) as namespace:
         index = _index(namespace, interface)
         try:
             if wire.delay:
@@ -192,13 +192,6 @@ def _reason(error: Exception) -> str:
     if len(error.args) < 2 or not isinstance(number, int):
         return str(error)
     return f"{error.args[1]} ({errno.errorcode.get(number, number)})"
-
-
-@contextlib.contextmanager
-def _inside(name: str) -> Iterator[Any]:
-    """Open a netlink connection within a namespace."""
-    with IPRoute(netns=name) as connection:
-        yield connection
 
 
 def _index(connection: Any, interface: str) -> int:

@@ -114,11 +114,6 @@ class LabRecord:
         )
 
 
-def boot_id() -> str:
-    """Return the id of this boot of the machine."""
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-
-
 def read(lab: str) -> LabRecord | None:
     """Return the state of a lab; None: there is none, or it is unreadable."""
     try:

@@ -25,9 +25,10 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.slave.events import AssignmentsReceived, TimePassed
-from rosrm.extensions.contracts import Intent, MigrationStrategy, Record
+from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.model.orders import seconds_of
+from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, Assignment
 from rosrm_simulate.agenda import Agenda
 from rosrm_simulate.machine import Machine
@@ -96,7 +97,7 @@ class Simulation(World[Machine]):
     def run(self, progress: Callable[[Progress], None] | None = None) -> Outcome:
         """Run until nothing can change any more, or until the workload's `until`."""
         self._plan()
-        next_tick, told = 0.0, 0
+        next_tick, shown = 0.0, 0
         until = self.workload.until
         while True:
             now = min(self.agenda.next_time, next_tick)
@@ -110,8 +111,8 @@ class Simulation(World[Machine]):
                 self.agenda.now = now
                 self._tick()
                 next_tick = self._after_tick(now)
-            if progress is not None and self.meter.events - told >= _TELL_EVERY:
-                told = self.meter.events
+            if progress is not None and self.meter.events - shown >= _TELL_EVERY:
+                shown = self.meter.events
                 progress(self._progress())
         return self.meter.outcome(self.state, self.agenda.now)
 
@@ -178,7 +179,7 @@ class Simulation(World[Machine]):
         self.tell(happened.TimePassed())
 
     def _read(self, machines: list[Machine]) -> None:
-        """Deliver readings of hosts to the master; hosts under their limits ask for work."""
+        """Deliver readings of hosts to the master; hosts under their limits request work."""
         # 0: a reading is never ahead of the statuses, which take their time.
         event = self.readings(machines, status_sequence=np.zeros(len(machines), np.uint64))
         self.tell(event)

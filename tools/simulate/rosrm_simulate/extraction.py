@@ -20,9 +20,9 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
 from rosrm.core.slave.state import awaits_graph
-from rosrm.extensions.contracts import Record
 from rosrm.model.codec import from_plain
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Record
 from rosrm.model.values import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Recording

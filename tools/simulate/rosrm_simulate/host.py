@@ -85,7 +85,7 @@ class Host(ABC, Generic[ProgramT]):
         programs: instances that really run; they outlive the slave.
         ends: statuses of ended instances that the supervisor remembers.
         polled: assignments at the master that wait for the slave's next request.
-        said: status batches on their way to the master.
+        status_batches: status batches on their way to the master.
         stale: resources whose readings are too old.
         limit: (RESOURCE_SLOTS,) as in its readings.
         newest_pid: of its programs; each start of a program has another one.
@@ -107,7 +107,7 @@ class Host(ABC, Generic[ProgramT]):
     programs: dict[InstanceId, ProgramT] = field(default_factory=dict)
     ends: dict[InstanceId, InstanceStatus] = field(default_factory=dict)
     polled: list[Assignment] = field(default_factory=list)
-    said: deque[StatusesReceived] = field(default_factory=deque)
+    status_batches: deque[StatusesReceived] = field(default_factory=deque)
     stale: set[str] = field(default_factory=set)
     sequence: int = 0
     batches: int = 0
@@ -146,7 +146,7 @@ class Host(ABC, Generic[ProgramT]):
 
     def say(self, batch: StatusesReceived) -> None:
         """Send statuses to the master."""
-        self.said.append(batch)
+        self.status_batches.append(batch)
 
     def later(self, _seconds: float, now: float, action: Callable[[float], None]) -> None:
         """Call an action after some seconds, with the time at which it happens."""
@@ -192,11 +192,11 @@ class Host(ABC, Generic[ProgramT]):
 
     def used(self, now: float) -> tuple[tuple[int, float, float], ...]:
         """Return number, cores and bytes of each instance."""
-        told = []
+        usages = []
         for instance, program in self.programs.items():
             amounts = self.used_by(program, now)
-            told.append((instance.number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0)))
-        return tuple(told)
+            usages.append((instance.number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0)))
+        return tuple(usages)
 
     def usages(self, now: float) -> UsagesReceived:
         """Return the event with the usage of each instance."""

@@ -54,7 +54,7 @@ class Machine(Host[Work]):
     Attributes:
         up: it runs; a host that is down neither receives nor sends anything.
         stopping: its slave is shutting down, and the host goes with its last process.
-        asked: it has asked for work.
+        asked: it has requested work.
         published_usage: usages that the master knows.
     """
 

@@ -15,8 +15,8 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Process, ProcessPhase
-from rosrm.extensions.contracts import Record
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Record
 from rosrm.model.values import Kind
 from rosrm.wording import standing
 

@@ -120,7 +120,7 @@ def _variant(base: Node, change: Node, path: str | Path, registry: Registry) -> 
         # The options of one policy do not fit another.
         members = {key: item for key, item in base.items.items() if key != "scoring"}
         under = Node(members, base.place)
-    name = text_of(change, "name") or _told(change)
+    name = text_of(change, "name") or _leaves_of(change)
     config = checked_cluster(in_depth(under, own), path, registry)
     return Variant(name, hosts.hosts if hosts else None, config)
 
@@ -135,7 +135,7 @@ def _only(node: Node, keys: Sequence[str]) -> Node:
     return Node(members, node.place, node.key_place)
 
 
-def _told(change: Node) -> str:
+def _leaves_of(change: Node) -> str:
     """Return a name for a variant without one: its changes."""
     return ", ".join(_leaves(change.plain())) or "as given"
 

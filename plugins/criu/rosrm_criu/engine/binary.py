@@ -80,28 +80,28 @@ class CriuBinary:
         unprivileged = () if may_do_all() else ("--unprivileged",)
         log.unlink(missing_ok=True)  # otherwise its errors would be reported as the cause
         words = [*self.command, *arguments, *unprivileged, "--log-file", str(log)]
-        with tempfile.TemporaryFile("w+", errors="replace") as said:
+        with tempfile.TemporaryFile("w+", errors="replace") as printed:
             try:
                 process = subprocess.Popen(
                     words,
                     stdin=subprocess.DEVNULL,
-                    stdout=said,
-                    stderr=said,
+                    stdout=printed,
+                    stderr=printed,
                     pass_fds=pass_fds,
                     start_new_session=True,
                 )
             except OSError as error:
                 raise CriuError(f"CRIU cannot be started: {words[0]}: {error.strerror}") from None
             code = _end_of(process, timeout)
-            said.seek(0)
-            output = said.read()
+            printed.seek(0)
+            output = printed.read()
         if code == 0:
             return
         what = f"CRIU {self.version} could not {arguments[0]}"
         if code is None:
             why = f"it was not done after {timeout:g} s and was ended"
         else:
-            why = _why(log, output) or f"it ended with code {code} and said nothing of the cause"
+            why = _why(log, output) or f"it ended with code {code} without a reason"
         raise CriuError(f"{what}: {why} (its log: {log})")
 
 
@@ -160,10 +160,10 @@ def opened(program: Path) -> CriuBinary:
         raise CriuError(f"{program} --version did not answer within {_ANSWER:g} s") from None
     version = re.search(r"^Version:\s*v?(\d+(?:\.\d+)+)", answer.stdout, re.MULTILINE)
     if answer.returncode != 0 or version is None:
-        said = (answer.stderr.strip() or answer.stdout.strip() or "nothing").splitlines()[-1]
+        line = (answer.stderr.strip() or answer.stdout.strip() or "nothing").splitlines()[-1]
         raise CriuError(
             f"{program} is no CRIU that works: `--version` ended with code {answer.returncode} "
-            f"and said {said!r}"
+            f"and printed {line!r}"
         )
     return CriuBinary((str(program),), version[1])
 

@@ -11,7 +11,7 @@ from typing import Final
 
 #: `(00.004711)    123: Error (criu/sk-inet.c:42): inet: Can't bind inet socket back: ...`
 _ERROR: Final = re.compile(
-    r"^(?:\(\s*\d+\.\d+\))?\s*(?:\d+:\s*)?Error\s*(?:\([^)]*\):?)?:?\s*(?P<said>.*\S)\s*$"
+    r"^(?:\(\s*\d+\.\d+\))?\s*(?:\d+:\s*)?Error\s*(?:\([^)]*\):?)?:?\s*(?P<text>.*\S)\s*$"
 )
 #: These messages accompany every failure and do not name its cause.
 _EMPTY: Final = re.compile(
@@ -66,9 +66,9 @@ def causes(log: str) -> tuple[str, ...]:
     Args:
         log: CRIU's log, or its output on standard error.
     """
-    said = [match["said"] for line in log.splitlines() if (match := _ERROR.match(line))]
-    telling = [line for line in said if not _EMPTY.fullmatch(line)] or said
-    return tuple(dict.fromkeys(telling))[:_MOST]
+    errors = [match["text"] for line in log.splitlines() if (match := _ERROR.match(line))]
+    useful = [line for line in errors if not _EMPTY.fullmatch(line)] or errors
+    return tuple(dict.fromkeys(useful))[:_MOST]
 
 
 def first_words(output: str) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ are restored. `--manage-cgroups=ignore`: the process is restored in its new inst
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import platform
@@ -89,8 +90,9 @@ def dump(
             manifest = replace(manifest, checksums=made)
         image.write(directory, manifest)
     except BaseException as error:
-        image.remove(directory, logs=False)
-        outcome = _go_on(root, was_stopped)
+        outcome = _go_on(root, was_stopped)  # first, because a removal takes a while, or fails
+        with contextlib.suppress(OSError):  # the error to report is the first one
+            image.remove(directory, logs=False)
         if not isinstance(error, CriuError | OSError):
             raise
         raise CriuError(_explained(directory, error) + outcome) from None

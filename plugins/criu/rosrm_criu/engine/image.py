@@ -10,6 +10,7 @@ hold.json         the result of the restore (see `rosrm_criu.engine.shim`)
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import zlib
 from collections.abc import Iterable, Mapping
@@ -133,6 +134,14 @@ def create(directory: Path) -> None:
         (directory / PAGES).mkdir(mode=0o700)
     except OSError as error:
         raise CriuError(f"no image can be made in {directory}: {error.strerror}") from None
+
+
+def link_or_copy(source: str | Path, target: str | Path) -> None:
+    """Make a hard link to a file, or a copy on a file system without hard links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def check_room(directory: Path, needed: int) -> None:

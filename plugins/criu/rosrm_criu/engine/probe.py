@@ -30,6 +30,8 @@ from rosrm_criu.engine.compatibility import INTERPRETER, facts_of
 
 #: Seconds for the whole test, which normally takes a few tenths.
 TIMEOUT: Final = 20.0
+#: Seconds for the cleaner to remove everything.
+_CLEARED: Final = 2.0
 #: Part of CRIU's error message if it lacks rights. The messages are no stable interface, but this
 #: word is the name of a capability.
 _NO_RIGHT: Final = "CAP_CHECKPOINT_RESTORE"
@@ -188,11 +190,11 @@ def _receive(ours: socket.socket, trial: _Trial, count: str, after: str) -> tupl
     """Return the sender of the expected count; raise `CriuError` for another count or none."""
     ours.settimeout(max(0.1, trial.left))
     try:
-        said, address = ours.recvfrom(16)
+        answer, address = ours.recvfrom(16)
     except TimeoutError:
         raise CriuError(f"a child that {after} does not answer over UDP on loopback") from None
-    if said.decode("ascii", "replace") != count:
-        raise CriuError(f"a child that {after} counts {said!r}, not {count}")
+    if answer.decode("ascii", "replace") != count:
+        raise CriuError(f"a child that {after} counts {answer!r}, not {count}")
     return str(address[0]), int(address[1])
 
 
@@ -227,20 +229,23 @@ def _subject(port: int, trial: _Trial) -> Iterator[subprocess.Popen[bytes]]:
 def _folder() -> Iterator[tuple[Path, int]]:
     """Yield a folder, and the pipe of the cleaner, which removes it once all ends are closed."""
     folder = Path(tempfile.gettempdir(), f"rosrm-criu-{uuid.uuid4().hex}")
-    with subprocess.Popen(
+    clearer = subprocess.Popen(
         ["/bin/sh", "-c", _CLEARER, str(folder)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
         cwd="/",
-    ) as clearer:
-        assert clearer.stdin is not None
-        assert clearer.stdout is not None
+    )
+    assert clearer.stdin is not None
+    assert clearer.stdout is not None
+    with clearer.stdin, clearer.stdout:
         if not clearer.stdout.readline():
             raise OSError(f"no folder can be made in {folder.parent}")
         yield folder, clearer.stdin.fileno()
-        # Leaving closes the pipe and waits for the shell.
+    # A process that a killed CRIU has left may hold the pipe: the cleaner then waits for its end.
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        clearer.wait(_CLEARED)
 
 
 def main() -> int:

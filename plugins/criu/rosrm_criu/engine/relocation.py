@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine.image import HERE
+from rosrm_criu.engine.image import HERE, link_or_copy
 
 _FILES: Final = "files.img"
 #: Bytes before the first message.
@@ -65,7 +65,7 @@ def images(directory: Path, old: str, new: str) -> Iterator[Path]:
     try:
         for file in directory.iterdir():
             if file.name != _FILES:
-                os.link(file, beside / file.name)
+                link_or_copy(file, beside / file.name)
         data = _files((directory / _FILES).read_bytes(), lambda path: moved(path, old, new))
         (beside / _FILES).write_bytes(data)
         yield beside

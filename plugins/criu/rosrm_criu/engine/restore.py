@@ -127,13 +127,17 @@ def _replace(source: Path, target: Path, mode: int) -> None:
     new = target.with_name(f".{target.name}.rosrm")
     new.unlink(missing_ok=True)
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    with source.open("rb") as copy, os.fdopen(os.open(new, flags, 0o600), "wb") as file:
-        shutil.copyfileobj(copy, file)
-        if os.geteuid() == 0:
-            before = (target if target.exists() else target.parent).lstat()
-            os.fchown(file.fileno(), before.st_uid, before.st_gid)
-        os.fchmod(file.fileno(), mode)
-    new.replace(target)
+    try:
+        with source.open("rb") as copy, os.fdopen(os.open(new, flags, 0o600), "wb") as file:
+            shutil.copyfileobj(copy, file)
+            if os.geteuid() == 0:
+                before = (target if target.exists() else target.parent).lstat()
+                os.fchown(file.fileno(), before.st_uid, before.st_gid)
+            os.fchmod(file.fileno(), mode)
+        new.replace(target)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
 
 
 def _make_tracing_file(mapped: MappedFile) -> None:
@@ -207,7 +211,7 @@ def id_for_criu(ids: tuple[int, ...], most: int) -> int:
     return 300
 
 
-def mark_anew(pid: int, marks: Mapping[str, str]) -> None:
+def replace_marks(pid: int, marks: Mapping[str, str]) -> None:
     """Change environment variables of a process, as /proc shows them to others.
 
     Values that the process has already read stay as they were. A new value that is longer than the

@@ -137,7 +137,7 @@ class _Restore:
         finally:
             os.close(log)
         for member in process_tree.tree(pid):
-            restore.mark_anew(member, marks)
+            restore.replace_marks(member, marks)
         return pid
 
     def report(self, pid: int, *, namespace: bool) -> None:
@@ -179,16 +179,16 @@ def _fail(directory: Path, reason: str) -> NoReturn:
 def _restore_in_namespace(task: _Restore) -> NoReturn:
     """Fork the init of the new pid namespace, and represent it to the supervisor."""
     living, end_of_life = os.pipe()
-    hearing, saying = os.pipe()
+    reports_out, reports_in = os.pipe()
     init = os.fork()
     if init == 0:
         os.close(end_of_life)
-        os.close(hearing)
-        _be_init(task, living, saying)
+        os.close(reports_out)
+        _be_init(task, living, reports_in)
     os.close(living)
-    os.close(saying)
-    with os.fdopen(hearing) as said:
-        first = json.loads(said.readline() or "{}")
+    os.close(reports_in)
+    with os.fdopen(reports_out) as reports:
+        first = json.loads(reports.readline() or "{}")
         if "restored" not in first:
             os.waitpid(init, 0)
             _fail(task.directory, first.get("failed", "the restore was killed"))
@@ -196,11 +196,11 @@ def _restore_in_namespace(task: _Restore) -> NoReturn:
         os.write(end_of_life, b"seen")
         task.report(root, namespace=True)
         _attend(root, init)
-        last = said.readline()
+        last = reports.readline()
     _end_as(int(last) if last else int(signal.SIGKILL))
 
 
-def _be_init(task: _Restore, living: int, saying: int) -> NoReturn:
+def _be_init(task: _Restore, living: int, reports_in: int) -> NoReturn:
     """Run as init: restore, reap every ended process, and end with the restored process."""
     code = FAILED
     try:
@@ -209,18 +209,18 @@ def _be_init(task: _Restore, living: int, saying: int) -> NoReturn:
         poll.register(living, 0)
         if poll.poll(0):  # the shim ended before the prctl call
             os._exit(code)
-        with os.fdopen(saying, "w", buffering=1) as said:
+        with os.fdopen(reports_in, "w", buffering=1) as reports:
             try:
                 _own_mounts()
                 _skip_ids(task.manifest)
                 # The namespace contains it; marks of its former host must not identify it here.
                 root = task.run({INSTANCE_MARK: "", SUPERVISOR_MARK: ""})
             except (CriuError, OSError) as error:
-                said.write(json.dumps({"failed": str(error)}) + "\n")
+                reports.write(json.dumps({"failed": str(error)}) + "\n")
                 os._exit(code)
-            said.write(json.dumps({"restored": root}) + "\n")
+            reports.write(json.dumps({"restored": root}) + "\n")
             os.read(living, 16)  # until the shim has seen the process, which may end at once
-            said.write(f"{_reap_until(root)}\n")
+            reports.write(f"{_reap_until(root)}\n")
         code = 0
     except Exception:  # noqa: BLE001 - a bug: logged, and the shim sees this process end
         sys.excepthook(*sys.exc_info())
@@ -274,19 +274,19 @@ def _restore_as_child(task: _Restore) -> NoReturn:
 def _start_guard(root: int) -> tuple[int, int]:
     """Start the guard that kills the restored process if the shim dies; return its pid and pipe."""
     living, end_of_life = os.pipe()
-    hearing, saying = os.pipe()
+    reports_out, reports_in = os.pipe()
     guard = os.fork()
     if guard == 0:
         os.setsid()  # so that a SIGKILL to the shim's group does not reach it
         os.close(end_of_life)
-        os.close(saying)
+        os.close(reports_in)
         if not os.read(living, 16):
             process_tree.send(reversed(process_tree.tree(root)), signal.SIGKILL)
         os._exit(0)
     os.close(living)
-    os.close(saying)
-    os.read(hearing, 1)  # until the guard has its own session
-    os.close(hearing)
+    os.close(reports_in)
+    os.read(reports_out, 1)  # until the guard has its own session
+    os.close(reports_out)
     return guard, end_of_life
 
 

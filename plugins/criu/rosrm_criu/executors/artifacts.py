@@ -1,34 +1,25 @@
 """A slave's images and transfer ends of migrations by `criu`, with automatic cleanup.
 
-A master may request a step twice, or undo a migration while a step is under way. A slave may be
-killed and restarted. So steps are identified by the attempt, and artifacts by the number of an
-instance. Unused artifacts are removed after a time.
+A slave may be killed and restarted. So artifacts are identified by the number of an instance, and
+unused ones are removed after a time.
 """
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import threading
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.errors import CriuError
 from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.paths import checkpoint, incoming, numbers, outgoing
 from rosrm_criu.engine.restore_result import Outcome
 from rosrm_criu.executors.request import StepArguments, without_log_names
 from rosrm_criu.transfer import Fetcher, Sender
 
-Answer = Mapping[str, Any]
-
 #: Seconds after which an image that a killed slave has left is no longer needed for a start.
 _LEFT_BEHIND: Final = 120.0
-#: Steps whose answers are kept; far more than there are migrations at a time.
-_REMEMBERED: Final = 50
 
 #: File below an image copied for a restore: number of the instance whose checkpoint it is.
 _ORIGIN: Final = "of"
@@ -36,87 +27,6 @@ _ORIGIN: Final = "of"
 _changing: Final = threading.Lock()
 _senders: Final[dict[int, Sender]] = {}
 _fetchers: Final[dict[int, Fetcher]] = {}
-_flights: Final[dict[tuple[str, str], Future[Answer]]] = {}
-_dumping: Final[defaultdict[int, threading.Lock]] = defaultdict(threading.Lock)
-
-
-# --- steps that are asked for twice -----------------------------------------------------------
-
-
-def once(step: str, attempt: str, work: Callable[[], Answer]) -> Answer:
-    """Run a step once per attempt; repeated calls, also concurrent ones, get the same answer.
-
-    Args:
-        step: its name.
-        attempt: id of the migration attempt.
-        work: the step. If it raises, its result is dropped, and the next call runs it again.
-    """
-    with _changing:
-        flight = _flights.get((step, attempt))
-        is_ours = flight is None
-        if flight is None:
-            flight = _flights[step, attempt] = Future()
-            while len(_flights) > _REMEMBERED:
-                del _flights[next(iter(_flights))]
-    if not is_ours:
-        return flight.result()
-    try:
-        answer = work()
-    except BaseException as error:
-        with _changing:
-            _flights.pop((step, attempt), None)
-        flight.set_exception(error)
-        raise
-    flight.set_result(answer)
-    return answer
-
-
-def after(step: str, attempt: str, timeout: float) -> None:
-    """Wait for the end of a step under way.
-
-    Args:
-        step: its name.
-        attempt: id of the migration attempt.
-        timeout: seconds.
-
-    Raises:
-        CriuError: the step is still under way.
-    """
-    with _changing:
-        flight = _flights.get((step, attempt))
-    if flight is None:
-        return
-    try:
-        flight.exception(timeout)
-    except TimeoutError:
-        raise CriuError(f"{step} is still under way after {timeout:g} s") from None
-
-
-@contextlib.contextmanager
-def alone(number: int, timeout: float) -> Iterator[None]:
-    """Exclude other dumps of an instance.
-
-    Args:
-        number: of the instance.
-        timeout: seconds to wait for another dump.
-
-    Raises:
-        CriuError: another dump is still under way after `timeout` seconds.
-    """
-    with _changing:
-        lock = _dumping[number]
-    if not lock.acquire(timeout=timeout):
-        raise CriuError(f"another dump of it is still under way after {timeout:g} s")
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def is_busy(number: int) -> bool:
-    """Return True if this slave is dumping an instance."""
-    with _changing:
-        return _dumping[number].locked()
 
 
 # --- the source -------------------------------------------------------------------------------

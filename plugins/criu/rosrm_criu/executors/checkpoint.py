@@ -8,7 +8,6 @@ after any failure until the process is restored.
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import signal
 import socket
@@ -29,8 +28,8 @@ from rosrm_criu.engine import (
 )
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
-from rosrm_criu.executors import artifacts
-from rosrm_criu.executors.request import StepArguments, check_wanted, turn_back, without_log_names
+from rosrm_criu.executors import artifacts, attempts
+from rosrm_criu.executors.request import StepArguments, without_log_names
 from rosrm_criu.plans import KEEP, TAKE
 
 #: Sockets that reserve the ports of checkpointed processes, by the number of the instance.
@@ -46,11 +45,11 @@ _LOOK: Final = 0.005
 def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Dump the process into an image; the process stays stopped."""
     asked = StepArguments.of(arguments)
-    return artifacts.once(KEEP, asked.attempt, lambda: _keep(asked))
+    return attempts.once(KEEP, asked.attempt, lambda: _keep(asked))
 
 
 def _keep(asked: StepArguments) -> Mapping[str, Any]:
-    with artifacts.alone(asked.source, asked.timeout):
+    with attempts.alone(asked.source, asked.timeout):
         return _keep_alone(asked)
 
 
@@ -65,7 +64,7 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
         raise CriuError(f"{asked.process} cannot be checkpointed: {trouble}")
     directory, began = checkpoint(asked.state, asked.source), time.monotonic()
     artifacts.discard(directory)
-    check_wanted(asked.attempt)
+    attempts.check_wanted(asked.attempt)
     try:
         with without_log_names():
             manifest = dump.dump(
@@ -74,8 +73,8 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
             )  # fmt: skip
         udp_ports.write(checkpoint_ports(asked.state, asked.source), udp_ports.bound(pids))
     except BaseException:  # any error: the process continues, and nothing is left behind
-        _discard(asked.state, asked.source)
         dump.resume(pid)
+        _discard(asked.state, asked.source)
         raise
     return {"size": manifest.size, "seconds": {"dump": time.monotonic() - began}}
 
@@ -83,12 +82,12 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
 def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Undo a failed checkpoint: continue the process, unless it has ended."""
     asked = StepArguments.of(arguments)
-    turn_back(asked.attempt)
-    artifacts.after(KEEP, asked.attempt, asked.timeout)
-    _discard(asked.state, asked.source)
+    attempts.turn_back(asked.attempt)
+    attempts.after(KEEP, asked.attempt, asked.timeout)
     pid = asked.pid(asked.source)
     if pid:
         dump.resume(pid)
+    _discard(asked.state, asked.source)
     return {}
 
 
@@ -124,7 +123,7 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     artifacts.forget_restored(asked.state, asked.instances)
     try:
         target.mkdir(mode=0o700)
-        shutil.copytree(source, target, copy_function=_link, dirs_exist_ok=True)
+        shutil.copytree(source, target, copy_function=image.link_or_copy, dirs_exist_ok=True)
         artifacts.note_origin(target, asked.source)
     except (OSError, shutil.Error) as error:
         artifacts.discard(target)
@@ -132,14 +131,7 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     return {"taken": True}
 
 
-def _link(source: str, target: str) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # a file system without hard links
-        shutil.copy2(source, target)
-
-
-def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+def await_checkpoint(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait until the image is restored, and remove it."""
     asked = StepArguments.of(arguments)
     found = artifacts.await_restored(asked)

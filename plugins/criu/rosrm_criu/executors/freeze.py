@@ -17,7 +17,7 @@ from rosrm_criu.control.client import (
 )
 from rosrm_criu.control.messages import State, Status, read_message
 from rosrm_criu.engine import dump, process_tree
-from rosrm_criu.executors.request import check_wanted
+from rosrm_criu.executors import attempts
 
 
 def leave(pid: int, control: Path, attempt: str, timeout: float) -> float:
@@ -35,7 +35,7 @@ def leave(pid: int, control: Path, attempt: str, timeout: float) -> float:
     root = process_tree.root_of(pid)
     if process_tree.is_stopped(root):  # an earlier call of the same step has dumped it
         dump.resume(pid)
-    check_wanted(attempt)
+    attempts.check_wanted(attempt)
     ask_prepare(control, root, attempt)
     return await_left(control, attempt, timeout, root).seconds.get("leave", 0.0)
 

@@ -22,11 +22,11 @@ from rosrm_criu.engine import dump, process_tree
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import incoming, outgoing
 from rosrm_criu.engine.probe import criu_support
-from rosrm_criu.executors import artifacts, periodic
-from rosrm_criu.executors.artifacts import Answer
+from rosrm_criu.executors import artifacts, attempts, periodic
+from rosrm_criu.executors.attempts import Answer
 from rosrm_criu.executors.checkpoint import reserve_all
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
-from rosrm_criu.executors.request import StepArguments, check_wanted, turn_back, without_log_names
+from rosrm_criu.executors.request import StepArguments, without_log_names
 from rosrm_criu.plans import CHECKPOINT, FETCH, INTRODUCE
 from rosrm_criu.transfer import Offer, Sender, missing
 
@@ -57,11 +57,11 @@ def checkpoint(arguments: Answer) -> Answer:
     The node is frozen from then on; after any failure it is asked to continue.
     """
     asked = StepArguments.of(arguments)
-    return artifacts.once(CHECKPOINT, asked.attempt, lambda: _checkpoint(asked))
+    return attempts.once(CHECKPOINT, asked.attempt, lambda: _checkpoint(asked))
 
 
 def _checkpoint(asked: StepArguments) -> Answer:
-    with artifacts.alone(asked.source, asked.timeout):
+    with attempts.alone(asked.source, asked.timeout):
         return _checkpoint_alone(asked)
 
 
@@ -77,8 +77,10 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         offered = time.monotonic()
         offer = _offer(sender, directory, asked)
     except Exception:  # any error: the node rejoins
-        artifacts.withdraw(asked.state, asked.source)
-        call_back(pid, control, asked.attempt)
+        try:
+            call_back(pid, control, asked.attempt)
+        finally:  # afterwards, because the end of the sender takes a while
+            artifacts.withdraw(asked.state, asked.source)
         raise
     return {
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
@@ -95,8 +97,8 @@ def go_on(arguments: Answer) -> Answer:
     If the node has ended since, its restart policy applies.
     """
     asked = StepArguments.of(arguments)
-    turn_back(asked.attempt)
-    artifacts.after(CHECKPOINT, asked.attempt, asked.timeout)
+    attempts.turn_back(asked.attempt)
+    attempts.after(CHECKPOINT, asked.attempt, asked.timeout)
     artifacts.withdraw(asked.state, asked.source)
     pid = asked.pid(asked.source)
     if not pid:
@@ -131,7 +133,7 @@ def end(arguments: Answer) -> Answer:
 def _dump(pid: int, asked: StepArguments) -> Path:
     directory = outgoing(asked.state, asked.source)
     artifacts.discard(directory)
-    check_wanted(asked.attempt)
+    attempts.check_wanted(asked.attempt)
     with without_log_names():
         dump.dump(
             find(), pid, directory, leave="stopped",
@@ -143,7 +145,7 @@ def _dump(pid: int, asked: StepArguments) -> Path:
 
 def _offer(sender: Sender, directory: Path, asked: StepArguments) -> Offer:
     seconds = float(asked.arguments["seconds"]["offer"])
-    check_wanted(asked.attempt)
+    attempts.check_wanted(asked.attempt)
     offer = sender.offer(
         directory, seconds=seconds, max_rate=float(asked.arguments["max_rate"]),
         to=str(asked.results[INTRODUCE]["certificate"]),
@@ -168,7 +170,7 @@ def introduce(arguments: Answer) -> Answer:
 def fetch_image(arguments: Answer) -> Answer:
     """Fetch the image to this host, for the start that follows."""
     asked = StepArguments.of(arguments)
-    return artifacts.once(FETCH, asked.attempt, lambda: _fetch(asked))
+    return attempts.once(FETCH, asked.attempt, lambda: _fetch(asked))
 
 
 def _fetch(asked: StepArguments) -> Answer:

@@ -14,14 +14,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.errors import CriuError
+from rosrm.errors import CriuError, PortableError
 from rosrm_criu.control.client import await_joined
 from rosrm_criu.engine import dump as dumping
 from rosrm_criu.engine import external_resources, image, paths, process_tree, slots
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.slots import Rejoin
-from rosrm_criu.executors import artifacts
+from rosrm_criu.executors import artifacts, attempts
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
 from rosrm_criu.executors.request import StepArguments, without_log_names
 
@@ -36,7 +36,7 @@ def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Make the node leave, dump it, and make it rejoin."""
     asked = StepArguments.of(arguments)
     parent = paths.periodic(asked.state, asked.source)
-    with artifacts.alone(asked.source, asked.timeout):
+    with attempts.alone(asked.source, asked.timeout):
         try:
             return _dump(asked, parent)
         except OSError as error:
@@ -56,8 +56,8 @@ def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
     for directory in (parent.parent, parent):
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     slots.discard_unfinished(parent)
-    slot, away, began = slots.new_slot(parent), parent / _AWAY, time.monotonic()
-    away.write_text(asked.attempt, encoding="utf-8")
+    slot, began = slots.new_slot(parent), time.monotonic()
+    (parent / _AWAY).write_text(asked.attempt, encoding="utf-8")
     try:
         manifest, left = _dump_away(asked, pid, control, slot)
         dumped = time.monotonic()
@@ -69,8 +69,6 @@ def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
         if has_failed(control):  # its restart policy starts it from the previous image
             dumping.kill(pid)
         raise
-    finally:
-        away.unlink(missing_ok=True)
     slots.complete(slot, Rejoin(str(control), asked.attempt, owner_of(pid)))
     return {
         "size": manifest.size, "missing": list(status.missing),
@@ -92,6 +90,7 @@ def _dump_away(asked: StepArguments, pid: int, control: Path, slot: Path) -> tup
             )  # fmt: skip
     finally:
         call_back(pid, control, asked.attempt)
+        (slot.parent / _AWAY).unlink(missing_ok=True)
     return manifest, left
 
 
@@ -126,15 +125,20 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
         pids: leaders of the instances that run here, by `process#number`.
 
     Raises:
-        CriuError: one of them is still being dumped.
+        CriuError, PortableError: one of them is still being dumped, or cannot be called back.
     """
     for instance, pid in pids.items():
         number = artifacts.number_of(instance)
         away = paths.periodic(state, number) / _AWAY
-        if away.exists() and not artifacts.is_busy(number):
+        if not away.exists() or attempts.is_busy(number):
+            continue
+        try:
             _await_end_of_dump(instance, pid)
             call_back(pid, control_of(pid), away.read_text(encoding="utf-8"))
-            away.unlink()
+        except (CriuError, PortableError):
+            if process_tree.is_alive(pid):
+                raise
+        away.unlink(missing_ok=True)
 
 
 def _await_end_of_dump(instance: str, pid: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,6 @@ from rosrm_criu.engine import process_tree
 
 #: References to CRIU's logs, which are removed with the image; the message has the cause.
 _LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
-
-_turned_back: Final[set[str]] = set()
-_turning: Final = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -71,19 +67,6 @@ class StepArguments:
         if not pid:
             raise CriuError(f"{self.process}#{number} does not run on {self.host}")
         return pid
-
-
-def turn_back(attempt: str) -> None:
-    """Mark an attempt as given up by the master, so that its steps under way stop."""
-    with _turning:
-        _turned_back.add(attempt)
-
-
-def check_wanted(attempt: str) -> None:
-    """Raise `CriuError` if the attempt was given up."""
-    with _turning:
-        if attempt in _turned_back:
-            raise CriuError("the move was undone")
 
 
 @contextlib.contextmanager

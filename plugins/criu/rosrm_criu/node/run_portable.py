@@ -150,8 +150,8 @@ class _Run:
     def say_failed(self, error: Exception) -> None:
         """Report the failure to waiting clients; the traceback is in the log."""
         if self._listener is not None:
-            said = str(error) if isinstance(error, PortableError) else _said(error)
-            self._listener.report(Status(State.FAILED, self._listener.status.request, said))
+            message = str(error) if isinstance(error, PortableError) else _described(error)
+            self._listener.report(Status(State.FAILED, self._listener.status.request, message))
 
     # --- running ---------------------------------------------------------------------------
 
@@ -345,5 +345,5 @@ def without_parameter_files(args: Sequence[str]) -> list[str]:
     return kept
 
 
-def _said(error: Exception) -> str:
+def _described(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"

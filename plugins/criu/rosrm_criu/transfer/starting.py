@@ -107,7 +107,7 @@ class _End:
             line = self._process.stdout.readline()
         finally:
             late.cancel()
-        if not line:
+        if not line.endswith(b"\n"):
             status = self._process.wait()
             raise TransferError(
                 f"the process of the transfer ended with status {status} and no answer: the log of "

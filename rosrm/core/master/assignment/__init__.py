@@ -1,1 +1,1 @@
-"""Assignments: a waiting process gets a host, and its load is reserved there."""
+"""Assignment of waiting processes to hosts, and reservation of their load."""

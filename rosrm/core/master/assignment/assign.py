@@ -29,16 +29,15 @@ from rosrm.model.values import EMPTY
 from rosrm.wording import listed
 
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACHED)
-_STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
-#: Seconds for which placement waits at most for the first request of a host that has registered.
+_AWAITS_SNAPSHOT: Final = "a host that may have its snapshot has not rejoined yet"
+#: Longest time, in seconds, for which placement waits for a registered host's first request.
 _FIRST_REQUEST: Final = 1.0
 
 
 def demand_of(state: MasterState, process: Process) -> Demand:
     """Return the demand of a process.
 
-    It is built again after a change of the learned needs, or of the hosts with a replica of its
-    snapshot.
+    A change of the learned needs, or of the hosts with a replica of its snapshot, rebuilds it.
     """
     version = state.learned.version
     near = state.replication.replicas.hosts_of(process.name, process.born)
@@ -49,7 +48,7 @@ def demand_of(state: MasterState, process: Process) -> Demand:
             process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
             reads=state.declared.reads,
         )  # fmt: skip
-        # Equal processes share one: thousands of them may wait.
+        # Equal processes share one demand, because thousands of them may wait.
         known = process.demand = (version, state.demands.setdefault(demand.key, demand))
     return known[1]
 
@@ -79,9 +78,9 @@ def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, f
 def demand_amounts(
     state: MasterState, process: Process, seen: Mapping[str, float]
 ) -> tuple[Mapping[str, float], frozenset[str]]:
-    """Return the amount that a process needs of each resource, and the resources that are guessed.
+    """Return the amount of each resource that a process needs, and the estimated resources.
 
-    An amount that was measured (`seen`) is not a guess.
+    A measured amount (`seen`) is not an estimate.
     """
     needs = state.estimate(process.spec)
     names = {**needs.amounts, **seen}
@@ -145,8 +144,8 @@ def place_waiting(state: MasterState, now: float) -> None:
 def _first_request_awaited(state: MasterState, now: float) -> str:
     """Return why placement waits for recently registered hosts; "" if it does not wait.
 
-    Without the wait, the host whose request arrives first takes every process that was submitted
-    while the hosts register. Hosts that register later do not prolong the wait.
+    Without the wait, the host with the first request would get every process that was submitted
+    while the hosts registered. Hosts that register later do not prolong the wait.
     """
     awaited = state.hosts.about_to_ask(now - _FIRST_REQUEST)
     if not len(awaited):
@@ -163,11 +162,10 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a snapshot and do not block those behind them."""
     if not np.isin(state.hosts.condition, _AWAY).any():
         return frozenset()
-    names = (name for name in state.queue if awaits_states(state, state.processes[name], now))
-    passed_over = frozenset(names)
-    for name in passed_over:
-        _record_wait_reason(state, state.processes[name], _STATE_MAY_COME, now)
-    return passed_over
+    names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
+    for name in names:
+        _record_wait_reason(state, state.processes[name], _AWAITS_SNAPSHOT, now)
+    return frozenset(names)
 
 
 def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
@@ -178,12 +176,12 @@ def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float)
 
 def _next_in_line(state: MasterState, passed_over: frozenset[str]) -> str | None:
     if not passed_over:
-        return state.queue.head()  # quicker, and thousands may wait
+        return state.queue.head()  # faster, because thousands may wait
     return next((name for name in state.queue if name not in passed_over), None)
 
 
 def _versions(state: MasterState) -> tuple[int, ...]:
-    """Return version counters of all that placement depends on.
+    """Return the version counters of all inputs of placement.
 
     While none of them grows, a process that did not fit still does not fit.
     """
@@ -226,12 +224,12 @@ def _assign(
     instance = state.new_instance_id(process)
     state.queue.remove(process.name)
     state.reserve(instance, host, now, ranking)
-    ranking.took()
+    ranking.note_assignment()
     process.owner, process.left_behind, process.exit_code = instance.number, None, None
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     state.record(
-        now, EventKind.ASSIGNED, f"{process.name} goes to {host.name}", process=process.name,
+        now, EventKind.ASSIGNED, f"{process.name} is assigned to {host.name}", process=process.name,
         host=host.name, facts={"number": instance.number, "decision": process.decision},
     )  # fmt: skip
     state.save(process)

@@ -1,10 +1,10 @@
 """Prefetch of short jobs: one assignment beyond `max_processes`, held by the slave.
 
-Between the end of one job and the start of the next lie several messages, which is much for a job
-of 0.1 s. So a host with `max_processes` may get one assignment more. Its slave holds that job and
-starts it without a further order as soon as a slot is free. Prefetch needs run times of earlier
-runs of the same program, so that no job waits long behind a long one. A job that waits longer than
-expected all the same returns to its place in the queue.
+Several messages pass between the end of one job and the start of the next. For a job of 0.1 s that
+delay is long, so a host with `max_processes` may get one assignment more. Its slave starts that job
+without a further order as soon as a slot is free. A host gets it only if the mean run times of
+earlier runs show that all of its running jobs end soon. A prefetched job that waits longer than
+expected returns to its place in the queue.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import Instance
 from rosrm.model.values import InstanceState, InstanceStatus, Kind, ProcessSpec
 
-#: Seconds: jobs that run no longer than this on average are short.
+#: Longest mean run time, in seconds, of a short job.
 _SHORT: Final = 0.5
-#: Seconds after which a job that was thought short has proved otherwise.
+#: Run time, in seconds, after which a running job no longer counts as short.
 PROVED_LONG: Final = 4 * _SHORT
 #: Weight of the newest run in the mean.
 _NEWEST: Final = 0.3
@@ -32,7 +32,7 @@ def learn_run_time(state: MasterState, spec: ProcessSpec, status: InstanceStatus
 
 
 def review_slots(state: MasterState, host: Host, now: float) -> None:
-    """Allow or forbid the prefetched assignment of a host whose processes have changed."""
+    """Allow a prefetched assignment on a host if all of its running jobs end soon."""
     most = host.description.max_processes
     if not most:
         return
@@ -50,7 +50,7 @@ def _ends_soon(state: MasterState, instance: Instance, now: float) -> bool:
 
 
 def waits_too_long(instance: Instance, now: float) -> bool:
-    """Return True if a prefetched assignment waits for a job that turned out to be long."""
+    """Return True if a prefetched assignment has waited longer than a short job runs."""
     return (
         instance.state is InstanceState.HELD
         and instance.host.description.max_processes > 0  # otherwise it waits for other starts

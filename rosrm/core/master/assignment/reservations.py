@@ -8,10 +8,10 @@ import numpy as np
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import Instance
-from rosrm.extensions.contracts import Intent
+from rosrm.model.records import Intent
 from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
 
-#: Seconds: a shorter run is mostly start-up, so it does not show the CPU use of a program.
+#: Shortest run, in seconds, that shows the CPU use of a program; before, start-up dominates.
 _TELLING_RUN: Final = 1.0
 
 

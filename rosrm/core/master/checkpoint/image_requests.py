@@ -1,8 +1,9 @@
 """Checkpoint and restore of a process on its own host: begin and outcome.
 
-Both are plans like those of migrations, and `executor` carries them out: undone before the commit,
-rolled forward after it. A checkpoint commits to a checkpoint image (`images`), and no instance owns
-the name then. A restore commits to the instance that is restored from the image.
+Both are plans like those of migrations, which `executor` executes: a failure before the commit is
+undone, a later one retried. The commit of a checkpoint makes a checkpoint image (`images`) the
+owner of the name, in place of an instance. The commit of a restore makes the restored instance the
+owner.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from rosrm.model.plan import Aim, Commit, Execute, Move
 from rosrm.model.values import InstanceId
 from rosrm.wording import listed, standing
 
-#: Kind of the record that marks the begin of each.
+#: Kind of the record at the begin of each.
 _BEGUN: Final = {
     Aim.CHECKPOINT: EventKind.CHECKPOINT_BEGUN,
     Aim.RESTORE: EventKind.RESTORE_BEGUN,
@@ -48,7 +49,7 @@ def begin_checkpoint(
     """Begin to dump a running process into an image.
 
     Returns:
-        None, or why the process cannot be checkpointed; then nothing has changed.
+        None; or the reason why the process cannot be checkpointed, and nothing has changed.
     """
     refusal = _why_no_checkpoint(state, process)
     if refusal:
@@ -101,7 +102,7 @@ def _why_no_strategy(state: MasterState, process: Process) -> str:
     able = [f"`{name}`" for name, it in state.declared.capabilities.items() if it.state == "memory"]
     remedy = f"name {listed(able, 'or')}" if able else "install a strategy that can, and name it"
     return (
-        f"nothing that is selected here can checkpoint {process.name}: {remedy} below "
+        f"no selected strategy can checkpoint {process.name}: {remedy} below "
         f"`migration: strategies:` in the cluster's file, and start the master again"
     )
 
@@ -113,7 +114,7 @@ def begin_restore(state: MasterState, process: Process, cause: str, now: float) 
     """Begin to restore a process from its image, on the host of the image.
 
     Returns:
-        None, or why the process cannot be restored; then nothing has changed.
+        None; or the reason why the process cannot be restored, and nothing has changed.
     """
     image = process.image
     refusal = _why_no_restore(state, process)
@@ -164,9 +165,9 @@ def _begin(
     state: MasterState, process: Process, move: Move, strategy: str, aim: Aim, now: float,
     *, cause: str, ranking: Ranking | None = None,
 ) -> Rejected | None:  # fmt: skip
-    """Let the strategy plan, and begin the plan; return None, or why there is no plan.
+    """Begin the plan of a strategy; return None, or the reason why there is no plan.
 
-    `ranking`: the reservation at the destination follows it.
+    `ranking`: if given, the needs in it are reserved at the destination.
     """
     migration = planned(state, strategy, move, cause, now, aim)
     if isinstance(migration, Rejected):
@@ -208,10 +209,9 @@ def commit_to_image(
 
 
 def leave_behind(state: MasterState, migration: Migration, step: Execute) -> bool:
-    """Return True if a plan that may not stop can skip an executor, because nothing needs the step.
+    """Return True if an executor step that cannot succeed is needless and may be skipped.
 
-    Anything frozen on that host is still frozen. When the host returns, it is killed, not
-    re-adopted.
+    An instance that is still frozen on that host is killed when the host rejoins, not re-adopted.
     """
     if migration.aim is Aim.CHECKPOINT:
         if migration.undo is None or migration.source.number not in migration.ended:
@@ -227,13 +227,13 @@ def leave_behind(state: MasterState, migration: Migration, step: Execute) -> boo
 
 
 def _remove_unmade(state: MasterState, migration: Migration) -> None:
-    """Remove the partial image that an undone checkpoint may have left on its host."""
+    """Remove the partial image that an undone checkpoint may have left."""
     host, drop = migration.source_host.name, migration.commit.image
     images.remove(state, migration.process, host, drop, migration.source.number)
 
 
 def settle(state: MasterState, process: Process, migration: Migration, now: float) -> None:
-    """Set the phase after a plan that ends with an image; drop the image of a cancelled process."""
+    """Set the phase after a plan that ends with an image; remove a cancelled process's image."""
     if process.wanted is DesiredState.CANCEL:
         images.cancel(state, process, now, migration.destination.number)
     else:
@@ -245,7 +245,7 @@ def settle(state: MasterState, process: Process, migration: Migration, now: floa
 
 
 def ending_of(migration: Migration) -> tuple[EventKind, str]:
-    """Return the kind and the message of the record that marks the end of a plan."""
+    """Return the kind and the message of the record at the end of a plan."""
     name, done = migration.process, migration.undo is None
     here, there = migration.source_host.name, migration.destination_host.name
     if migration.aim is Aim.CHECKPOINT:

@@ -1,11 +1,11 @@
 """Checkpoint images: ownership of the name, and removal of unwanted images.
 
 ===========================  ===================================================================
-the process                  its image
+process                      its image
 ===========================  ===================================================================
-is checkpointed              owns the name, also while its host is lost, closed or switched off
-is restored                  ends with the commit: it has become the process again
-is cancelled or restarted    is removed once its host reports; until then the removal is an intent
+checkpointed                 owns the name, also while its host is lost, closed or switched off
+restored                     loses the name to the restored instance at the commit
+cancelled or restarted       is removed once its host is up; until then the removal is an intent
 ===========================  ===================================================================
 """
 
@@ -20,17 +20,17 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.images import UnwantedImage
 from rosrm.core.master.state.pending_orders import ImageRemoval
 from rosrm.core.master.state.process import Image, Process, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
+from rosrm.model.records import Intent
 
-#: Seconds for a removal, and until a failed removal is retried.
+#: Time-out of a removal, and delay before its retry; seconds.
 _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 60.0
 #: Key of the unwanted images in the journal's table "cluster".
 _KEY: Final = "unwanted_images"
-#: Fields of an unwanted image that the journal has.
+#: Fields of an unwanted image that are journaled.
 _JOURNALED: Final = ("process", "host", "drop", "numbers")
 
 
@@ -60,7 +60,7 @@ def why_away(state: MasterState, image: Image) -> str:
 
 
 def reason_of(state: MasterState, process: Process) -> str:
-    """Return place and condition of a process's image, else the reason of the process."""
+    """Return the host and condition of a process's image, or else the reason of its phase."""
     image = process.image
     if image is None or process.phase is not ProcessPhase.CHECKPOINTED:
         return process.reason
@@ -81,9 +81,9 @@ def cancel(state: MasterState, process: Process, now: float, *numbers: int) -> N
 
 
 def drop(state: MasterState, process: Process, *numbers: int) -> None:
-    """Detach the image of a process, if it has one, and have it removed.
+    """Detach the image of a process, if it has one, and remove it from its host.
 
-    `numbers`: of other instances under which the image may lie on its host.
+    `numbers`: further instance numbers under which the host may have stored the image.
     """
     image = process.image
     if image is not None:
@@ -95,7 +95,7 @@ def drop(state: MasterState, process: Process, *numbers: int) -> None:
 def remove(
     state: MasterState, process: str, host: str, drop: str, number: int, *numbers: int
 ) -> None:
-    """Have an image removed once its host is up; the arguments are those of `UnwantedImage`."""
+    """Remove an image once its host is up; the arguments are those of `UnwantedImage`."""
     state.images.unwanted[number] = UnwantedImage(process, host, drop, (number, *numbers))
     _save(state)
 
@@ -112,7 +112,7 @@ def review(state: MasterState, now: float) -> None:
 
 
 def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
-    """Note that a host has removed an image, or why not."""
+    """Note the answer of a host to the order to remove an image."""
     one = state.images.unwanted.get(number)
     if one is None or one.order != event.order:
         return
@@ -128,7 +128,7 @@ def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, 
     one.ask_at = now + _ASK_AGAIN
     state.record(
         now, EventKind.IMAGE_LEFT,
-        f"the image of {one.process} was not removed from {one.host}: {event.reason}; tried again",
+        f"the image of {one.process} was not removed from {one.host}: {event.reason}; retrying",
         process=one.process, host=one.host, facts={"number": number},
     )  # fmt: skip
 

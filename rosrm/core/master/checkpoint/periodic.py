@@ -1,15 +1,15 @@
-"""Periodic checkpoints: dumps of processes that keep running; a crash starts from the newest.
+"""Periodic checkpoints: dumps of running processes, for a restart from the newest after a crash.
 
 ==================================  ==========================================================
 observed                            ordered
 ==================================  ==========================================================
-a process requests them, and runs   `execute` of its strategy's step, at the policy's pace
-a dump fails                        recorded once, and retried at the same pace
-an instance with images is gone     its images are removed from its host
+a process that requests them runs   `RunExecutor` of its strategy's step, at the policy's pace
+a dump fails                        the same; the failure is recorded once for each reason
+an instance with images is gone     `RunExecutor` of the strategy's executor that removes images
 ==================================  ==========================================================
 
-Nothing of this is durable. The slave that dumps a process resumes it without an order of the
-master, and its supervisor starts it from its image.
+This state is not persisted. The slave that dumps a process resumes it without a further order, and
+the supervisor starts it from its image.
 """
 
 from __future__ import annotations
@@ -37,8 +37,10 @@ from rosrm.wording import size
 
 #: Seconds between two reviews.
 _LOOK_EVERY: Final = 1.0
-#: Seconds for a removal.
+#: Time-out of a removal, in seconds.
 _PATIENCE: Final = 30.0
+#: Upper bound of numbers in results, because JSON may hold integers that no float can.
+_MOST: Final = 1e18
 
 
 def review(state: MasterState, now: float) -> None:
@@ -57,7 +59,7 @@ def review(state: MasterState, now: float) -> None:
 
 
 def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
-    """Note the result of an instance's dump under way."""
+    """Note the answer to the order of an instance's dump."""
     dumped = state.periodic.of.get(number)
     if dumped is not None and dumped.order == event.order:
         _note(state, dumped, event, now)
@@ -74,7 +76,7 @@ def of_process(state: MasterState, process: Process, now: float) -> Mapping[str,
     }  # fmt: skip
 
 
-# --- what is due ------------------------------------------------------------------------------
+# --- due dumps --------------------------------------------------------------------------------
 
 
 def _review(state: MasterState, process: Process, now: float) -> None:
@@ -89,7 +91,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         discard = _discard_of(state, name)
         dumped = state.periodic.of[number] = Dumped(process.name, host.name, name, discard, now)
     if dumped.order is not None and dumped.asked != host.description.incarnation:
-        dumped.order, dumped.since = None, now  # the dump ended with the slave that made it
+        dumped.order, dumped.since = None, now  # the dump ended with the former run of the slave
     if dumped.order is not None or not _may_be_dumped(state, process, owner):
         return
     pace = _pace(state, process, strategy, host, dumped)
@@ -104,7 +106,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
 
 
 def _discard_of(state: MasterState, name: str) -> str | Rejected | None:
-    """Return the executor by which a strategy removes images; None: it has none."""
+    """Return the name of a strategy's executor that removes images; None: there is none."""
     strategy: object = state.strategies.get(name)
     if not implements(strategy, PeriodicImaging):
         return None
@@ -116,7 +118,7 @@ def _discard_of(state: MasterState, name: str) -> str | Rejected | None:
 
 
 def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
-    """Return True if a process runs, its host is up, and no plan or stop is under way."""
+    """Return True if a process runs on a host that is up, and is neither moved nor stopped."""
     return (
         process.phase is ProcessPhase.RUNNING
         and owner.is_running
@@ -129,7 +131,7 @@ def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> boo
 def _pace(
     state: MasterState, process: Process, strategy: PeriodicImaging, host: Host, dumped: Dumped
 ) -> float | Rejected | None:
-    """Return the seconds between two dumps; None: no dump is wanted."""
+    """Return the seconds between two dumps; None: the process requests none."""
     policy, name = state.replication.policy, state.replication.policy_name
     if policy is None:
         return Rejected("no checkpoint policy is selected: name one in the cluster's file")
@@ -203,7 +205,8 @@ def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now
 
 
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else 0.0
+    """Return a number of an executor's result; 0.0 for anything else, NaN and infinity too."""
+    return float(value) if isinstance(value, int | float) and 0 <= value < _MOST else 0.0
 
 
 def _record_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
@@ -219,9 +222,9 @@ def _record_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float
 
 
 def _remove(state: MasterState, number: int, dumped: Dumped) -> bool:
-    """Order the removal of images; return False if the strategy must be asked again first.
+    """Order the removal of an instance's images; return False if it must be retried.
 
-    A host that is not up removes them when it registers.
+    The slave of a host that is not up removes them when it registers.
     """
     host = state.hosts.up(dumped.host)
     if host is None:

@@ -1,26 +1,26 @@
 """Snapshot replication: placement of replicas by the checkpoint policy, and their removal.
 
-A node keeps its newest snapshot on its own host without an order. The master repeats each order to
-a slave until the slave's report confirms it. Nothing of this is durable. Each stateful process is
-reviewed about once a second.
+A node writes its newest snapshot on its own host without an order. The master repeats each order to
+a slave until the slave's report confirms it. The choices are not persisted. Each stateful process
+is reviewed about once a second.
 
 ==========================================  =====================================================
 observed                                    ordered
 ==========================================  =====================================================
-it runs, and the policy chooses hosts       `keep`: its slave ships the snapshot to them from now
-                                            on, beginning with the first of this instance
-its slave has an older choice               `keep`: the new choice
-it runs, and the policy gives no answer     as it chose last; where it has not chosen since the
-                                            master started, `keep` on the hosts with a replica
-it is cancelled, or has finished            `drop_kept` of every replica
-it was submitted again                      `drop_kept` of the replicas from before
-it was removed, by the journal              `drop_kept` of every replica
-a host that is not chosen has a replica     `drop_kept`, once a newer one lies where it should;
+a process runs, and the policy chooses      `ReplicateSnapshot`: the slave sends each snapshot of
+hosts                                       this instance to them
+its slave has an older choice               `ReplicateSnapshot`: the new choice
+it runs, and the policy gives no answer     the last choice; without one since the master's
+                                            start, `ReplicateSnapshot` to the hosts with a replica
+it is cancelled, or has finished            `DropReplica` for every replica
+it was submitted again                      `DropReplica` for those from before
+the journal shows that it was removed       `DropReplica` for every replica
+a host that is not chosen has a replica     `DropReplica`, once a chosen host has a newer replica;
                                             never before the policy has chosen
 ==========================================  =====================================================
 
-Replicas under any other name that this master does not know are left alone: its journal may be
-lost. The journal keeps the last 10,000 removed names.
+Replicas of any other unknown process stay, because the journal may have lost that process. The
+journal has the last 10,000 removed names.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from rosrm.model.values import InstanceId, SnapshotReport
 
 #: Seconds between two reviews of the same process.
 _LOOK_EVERY: Final = 1.0
-#: Most drop orders remembered, so that none is repeated at once.
+#: Highest number of drop orders in memory, which prevents that one is repeated at once.
 _REMEMBERED: Final = 10_000
-#: Phases after which the replicas of a process have no use.
+#: Phases in which the replicas of a process are useless.
 _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
 
 
@@ -66,38 +66,38 @@ def note_states(
     state: MasterState, host: Host, states: tuple[SnapshotReport, ...], now: float
 ) -> None:
     """Replace the known snapshots and replicas of a host by its complete report."""
-    # The journal may be lost: no instance may get a number that a snapshot has already.
+    # The journal may be lost, but no new instance may get the number of an existing snapshot.
     state.skip_numbers(max((one.instance.number for one in states), default=0))
     state.replication.replicas.replace(host.name, states, now)
 
 
 def awaits_states(state: MasterState, process: Process, now: float) -> bool:
-    """Return True if a host that has or may have a replica is away and may return at any moment.
+    """Return True if an absent host has or may have a replica, and may rejoin soon.
 
     A process that starts now might begin without its snapshot. So it waits for hosts that have not
-    returned since the master started, until they are lost. If no replica is in reach, it also waits
-    for a lost host other than its own, for one lease.
+    rejoined since the master started, until they are lost. If no replica is in reach, it also waits
+    one lease for a lost host other than its own.
     """
     if not state.declared.has_snapshots(process.spec):
         return False
     if (state.hosts.condition == HostCondition.EXPECTED).any():
         return True
     return not state.replication.in_reach(process.name, process.born, state.hosts) and any(
-        _may_come_back(state, state.hosts.by_name[name], now)
+        _may_rejoin(state, state.hosts.by_name[name], now)
         for name in state.replication.replicas.hosts_of(process.name, process.born)
         if name in state.hosts.by_name and not _was_left_on(process, name)
     )
 
 
-def _may_come_back(state: MasterState, host: Host, now: float) -> bool:
+def _may_rejoin(state: MasterState, host: Host, now: float) -> bool:
     away = state.hosts.condition_of(host) in (HostCondition.LOST, HostCondition.DETACHED)
     return away and now < host.lost_since + state.settings.lease
 
 
 def _was_left_on(process: Process, host: str) -> bool:
-    """Return True if the lost host is the process's own.
+    """Return True if the process ran on this host when the host was lost.
 
-    That loss is why the process waits, and alone no reason to wait longer.
+    `host_loss` has already delayed the process for that loss, so it does not wait longer.
     """
     return process.left_behind is not None and process.left_behind.host == host
 
@@ -112,8 +112,8 @@ def note_answer(state: MasterState, process: str, event: happened.OrderAnswered)
 # --- requests -------------------------------------------------------------------------------
 
 
-def begin_anew(state: MasterState, process: Process) -> None:
-    """Start a terminal process without its past: discard its snapshots if finished or cancelled."""
+def drop_former_replicas(state: MasterState, process: Process) -> None:
+    """Make the snapshots of a restarted process void if it had finished or was cancelled."""
     if process.phase in _DONE:
         process.born = state.next_instance
 
@@ -137,14 +137,13 @@ def review(state: MasterState, now: float) -> None:
         name = known.waiting.pop()
         process = state.processes.get(name)
         if process is None:
-            known.last_orders.pop(name, None)
             _drop_removed(state, name, now)
         else:
             _review(state, process, now)
 
 
 def _drop_removed(state: MasterState, name: str, now: float) -> None:
-    """Drop every replica of a process that was removed and is not known again."""
+    """Drop every replica of a process that was removed and not submitted again."""
     end = state.replication.removed.get(name, 0)
     for host, replica in state.replication.replicas.of(name).items():
         if replica.number < end:
@@ -164,7 +163,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
 def _choose(
     state: MasterState, process: Process, host: Host, replicas: Mapping[str, Replica], now: float
 ) -> None:
-    """Ask the policy, and send its choice to the slave if it is new there."""
+    """Ask the policy, and send its choice to the slave unless the slave has it already."""
     choice = _choice(state, process, host, replicas, now)
     last = state.replication.last_orders.get(process.name)
     by_policy = choice is not None or (last is not None and last.by_policy)
@@ -199,7 +198,7 @@ def _choose(
 def _current_choice(
     process: Process, host: Host, replicas: Mapping[str, Replica]
 ) -> CheckpointChoice:
-    """Choose the other hosts with a replica that is not from before the last submission."""
+    """Choose the other hosts with a replica from after the last submission."""
     kept = (name for name, one in replicas.items() if one.number >= process.born)
     return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
 
@@ -212,9 +211,9 @@ def _is_same(one: CheckpointChoice, other: CheckpointChoice) -> bool:
 def _choice(
     state: MasterState, process: Process, host: Host, replicas: Mapping[str, Replica], now: float
 ) -> CheckpointChoice | None:
-    """Return the choice of the policy; None: keep the last one.
+    """Return the choice of the policy; None: keep the last choice.
 
-    A policy that raises or breaks its contract is recorded by name.
+    A policy that raises or breaks its contract is recorded with its name.
     """
     policy, policy_name = state.replication.policy, state.replication.policy_name
     if policy is None:
@@ -239,14 +238,14 @@ def _choice(
         return None
 
 
-def _may_hold_replica(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
-    """Return True if a host may keep a replica.
+def _may_hold_replica(state: MasterState, host: Host, current: tuple[str, ...]) -> bool:
+    """Return True if a host may get or keep a replica; `current`: the hosts that have one.
 
-    A suspect host stays a keeper, because it may only be silent for a moment.
+    A suspect host keeps its replica, because it may report again within a moment.
     """
     condition = state.hosts.condition_of(host)
     return condition is HostCondition.UP or (
-        condition is HostCondition.SUSPECT and host.name in keepers
+        condition is HostCondition.SUSPECT and host.name in current
     )
 
 
@@ -285,7 +284,7 @@ def _is_stale(
         return False
     if host in last.choice.hosts:
         return False
-    # Keep an undesired replica until a newer one exists elsewhere.
+    # Keep an undesired replica until a desired host has a newer one.
     better = last.choice.hosts or (owner.host.name,)
     return any(name in replicas and replicas[name].age > replica.age for name in better)
 
@@ -293,7 +292,7 @@ def _is_stale(
 def _drop(state: MasterState, process: str, name: str, replica: Replica, now: float) -> None:
     host = state.hosts.up(name)
     if host is None:
-        return  # it reports its replicas again when it rejoins
+        return  # the host reports its replicas again when it rejoins
     at = state.replication.dropped_at.get((process, name), -math.inf)
     if now - at < state.settings.order_retry:
         return

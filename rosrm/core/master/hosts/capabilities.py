@@ -1,15 +1,16 @@
-"""Capabilities of hosts: each host is asked by an executor of the migration strategy's plugin.
+"""Capabilities of hosts: an executor of the strategy's plugin checks each host.
 
 =============================  ==============================================================
-a host                         action
+observed                       action
 =============================  ==============================================================
-is up, and was not asked       `execute` of the strategy's executor
-has answered                   its answer holds until it registers again
-did not answer                 it is asked again after a while
-the plugin's `ability` fails   the plugin is asked again after a while
+a host is up, and unchecked    `RunExecutor` with the strategy's `host_check`
+the host has answered          the answer is valid until the host registers again
+no answer within 30 s          the order is repeated after 10 s
+`host_check` cannot be read    the plugin is called again after 10 s
 =============================  ==============================================================
 
-Nothing of this is durable. Until a host has answered, nothing is moved to or from it.
+The answers are not persisted. Until a host has answered, no process moves to or from it by that
+strategy.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
 from rosrm.wording import listed
 
-#: Seconds for an answer, and until a host that did not answer is asked again.
+#: Seconds for an answer, and until an order without an answer is repeated.
 _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 10.0
 
 
 def ask_hosts(state: MasterState, now: float) -> None:
-    """Ask every host that is up and has not been asked, or did not answer."""
+    """Order the check of each strategy on every host that is up and has given no valid answer."""
     for name, strategy in state.strategies.items():
         if implements(strategy, HostChecking):
             for host in state.hosts.hosts:
@@ -55,13 +56,13 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
     state.capability_answers[name, host.name] = answer
     try:
         executor = state.plugins.ask(
-            "migration", name, "ability", lambda: required(strategy.ability, str)
+            "migration", name, "host_check", lambda: required(strategy.host_check, str)
         )
     except PluginError as error:
-        answer.reason = f"its ability is not known: {error}"
+        answer.reason = f"its host check is not known: {error}"
         return
     if executor not in host.description.executors:
-        # Asked again, because the slave reports broken plugins only after its registration.
+        # Checked again later, because a slave reports broken plugins only after its registration.
         answer.reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
         return
     query = CapabilityQuery(name, host.name)
@@ -72,7 +73,7 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
 def note_answer(
     state: MasterState, query: CapabilityQuery, event: happened.OrderAnswered, now: float
 ) -> None:
-    """Note the answer of a host about a strategy, unless the host was asked again since."""
+    """Note the answer of a host about a strategy; ignore the answer to an earlier order."""
     strategy, host = query.strategy, query.host
     answer = state.capability_answers[strategy, host]
     if answer.order != event.order:
@@ -115,7 +116,7 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
 
 
 def faults(state: MasterState, strategy: str, source: Host) -> list[str]:
-    """Return why a strategy cannot move anything from a host to others, an equal reason once."""
+    """Return the reasons why a strategy cannot move anything from a host, each reason once."""
     absent: dict[str, tuple[Answer | None, list[str]]] = {}
     others: dict[str, None] = {}
     answers = state.capability_answers

@@ -1,9 +1,9 @@
 """Fences: deadlines by which a host that is cut off from the master stops an instance.
 
-A lease in the sense of Gray and Cheriton (1989), with one difference: the master need not answer
-each host. Its beats name the hosts that it does not hear. A beat that does not name a host proves
-that the master received a message from the host at most `suspect` seconds before. From there the
-host counts by its own monotonic clock: clocks may differ, but must run equally fast.
+A fence is a lease in the sense of Gray and Cheriton (1989), with one difference: the master need
+not answer each host. Its beats name the silent hosts. A beat that does not name a host proves that
+the master received a message from the host at most `suspect` seconds before. From that time the
+host counts by its own monotonic clock. Clocks may differ, but must run equally fast.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
 
     Where a successor may start elsewhere after the loss of the host, the instance ends before that,
     unless its own `isolation.after` is longer. With `isolation: keep`, a process that may have a
-    successor ends only when its slave does not run. Then only the slave's messages are missing, and
-    other nodes would still receive those of both instances.
+    successor ends only if its slave does not run. In that case the host may still be connected, and
+    other nodes would receive the messages of both instances.
     """
     follows = spec.host_loss.then == "elsewhere" or spec.standby.wanted
     stops = spec.isolation.then == "stop"
@@ -44,7 +44,7 @@ def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
 def ended_after_loss(spec: ProcessSpec, settings: CoreSettings) -> float:
     """Return the seconds after the loss of a host by which the fence has ended every instance.
 
-    inf: the fence may not end the instance at all, because a running slave keeps it.
+    inf: no fence, or a fence that does not end the instance while its slave runs.
     """
     fence = fence_of(spec, settings)
     if fence is None or fence.alive:

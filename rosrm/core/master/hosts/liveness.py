@@ -22,7 +22,7 @@ from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import ReportInstances
 
-#: Reports that a host may owe before it is suspect, however seldom it reports.
+#: Number of its report periods for which a host may be silent before it is suspect.
 _REPORTS_MISSED: Final = 3
 
 
@@ -39,8 +39,8 @@ def review_liveness(state: MasterState, now: float) -> None:
     gone = age >= lease
     up, suspect = condition == HostCondition.UP, condition == HostCondition.SUSPECT
     lost = condition == HostCondition.LOST
-    # A host that left need not report any more, unless it still holds instances. The lease of an
-    # expected host begins at the start of this master.
+    # A host that left need not report, unless instances still run there. The lease of an expected
+    # host begins at the start of this master.
     left = (condition == HostCondition.LEFT) & (table.processes > 0)
     past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
     for column in np.flatnonzero(up & ~fresh & ~past_lease):
@@ -65,7 +65,7 @@ def lease_end(state: MasterState, host: Host) -> float:
 
 
 def _grace(state: MasterState) -> FloatArray:
-    """Return the seconds, (H,), by which hosts that report seldom may be silent for longer."""
+    """Return the additional seconds, (H,), for which hosts that report seldom may be silent."""
     return np.maximum(0.0, _REPORTS_MISSED * state.hosts.period - state.settings.suspect)
 
 

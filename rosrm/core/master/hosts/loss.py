@@ -1,24 +1,24 @@
-"""Loss of a host: when its processes are given up, and rejoin.
+"""Loss and rejoin of a host, and the treatment of its instances.
 
 A detached host, whose slave was stopped and left processes running, counts as lost when its lease
 has passed: no process of it may start elsewhere sooner than after a loss.
 
 =========================  ======================================================================
-on a lost host             action
+instance on a lost host    action
 =========================  ======================================================================
-the owner of the name      given up at once, where a standby can take over;
+owner of the name          given up at once, where a standby can take over;
                            else by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
-one that may be the owner  as the owner: the destination of a migration that may be active, or the
+possible owner             as the owner: the destination of a migration that may be active, or the
                            last instance of a process
-one that is cancelled      kept until its host reports it ended, or is pruned; with `elsewhere` and
+cancelled                  tracked until its host reports its end or is pruned; with `elsewhere` and
                            `isolation: stop` given up after `delay`, when its fence has ended it
-one that is being restored never given up: its memory is on that host alone
-any other                  given up at once: a former source, a shadow
+being restored             never given up, because its memory is on that host alone
+other                      given up at once, for example a former source or a shadow
 =========================  ======================================================================
 
 An instance that is given up may still run while its host is silent; `readoption` handles it then.
-Nothing is given up while no host reports to the master, nor for one lease after: in that case the
-master was cut off, and its hosts rejoin one by one.
+While no host reports to the master, and for one lease afterwards, no instance is given up: the
+master itself was cut off, and its hosts rejoin one by one.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def mark_lost(state: MasterState, host: Host, now: float) -> None:
 
 
 def detach(state: MasterState, host: Host, lease_end: float, now: float) -> None:
-    """Mark a host as detached: its stopped slave left processes running, out of reach now."""
+    """Mark a host as detached: its slave was stopped and left processes running."""
     host.detached_since, host.lost_since = now, lease_end
     _note_phases(state, host, now)
 
@@ -67,7 +67,7 @@ def _note_phases(state: MasterState, host: Host, now: float) -> None:
 
 
 def mark_rejoined(state: MasterState, host: Host, now: float) -> None:
-    """Restore the phases of a lost host's processes from their last status when it rejoins."""
+    """Restore the phases of a rejoined host's processes from their last statuses."""
     for instance in state.instances_of(host):
         process = state.owned_by(instance)
         if process is None or process.name in state.migrations:
@@ -107,7 +107,8 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     policy = process.spec.host_loss
     lost_for = now - instance.host.lost_since
     if process.wanted is DesiredState.CANCEL:
-        # Giving it up frees its name, so it must have ended: only an expired fence ensures that.
+        # Giving the instance up frees its name, so it must have ended. Only an expired fence
+        # ensures that.
         ends_at = max(policy.delay, ended_after_loss(process.spec, state.settings))
         return policy.then == "elsewhere" and lost_for >= ends_at
     return policy.then in ("elsewhere", "stop") and lost_for >= policy.delay
@@ -133,7 +134,7 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
     if process is not None and _may_be_readopted(process, instance):
         process.left_behind = LeftBehind(instance.id.number, host.name, instance.node_name)
     stays = process is not None and process.spec.host_loss.then == "stop"
-    lifecycle.gone(state, instance, now, why, comes_again=not stays)
+    lifecycle.gone(state, instance, now, why, requeue=not stays)
 
 
 def _may_be_readopted(process: Process, instance: Instance) -> bool:

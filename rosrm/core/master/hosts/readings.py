@@ -21,8 +21,8 @@ def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> B
     too, but it renews the last contact of its host and makes the host's stored reading stale.
 
     Returns:
-        (N,) True where a reading was refused: an unknown or former host, NaN, a negative or absurd
-        value.
+        (N,) True where a reading was refused: unknown host, former run of its slave, or a value
+        that is NaN, negative or above `ABSURD_USAGE`.
     """
     columns = readings.host_id - 1
     known = (columns >= 0) & (columns < len(table))
@@ -58,7 +58,7 @@ def _store(
         table.usage[rows[used], where] = usage[used]
         table.limit[rows[used], where] = limit[used]
     np.add(table.usage, table.load, out=table.busy)
-    if stale.any():  # only a resource with a limit closes a host when its probe is late
+    if stale.any():  # a stale reading excludes the host only if the resource has a limit
         stale = stale & ((limit < 1.0) * _SLOT_BITS).sum(axis=1, dtype=np.uint32)
     table.stale[at] = stale
     table.accepting[at] = readings.accepting[good]

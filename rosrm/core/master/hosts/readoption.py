@@ -1,4 +1,4 @@
-"""Re-adoption: instances of a returning host that were given up when it was lost.
+"""Re-adoption of instances that were given up with their lost host, after it rejoins.
 
 If no successor has started, the instance owns the name again, and its process leaves the queue; a
 job that has completed in between is complete. If a successor has started, the instance is fenced.
@@ -40,7 +40,8 @@ def _readopt(
     state.unqueue(process)
     again = InstanceId(process.name, left.number)
     instance = state.add_instance(again, host, now, state.estimate(process.spec))
-    # A state is set, unlike for a new assignment: if the host does not hold it, it is gone.
+    # Unlike a new assignment, the instance has a state. So it is dropped if the host does not
+    # report it.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
     process.owner, process.left_behind = left.number, None
     state.set_phase(process, ProcessPhase.STARTING, now)
@@ -49,7 +50,7 @@ def _readopt(
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
     state.save(process)
-    # A migration under way at the loss may have ordered the slave not to restart it.
+    # A migration at the time of the loss may have ordered the slave not to restart the instance.
     state.send(host, SetRestartPolicy(instance.id, process.spec.restart))
 
 

@@ -23,11 +23,11 @@ from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import ReportInstances
 from rosrm.model.plan import Execute
+from rosrm.model.records import Intent
 from rosrm.model.values import InstanceStatus
 from rosrm.wording import counted
 
@@ -198,7 +198,7 @@ def readings_received(state: MasterState, event: happened.ReadingsReceived, now:
     """Store a batch of readings; refuse and record invalid ones."""
     first = bool(state.set_aside) and bool(state.hosts.without_reading().any())
     refused = take_readings(state.hosts, event, now)
-    if first:  # before the queue is served, which keeps the order
+    if first:  # before placement, so that requeued processes keep their order
         reconsider_set_aside(state, now)
     for row in np.flatnonzero(refused):
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))

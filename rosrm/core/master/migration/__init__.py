@@ -1,1 +1,1 @@
-"""Migrations: why one starts, its plan, the execution of its steps, standbys, failover."""
+"""Migrations: eviction, start, execution of the plan, handoff, standbys, failover."""

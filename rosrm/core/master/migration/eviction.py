@@ -1,8 +1,8 @@
 """Eviction: processes leave a host that is over a limit or is being drained.
 
 An evicted process must lower the usage that is over its limit, and fit on its destination without
-putting that host over a limit. Among such processes, the one with the largest usage moves. When no
-host has room, nothing moves.
+putting that host over a limit. Of such processes, the one with the largest usage moves. If no host
+has room, no process moves.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from rosrm.core.master.scheduling.decision import decide, verdict_of
 from rosrm.core.master.scheduling.feasibility import may_ever_take
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
-from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Instance, Process
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
 from rosrm.wording import counted, few, listed
 
-#: Least seconds between two records, with different reasons, that nothing can leave a host.
+#: Shortest time, in seconds, between two `nothing_moves` records of a host with different reasons.
 _RECORD_PERIOD: Final = 10.0
-#: Most reasons against hosts in one answer.
+#: Highest number of reasons against hosts in one answer.
 _MOST_REASONS: Final = 3
 _ALONE: Final = "there is no other host"
 
@@ -59,11 +59,13 @@ def evict_from_hosts(state: MasterState, now: float) -> None:
 
 
 def _note_limits(state: MasterState, now: float) -> None:
-    """Note for each host the limits that it exceeds, and since when."""
+    """Note for each host the exceeded limits with the times since when they are exceeded."""
     over = {int(column) for column in state.hosts.hosts_over_limit()}
     for host in state.hosts.listed():
-        # A stale reading does not show on which side of its limit the host is.
+        # A stale reading does not show whether the host is over its limit.
         stale = state.hosts.stale_resources(host) if state.hosts.stale[host.column] else ()
+        if host.over_at and state.hosts.condition_of(host) is not HostCondition.UP:
+            stale = tuple(host.over_at)
         names = state.hosts.over_limit(host.column) if host.column in over else []
         names = [name for name in names if name not in stale]
         host.over_at.update({name: now for name in stale if name in host.over_at})
@@ -82,9 +84,9 @@ def _note_limits(state: MasterState, now: float) -> None:
 
 
 def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
-    """Record that a host is under its limits, once it has stayed there.
+    """Record that a host is under its limits, after it was for the time `hysteresis`.
 
-    A reading at the limit crosses it many times a minute, which says nothing new.
+    Otherwise a usage near the limit would write many records a minute.
     """
     for name, at in list(host.over_at.items()):
         if name not in host.over_since and now - at >= state.settings.hysteresis:
@@ -96,14 +98,15 @@ def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
 
 def _evict(state: MasterState, host: Host, now: float) -> None:
     if any(migration.source_host is host for migration in state.migrations.values()):
-        return  # the effect of the current migration is awaited first
+        return  # first wait for the effect of the current migration
     for resource, since in list(host.over_since.items()):
-        if now - since >= state.settings.hysteresis:
-            _evict_for_resource(state, host, resource, now)
+        due = now - since >= state.settings.hysteresis
+        if due and _evict_for_resource(state, host, resource, now):
             return
 
 
-def _evict_for_resource(state: MasterState, host: Host, resource: str, now: float) -> None:
+def _evict_for_resource(state: MasterState, host: Host, resource: str, now: float) -> bool:
+    """Begin to move one process; return False, and record why, if none can leave."""
     reasons = []
     for instance in _largest_first(state, host, resource):
         process = state.processes[instance.id.process]
@@ -114,10 +117,11 @@ def _evict_for_resource(state: MasterState, host: Host, resource: str, now: floa
                 headroom=state.settings.headroom,
             )  # fmt: skip
             if rejected is None:
-                return
+                return True
             reason = rejected.reason
         reasons.append((process.name, reason))
     _record_nothing_moves(state, host, resource, reasons, now)
+    return False
 
 
 def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
@@ -127,7 +131,7 @@ def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instan
 
 
 def _usage_to_free(instance: Instance, resource: str) -> float:
-    """Return the usage that leaves the host with an instance, in base units of the resource."""
+    """Return the usage, in base units of the resource, that moving an instance frees."""
     return instance.seen.get(resource, instance.demand.get(resource, 0.0))
 
 
@@ -153,10 +157,10 @@ def try_move(
 ) -> Rejected | None:  # fmt: skip
     """Move a process to the host with the largest margin, or to a given one.
 
-    A host that lacks an executor of the plan is passed over, unless it was given.
+    A host that lacks an executor of the plan is skipped, unless it was given.
 
     Returns:
-        None, or why the process cannot be moved; then nothing has changed.
+        None; or the reason why the process cannot be moved, and nothing has changed.
     """
     refusal = why_immovable(state, process)
     if refusal:
@@ -188,7 +192,7 @@ def try_move(
 def _destination(
     state: MasterState, process: Process, ranking: Ranking, source: Host, host: Host | None
 ) -> Host | Rejected:
-    """Return the best host of a ranking, or the given one if it fits; else why there is none."""
+    """Return the best host of a ranking, or the given host if it fits; else the reason."""
     if host is None:
         column = ranking.best()
         if column < 0:
@@ -210,7 +214,7 @@ def _is_alone(state: MasterState, source: Host) -> bool:
 
 
 def _and_why(state: MasterState, process: Process, source: Host) -> str:
-    """Return a few of the reasons of the strategy against hosts; "" for none."""
+    """Return the first reasons of the strategy against hosts; "" for none."""
     faults = capabilities.faults(state, process.spec.migration.strategy or "", source)
     return "".join(f"; {fault}" for fault in few(faults, _MOST_REASONS))
 
@@ -219,7 +223,7 @@ def _and_why(state: MasterState, process: Process, source: Host) -> str:
 
 
 def departures(state: MasterState, host: Host) -> str:
-    """Return the processes that leave a draining host, and those that cannot, with the reason."""
+    """Return a phrase on the processes that leave a draining host, and those that cannot."""
     leaving, staying = _leaving(state, host), _staying(state, host)
     if not leaving:
         return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
@@ -229,20 +233,20 @@ def departures(state: MasterState, host: Host) -> str:
 
 
 def _leaving(state: MasterState, host: Host) -> list[str]:
-    """Return the processes with an instance on a host that will leave it or end."""
+    """Return the processes whose instances on a host will move away or end."""
     held = state.instances_of(host)
     return sorted({one.id.process for one in held if not _why_it_stays(state, one)})
 
 
 def _staying(state: MasterState, host: Host) -> list[str]:
-    """Return the reasons of the processes that cannot leave a host, an equal one once."""
+    """Return the reasons why processes cannot leave a host, each reason once."""
     held = state.instances_of(host)
     reasons = [(one.id.process, reason) for one in held if (reason := _why_it_stays(state, one))]
     return _grouped(reasons + _images_on(state, host))
 
 
 def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
-    """Return the reasons of processes, equal ones once: "each of a and b is not ready".
+    """Return each reason once, for all its processes: "each of a and b is not ready".
 
     Args:
         reasons: name of the process, and its reason as a whole sentence.
@@ -258,7 +262,7 @@ def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _why_it_stays(state: MasterState, instance: Instance) -> str:
-    """Return why an instance can neither leave its host nor is about to end; "" if it can."""
+    """Return why an instance stays on its host; "" if it can move or is about to end."""
     process, source = state.owned_by(instance), instance.host
     if process is None or process.wanted is not DesiredState.RUN:
         return ""
@@ -267,7 +271,8 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
     reason = why_never_movable(state, process)
     if reason:
         return reason
-    # What a strategy or a lost host lacks may change later; labels and resources do not.
+    # Only labels, resources and exclusions count here. A missing capability, or a lost host, may
+    # change later.
     lasting = {**process.excluded, source.name: "it is there"}
     amounts, estimated = demand_amounts(state, process, instance.measured)
     possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
@@ -279,7 +284,7 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
 
 
 def _note_drained(state: MasterState, host: Host, now: float) -> None:
-    """Record once that no process which can leave a host is left on it."""
+    """Record once that a host is drained: every process left on it cannot leave."""
     if state.hosts.why_unreachable(host):
         return
     held, before = state.instances_of(host), host.drained
@@ -308,7 +313,7 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
 
 
 def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
-    """Return a reason for each image on a host: it is restored in place, so it cannot leave."""
+    """Return a reason for each image on a host; images are restored in place, so they stay."""
     return [
         (name, f"{name} is checkpointed: its image stays on {host.name}")
         for name in state.images_on(host)

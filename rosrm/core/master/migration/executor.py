@@ -1,23 +1,23 @@
-"""Execution of migration plans: one step at a time, forward, or back before the commit.
+"""Execution of migration plans, one step at a time: forward, or back (undo) before the commit.
 
 ========  ==================  ==============================================================
-the plan  a step              consequence
+plan      current step        consequence
 ========  ==================  ==============================================================
 forward   is done             the next step; after the last, the migration is complete
 forward   fails, no commit    the undo of every step so far, newest first
-forward   fails, committed    it is retried; the process is shown as stuck until it is done
+forward   fails, committed    the step is retried; the process is stuck until it is done
 back      is done             the next undo; after the last, the source resumes
-back      fails               it is retried; the process is shown as stuck until it is done
-any       cannot be done      it is left out: an instance that has ended never starts again, and
-                              an executor step for an instance whose host is lost has no use.
-                              An executor that ran and returned no object counts as done
-back      destination active  forward to the commit: in a handoff the destination itself decides;
-                              in a restore an executor has found that the process runs
-standby   is SWITCH           it is paused, and goes forward once the source has ended
+back      fails               the step is retried; the process is stuck until it is done
+any       cannot be done      the step is skipped: an instance that has ended never starts again,
+                              an executor step for an instance on a lost host has no effect, and a
+                              retry of an executor that returned no object gives the same result
+back      destination active  forward to the commit: in a handoff the destination has reported that
+                              it is active, in a restore an executor has found the process running
+standby   is SWITCH           the plan is paused, and continues forward once the source has ended
 ========  ==================  ==============================================================
 
-Cancelling a process turns its migration back; a stuck one is given up, and all its instances are
-stopped. When neither source nor destination is left, the process returns to the queue.
+The cancellation of a process turns its migration back. A stuck migration is then given up, and all
+its instances are stopped. If neither source nor destination is left, the process is queued again.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ from rosrm.model.values import InstanceId, InstanceState
 
 #: Message of the record of a commit.
 _COMMITTED: Final = {
-    Aim.MOVE: "committed: the process now runs at the destination; the move can no longer be undone",
-    Aim.CHECKPOINT: "committed: the process is now in its image; the checkpoint can no longer be undone",
-    Aim.RESTORE: "committed: the process now runs from its image; the restore can no longer be undone",
+    Aim.MOVE: "the process now runs at the destination; the move can no longer be undone",
+    Aim.CHECKPOINT: "the process is now in its image; the checkpoint can no longer be undone",
+    Aim.RESTORE: "the process now runs from its image; the restore can no longer be undone",
 }
 
 # --- steps ------------------------------------------------------------------------------------
@@ -69,8 +69,8 @@ def advance_all(state: MasterState, now: float) -> None:
 def advance_standby(state: MasterState, migration: Migration, now: float) -> StepOutcome:
     """Advance the migration of a standby up to its SWITCH step, where it is paused.
 
-    Only the standby is started and configured: the primary keeps running as before, with its
-    restarts. So the other steps before SWITCH are left out.
+    Only the steps that start and configure the standby are executed. The other steps before SWITCH
+    concern the primary, which runs on unchanged, with its restarts.
 
     Returns:
         The outcome of the current step; DONE: the migration is paused.
@@ -82,7 +82,7 @@ def advance_standby(state: MasterState, migration: Migration, now: float) -> Ste
             if not begin(state, migration, step, now):
                 return StepProgress.PENDING
             if isinstance(step, Configure):
-                migration.deadline = inf  # the silence of a primary is no fault of its standby
+                migration.deadline = inf  # a standby does not fail because its primary is silent
             outcome = outcome_of(state, migration, step, now)
             if outcome is not StepProgress.DONE:
                 return outcome
@@ -117,7 +117,7 @@ def _advance(state: MasterState, migration: Migration, now: float) -> bool:
 def _choose_direction(state: MasterState, migration: Migration, now: float) -> None:
     """Choose the direction before the commit.
 
-    A destination that is active decides; otherwise the fate of the source does.
+    An active destination leads forward. Otherwise the end of the source leads back.
     """
     if migration.committed:
         return
@@ -164,8 +164,8 @@ def _commit(state: MasterState, migration: Migration, step: Commit, now: float) 
 def _cannot_be_done(state: MasterState, migration: Migration, step: Step, now: float) -> bool:
     """Return True if a retry cannot help: the instance has ended, or its slot was given away."""
     if isinstance(step, Execute):
-        # A retry would give the same bad result. In a restore, the result may say that the
-        # destination is active, so that plan waits until the plugin is corrected.
+        # A retry would give the same bad result. But the result of a restore may show that the
+        # destination is active. So a restore stays stuck until the plugin is corrected.
         answer = migration.answer
         bad = answer is not None and answer.outcome is OrderOutcome.BAD_RESULT
         done = bad and migration.aim is not Aim.RESTORE
@@ -214,14 +214,14 @@ def _failed(state: MasterState, migration: Migration, step: Step, reason: str, n
         migration.stuck = True
         end = "finished" if migration.undo is None else "undone"
         process = state.processes[migration.process]
-        why = f"its {migration.aim.value} cannot be {end} yet: {reason}; the master tries again"
+        why = f"its {migration.aim.value} cannot be {end} yet: {reason}; the master retries"
         state.set_phase(process, ProcessPhase.STUCK, now, why)
         message = f"{process.name} is stuck: {why}"
         state.record(now, EventKind.MIGRATION_STUCK, message, process=process.name)
 
 
 def _begin_undo(state: MasterState, migration: Migration, reason: str, now: float) -> None:
-    """Undo every step so far before the commit, the current one included, newest first."""
+    """Begin the undo of all steps up to the current one, newest first."""
     migration.failure = reason
     migration.begin_undo()
     message = f"the {migration.aim.value} of {migration.process} is undone: {reason}"
@@ -245,9 +245,9 @@ def _go_forward(state: MasterState, migration: Migration, now: float) -> None:
 
 
 def _undo_reason(state: MasterState, migration: Migration) -> str:
-    """Return why a plan must turn back before its commit; "" if it need not."""
+    """Return why a plan must be undone before its commit; "" if it need not."""
     if state.processes[migration.process].wanted is DesiredState.CANCEL:
-        return f"{migration.process} is to be cancelled"
+        return f"a cancellation of {migration.process} was requested"
     end = migration.ended.get(migration.source.number)
     if end is None:
         return ""
@@ -270,7 +270,7 @@ def _has_left_in_image(migration: Migration) -> bool:
 
 
 def _resumes(state: MasterState, migration: Migration) -> bool:
-    """Return True if the source is to run again: its process is neither cancelled nor completed."""
+    """Return True if the source must run again: its process is neither cancelled nor completed."""
     end = migration.ended.get(migration.source.number)
     completed = end is not None and end.completed
     return not completed and state.processes[migration.process].wanted is DesiredState.RUN
@@ -298,11 +298,11 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
     for instance in state.instances_of(process):
         if instance.id.number not in kept and not instance.stopping:
             if instance.state is None and instance.id.number not in migration.launched:
-                state.drop_instance(instance)  # it had a reservation, and never started
+                state.drop_instance(instance)  # it was reserved and never started
             else:
                 lifecycle.stop_instance(state, instance, now)
     for name in migration.source_host.over_since:
-        migration.source_host.over_since[name] = now  # first await the effect of this migration
+        migration.source_host.over_since[name] = now  # first wait for the effect of this migration
     kind, message = image_requests.ending_of(migration)
     durations = {
         name: result["seconds"] for name, result in migration.results.items() if "seconds" in result
@@ -337,7 +337,7 @@ def _settle_owner(state: MasterState, process: Process, migration: Migration, no
 
 
 def _end_of_owner(process: Process, migration: Migration) -> End:
-    """Return the end of the owner as it would be without the migration."""
+    """Return the end of the owner, corrected for orders of the migration (stop, no restarts)."""
     end = migration.ended[process.owner]
     policy = process.spec.restart
     was_source = process.owner == migration.source.number

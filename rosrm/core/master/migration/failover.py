@@ -1,8 +1,8 @@
 """Failover: a standby replaces its primary.
 
-A standby is the destination of a migration that is paused before the step in which the destination
-becomes active. When the primary has ended, `take_over` resumes the migration: that step orders the
-destination to take over, and the plan continues as usual, forward or back.
+A standby is the destination of a migration that is paused before its SWITCH step. When the primary
+has ended, `take_over` resumes the migration with that step, which orders the standby to become
+active. The plan then continues as usual, forward or back.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Step
 
 #: Reports of a standby that no longer follows the state of its primary.
-_GIVEN_UP: Final = frozenset({ReportPhase.FAILED, ReportPhase.ABORTED})
+_NOT_FOLLOWING: Final = frozenset({ReportPhase.FAILED, ReportPhase.ABORTED})
 
 
 def index_of(phase: HandoffPhase, steps: Sequence[Step]) -> int:
@@ -37,12 +37,12 @@ def is_ready(state: MasterState, process: Process) -> bool:
         return False
     reported = standby.phases_of(standby.destination)
     instance = state.instances.get(standby.destination.number)
-    follows = ReportPhase.READY in reported and not reported.keys() & _GIVEN_UP
+    follows = ReportPhase.READY in reported and not reported.keys() & _NOT_FOLLOWING
     return follows and instance is not None and not instance.stopping
 
 
 def take_over(state: MasterState, process: Process, end: End, now: float) -> bool:
-    """Let the standby of an ended primary take over.
+    """Resume the migration of a standby whose primary has ended.
 
     Returns:
         False: no standby could take over, or the primary has completed as intended.

@@ -1,8 +1,8 @@
-"""Handoff protocol on the master's side: phases sent, reports received, decision.
+"""Handoff protocol on the master's side: phases sent, reports received, decisions.
 
-The destination alone decides when it becomes active. After the master has published SWITCH, it may
-guess that the destination is not active, but never act on the guess. It orders the source to resume
-only when the destination has reported that it never will be active, or has ended.
+The destination alone decides when it becomes active. After the master has published SWITCH, silence
+of the destination proves nothing: the destination may be active. So the master orders the source to
+resume only when the destination has reported that it will never become active, or has ended.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from rosrm.core.master.outcomes import (
 from rosrm.core.master.state.migration import HandoffReports, Migration
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
-from rosrm.model.values import InstanceId, ProcessSpec
+from rosrm.model.values import InstanceId, qualified_name
 
-#: Reports of a destination that follows the source, or is further still.
+#: Reports of a destination that follows the source or is in a later phase.
 _READY: Final = frozenset({ReportPhase.READY, ReportPhase.SWITCHING, ReportPhase.ACTIVE})
 
 #: Action that the master orders in each phase, as the subject of a sentence.
@@ -33,7 +33,7 @@ TITLES: Final[Mapping[HandoffPhase, str]] = {
     HandoffPhase.SHADOW: "copying the state to the destination",
     HandoffPhase.SWITCH: "switching from the source to the destination",
     HandoffPhase.TAKE_OVER: "letting the destination take over",
-    HandoffPhase.ABORT: "calling the handoff off at the destination",
+    HandoffPhase.ABORT: "aborting the handoff at the destination",
     HandoffPhase.RESUME: "letting the source publish again",
     HandoffPhase.DONE: "ending the handoff",
 }
@@ -41,13 +41,13 @@ TITLES: Final[Mapping[HandoffPhase, str]] = {
 _REPORTS: Final[Mapping[ReportPhase, str]] = {
     ReportPhase.ATTACHED: "takes part in the handoff",
     ReportPhase.SILENT: "has stopped publishing",
-    ReportPhase.RELEASED: "has handed everything over",
+    ReportPhase.RELEASED: "has delivered its last messages",
     ReportPhase.RESUMED: "publishes again",
     ReportPhase.SHADOWING: "receives the state of the source",
     ReportPhase.READY: "has the state of the source and can take over",
     ReportPhase.SWITCHING: "is taking over",
     ReportPhase.ACTIVE: "is active",
-    ReportPhase.ABORTED: "has called the handoff off",
+    ReportPhase.ABORTED: "has aborted the handoff",
     ReportPhase.FAILED: "cannot continue the handoff",
 }
 
@@ -57,19 +57,14 @@ _REPORTS: Final[Mapping[ReportPhase, str]] = {
 
 def publish(state: MasterState, migration: Migration, phase: HandoffPhase) -> None:
     """Publish the phase of a handoff to its source and destination."""
-    spec = state.processes[migration.process].spec
+    namespace = state.processes[migration.process].spec.namespace
     state.emit(
         PublishStateConfig(
             migration.process, phase, migration.source.number, migration.destination.number,
-            qualified(spec, migration.source_node), qualified(spec, migration.destination_node),
+            qualified_name(namespace, migration.source_node),
+            qualified_name(namespace, migration.destination_node),
         )
     )  # fmt: skip
-
-
-def qualified(spec: ProcessSpec, node_name: str) -> str:
-    """Return the name of a node with the namespace of its process: "/robot/camera"."""
-    namespace = spec.namespace.strip("/")
-    return f"/{namespace}/{node_name}" if namespace else f"/{node_name}"
 
 
 def close(state: MasterState, migration: Migration) -> None:
@@ -135,7 +130,8 @@ def _note(
         return
     reports = migration.handoff_reports.setdefault(event.instance, HandoffReports())
     if event.phase not in reports.phases:
-        # A destination that receives the state waits no more; a time-out shows the older message.
+        # The message of SHADOWING belongs to the wait that has just ended. Only the text of a
+        # time-out shows it.
         is_news = event.message and event.phase is not ReportPhase.SHADOWING
         details = f": {event.message}" if is_news else ""
         message = f"{migration.process}#{event.instance} {_REPORTS[event.phase]}{details}"
@@ -147,9 +143,9 @@ def _note(
 
 
 def is_active(state: MasterState, migration: Migration) -> bool:
-    """Return True if the destination has reported that it is active, with no order to stop since.
+    """Return True if the destination has reported that it is active, and was not ordered to stop.
 
-    After an order to stop, only its end decides.
+    After an order to stop, the master waits for the end of the destination.
     """
     instance = state.instances.get(migration.destination.number)
     if instance is None or instance.stopping:
@@ -159,7 +155,7 @@ def is_active(state: MasterState, migration: Migration) -> bool:
 
 
 def is_released(state: MasterState, migration: Migration, instance: InstanceId) -> bool:
-    """Return True if a silent source has handed everything over, or has ended."""
+    """Return True if a silent source has delivered everything, or has ended."""
     ended = instance.number not in state.instances
     return ended or ReportPhase.RELEASED in migration.phases_of(instance)
 
@@ -243,7 +239,7 @@ def was_switched(migration: Migration) -> bool:
 
 
 def timed_out(state: MasterState, migration: Migration, step: Configure, now: float) -> StepOutcome:
-    """Return the outcome of a phase after its time-out, as `outcome` does."""
+    """Return the outcome of a phase after its time-out."""
     if step.phase is HandoffPhase.RESUME and not was_switched(migration):
         return StepProgress.DONE  # the source was never ordered to be silent
     if step.phase is HandoffPhase.ABORT:
@@ -256,14 +252,13 @@ def timed_out(state: MasterState, migration: Migration, step: Configure, now: fl
 
 
 def _stop_silent_destination(state: MasterState, migration: Migration, now: float) -> None:
-    """Stop a destination that does not answer: only its end ensures that it is never active."""
+    """Stop a destination without an answer, because only its end proves that it is not active."""
     stop = state.processes[migration.process].spec.stop
     lifecycle.stop_instance(state, state.instances[migration.destination.number], now)
     migration.deadline = now + stop.timeout
     state.record(
         now, EventKind.DESTINATION_UNHEARD,
-        f"{migration.destination} does not confirm that the handoff is called off: the master "
-        "stops it",
+        f"{migration.destination} does not confirm the abort of the handoff: the master stops it",
         process=migration.process, host=migration.destination_host.name,
     )  # fmt: skip
     state.save_migration(migration)
@@ -273,8 +268,8 @@ def _newest_reports(migration: Migration) -> str:
     """Return the newest report of source and destination, for a time-out."""
     if not migration.handoff_reports:
         return (
-            "neither node has reported. Do they use rosrm.node? One that keeps only the "
-            "paper's constraints needs `protocol: paper` in the options of its migration"
+            "neither node has reported. Do they use rosrm.node? A node that meets only the "
+            "constraints of the paper needs `protocol: paper` in the options of its migration"
         )
     both = (migration.destination, migration.source)
     return "; ".join(f"{one} {_newest_report(migration, one)}" for one in both)

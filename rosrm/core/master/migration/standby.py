@@ -1,16 +1,16 @@
 """Standbys: a second instance on another host follows the state of a process.
 
-A standby is the destination of a migration that `executor` carries out up to the SWITCH step, where
-it is paused. `failover` resumes the migration when the primary has ended.
+A standby is the destination of a migration that `executor` executes up to the SWITCH step, where
+the migration is paused. `failover` resumes it when the primary has ended.
 
 ======================  =====================================================================
-the process             action on its standby
+process                 action on its standby
 ======================  =====================================================================
-runs, has none          one is started on another host that has room, as a shadow
-has one that runs       `state_config` names source and standby, until the standby is READY
-has one that gave up    it is stopped; another one is started after a time that doubles
-waits for its restart   the primary is stopped for good, and its end hands over to the standby
-moves                   it is kept until the migration is committed, because that may fail
+runs without standby    a standby is started as a shadow, on another host that has room
+standby starts          `state_config` names primary and standby, until the standby is READY
+standby has failed      the standby is stopped; another one starts after a delay that doubles
+is in back-off          the primary is stopped for good, and the standby takes over
+migrates                the standby stays until the commit, because the migration may fail
 has ended               the standby is stopped
 ======================  =====================================================================
 """
@@ -32,15 +32,15 @@ from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import HandoffPhase, ReportPhase, Start
 
-#: Seconds until another standby is started after a failed one; doubled with each failure.
+#: Seconds between a failed standby and the next one; doubled with each failure.
 _FIRST_WAIT: Final = 2.0
 _LONGEST_WAIT: Final = 60.0
-#: Most standbys that are begun in one review.
+#: Highest number of standbys that one review starts.
 _AT_A_TIME: Final = 2
 
 
 def review_standbys(state: MasterState, now: float) -> None:
-    """Review every standby, and begin those that are missing."""
+    """Review every standby, and start missing ones."""
     for migration in list(state.standbys.values()):
         _review(state, migration, now)
     begun = 0
@@ -86,7 +86,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
 
 
 def _can_wait(migration: Migration) -> bool:
-    """Return True if the plan is a handoff, with a shadow that is ready before it is active."""
+    """Return True if the plan starts a shadow that is ready before the SWITCH step."""
     shadow, switch = (
         failover.index_of(phase, migration.plan.steps)
         for phase in (HandoffPhase.SHADOW, HandoffPhase.SWITCH)
@@ -97,7 +97,7 @@ def _can_wait(migration: Migration) -> bool:
 
 
 def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
-    """Return the demand of a standby: that of the process, on a host apart from the primary's."""
+    """Return the demand of a standby: that of the process, without hosts too near the primary."""
     own = demand_of(state, process)
     excluded = {**process.excluded, primary.name: "the primary runs there"}
     labels = primary.description.labels
@@ -108,7 +108,7 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
                 why = f"it has no label {label!r}, in which the standby must differ"
                 excluded.setdefault(host.name, why)
             elif value == labels.get(label):
-                why = f"it has {label}={value} as the host of the primary has"
+                why = f"it has {label}={value}, as the host of the primary"
                 excluded.setdefault(host.name, why)
     return Demand(process.spec, own.amounts, own.estimated, excluded, reads=state.declared.reads)
 
@@ -147,12 +147,12 @@ def _review(state: MasterState, migration: Migration, now: float) -> None:
 
 
 def _why_given_up(migration: Migration) -> str | None:
-    """Return why the standby has called the handoff off; None: it has not."""
+    """Return why the standby has aborted the handoff; None: it has not."""
     reported = migration.phases_of(migration.destination)
     if reported.keys().isdisjoint({ReportPhase.FAILED, ReportPhase.ABORTED}):
         return None
     why = reported.get(ReportPhase.FAILED) or reported.get(ReportPhase.ABORTED)
-    return why or f"{migration.destination} has called the handoff off"
+    return why or f"{migration.destination} has aborted the handoff"
 
 
 def _advance(state: MasterState, process: Process, migration: Migration, now: float) -> None:

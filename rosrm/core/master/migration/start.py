@@ -1,4 +1,4 @@
-"""Start of a migration: strategy, plan, executors, destination."""
+"""Start of a migration: plan by the strategy, check of executors, reservation."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_
 from rosrm.model.values import InstanceId
 from rosrm.wording import get_close_matches, listed, standing
 
-#: Method of a strategy that plans for each aim.
+#: Method of a strategy that returns the plan for each aim.
 _HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE: "restore"}
 
 
 def begin_move(
     state: MasterState, process: Process, migration: Migration, ranking: Ranking, now: float
 ) -> None:
-    """Begin a planned migration to a host that has room for the process by a ranking."""
+    """Begin a planned migration, with a reservation by a ranking on its destination."""
     destination, cause = migration.destination_host, migration.cause
     state.migrations[process.name] = migration
     state.reserve(migration.destination, destination, now, ranking)
@@ -95,7 +95,7 @@ def moves_under_way(state: MasterState) -> int:
 
 
 def why_busy(migration: Migration) -> str:
-    """Return a sentence that names the plan under way for a process."""
+    """Return a sentence on the current migration of a process."""
     if migration.aim is Aim.MOVE:
         return f"{migration.process} is moving already, to {migration.destination_host.name}"
     return f"{migration.process} is busy: {migration.progress_text}"
@@ -128,26 +128,26 @@ def why_never_movable(state: MasterState, process: Process) -> str:
 
 
 def why_not_selected(state: MasterState, strategy: str) -> str:
-    """Return a sentence: the cluster's configuration does not select a strategy; what may help."""
+    """Return a sentence: the configuration does not select a strategy, and the remedy."""
     near = get_close_matches(strategy, state.strategies, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return (
         f"the migration strategy {strategy!r} is not selected here{hint} (selected: "
-        f"{listed(sorted(state.strategies)) or 'none'}). Add it to `migration:` in cluster.yaml, if "
-        f"`rosrm plugins` lists it, or choose one of these"
+        f"{listed(sorted(state.strategies)) or 'none'}). Choose one of these, or add it to "
+        f"`migration:` in cluster.yaml, if `rosrm plugins` lists it"
     )
 
 
 def why_no_executor(state: MasterState, migration: Migration) -> str:
-    """Return a sentence on the host that lacks an executor of a plan; "": none does."""
+    """Return a sentence on a host that lacks an executor of its plan; "": no host does."""
     lacking = _lacking(state, migration)
     return "" if lacking is None else _lacks(state, migration, lacking[0], [lacking[1].name])
 
 
 def without_executor(state: MasterState, migration: Migration) -> tuple[list[str], str]:
-    """Return all hosts that lack the executor missing at a plan's destination, with a sentence.
+    """Return all hosts that lack the executor that a plan's destination lacks, with a sentence.
 
-    Return no host if the plan can be carried out on its destination.
+    Return no host if the destination has all executors of the plan.
     """
     lacking = _lacking(state, migration)
     if lacking is None or lacking[1] is not migration.destination_host:
@@ -162,9 +162,9 @@ def without_executor(state: MasterState, migration: Migration) -> tuple[list[str
 
 
 def _lacking(state: MasterState, migration: Migration) -> tuple[str, Host] | None:
-    """Return an executor that a plan names and the host that lacks it."""
+    """Return an executor of a plan and the host that lacks it; None: no host lacks any."""
     if migration.strategy not in state.declared.executors:
-        return None  # its offer is unknown
+        return None  # the offer of the strategy is unknown
     image = migration.commit.image
     dropping = [(image, migration.source_host.name)] if image else []
     for executor, name in [*executors_of(migration.plan), *dropping]:
@@ -194,7 +194,7 @@ def _lacks(state: MasterState, migration: Migration, executor: str, hosts: list[
 def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | Rejected:
     """Return the plan of a named strategy, or why there is none.
 
-    The options of the strategy are added to `move`. A strategy that raises is named.
+    The options of the strategy are added to `move`. The reason names a strategy that raises.
     """
 
     def ask() -> Plan | Rejected:
@@ -203,10 +203,10 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
             plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
         except ValueError as reason:  # by its contract: the strategy cannot move this process
             return _no_plan(name, describe_fault(reason))
-        fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
+        fault = plan_fault(plan, move, aim) or _executor_fault(state, name, plan)
         if fault:
             raise PluginError(f"an unsound plan: {fault}")
-        return checked(plan, "plan")  # it goes into the journal
+        return checked(plan, "plan")  # the plan is written to the journal
 
     try:
         return state.plugins.ask("migration", name, _HOOKS[aim], ask)
@@ -218,8 +218,8 @@ def _no_plan(strategy: str, reason: str) -> Rejected:
     return Rejected(f"the migration strategy {strategy!r} gave no plan: {reason}")
 
 
-def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
-    """Return the fault of a plan that names an executor its own offer lacks; "": none."""
+def _executor_fault(state: MasterState, name: str, plan: Plan) -> str:
+    """Return a sentence on an executor of a plan that its strategy's offer lacks; "": none."""
     own = state.declared.executors.get(name)
     images = [step.image for step in plan.steps if isinstance(step, Commit) and step.image]
     for executor in [*(executor for executor, _ in executors_of(plan)), *images]:

@@ -1,4 +1,4 @@
-"""Steps of a migration plan: the order for each, and its outcome."""
+"""Steps of a migration plan: their orders and their outcomes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TITLES: Final[Mapping[type[Step], str]] = {
     Commit: "the commit",
     Start: "starting {0.instance} on {0.host}",
     AwaitReady: "waiting until {0.instance} is ready on {0.host}",
-    AwaitReleased: "waiting until {0.instance} on {0.host} has handed everything over",
+    AwaitReleased: "waiting until {0.instance} on {0.host} has delivered its last messages",
     Stop: "stopping {0.instance} on {0.host}",
     Execute: "the step {0.executor!r} of the migration strategy on {0.host}",
 }
@@ -62,9 +62,9 @@ def begin(state: MasterState, migration: Migration, step: Step, now: float) -> b
 
 
 def _is_expected(state: MasterState, migration: Migration, step: Step) -> bool:
-    """Return True if a host that the step needs has not returned since the master started.
+    """Return True if a host that the step needs has not rejoined since the master started.
 
-    The step waits for it until its lease ends; then the step begins, and its own time-out decides.
+    The step waits until the host rejoins or its lease ends. Then the time-out of the step counts.
     """
     if isinstance(step, Commit):
         return False
@@ -89,8 +89,8 @@ def outcome_of(state: MasterState, migration: Migration, step: Step, now: float)
 def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
     """Note the answer to the order of the current step of a migration.
 
-    The result of an executor is kept for those of later steps. The start of a standby is repeated
-    whatever the answer.
+    The results of executors are arguments of later ones. The answer to the start of a standby is
+    ignored, because that order is repeated anyway.
     """
     migration = state.migrations.get(process)
     if migration is None or migration.order != event.order:
@@ -107,7 +107,7 @@ def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
 
 
 def _give_order(state: MasterState, migration: Migration, step: Step, now: float) -> None:
-    """Send the order of a step to its slave, or in a handoff to the nodes themselves."""
+    """Send the order of a step to its slave, or publish the phase of a handoff to its nodes."""
     migration.order = None
     if isinstance(step, Commit | AwaitReady | AwaitReleased):
         return
@@ -125,7 +125,7 @@ def _give_order(state: MasterState, migration: Migration, step: Step, now: float
 def _order_of(
     state: MasterState, migration: Migration, step: Start | Stop | Execute | SetRestart, now: float
 ) -> Order:
-    """Return the order of a step; note in its migration what the order changes."""
+    """Return the order of a step, and note its effects in the migration."""
     if isinstance(step, Stop):
         return StopInstance(step.instance)
     if isinstance(step, Execute):
@@ -164,10 +164,10 @@ def _start(state: MasterState, migration: Migration, step: Start, now: float) ->
 
 
 def _in_the_way(state: MasterState, migration: Migration, step: Start, now: float) -> bool:
-    """Return True if another instance of the name may run, and the plan does not allow two.
+    """Return True if another instance of the process may run and must end before a start.
 
-    A source with an image is frozen, so it does not count. On the way back, stop any other instance
-    whatever the plan allows: the step that should have stopped it failed.
+    Ignore a source with an image, because it is frozen. On the way back, stop every other instance,
+    even if the plan allows two: the step that should have stopped it has failed.
     """
     process = state.processes[migration.process]
     back = migration.undo is not None
@@ -184,8 +184,8 @@ def _in_the_way(state: MasterState, migration: Migration, step: Start, now: floa
 def _give_order_again(state: MasterState, migration: Migration, step: Step, now: float) -> None:
     """Repeat the order for a start, a stop or a restart policy, because orders may be lost.
 
-    A second order does no harm. A start that another instance delayed is ordered as soon as that
-    one has ended.
+    These orders are idempotent. A start that another instance delays is ordered as soon as the
+    other instance has ended.
     """
     if isinstance(step, Configure):
         handoff.republish(state, migration, step, now)
@@ -196,7 +196,7 @@ def _give_order_again(state: MasterState, migration: Migration, step: Step, now:
 
 
 def _has_waited(migration: Migration, step: Step) -> bool:
-    """Return True if the start was not ordered yet, because another instance was in its way."""
+    """Return True for a start that was not ordered yet, because another instance delayed it."""
     return isinstance(step, Start) and step.instance.number not in migration.launched
 
 
@@ -238,7 +238,7 @@ def _of_start(state: MasterState, migration: Migration, step: Start) -> StepOutc
         return _ended(migration, step)
     instance, answer = state.instances.get(step.instance.number), migration.answer
     if instance is None:
-        return StepProgress.PENDING  # another instance has to end first
+        return StepProgress.PENDING  # another instance must end first
     if answer is not None and not answer.accepted:
         return StepFailed(f"{step.host} refused to start {step.instance}: {answer.reason}")
     return done_if(instance.is_running)
@@ -258,7 +258,7 @@ def _ended(migration: Migration, step: Start | AwaitReady) -> StepFailed:
 
 def _of_restart_policy(state: MasterState, migration: Migration, step: SetRestart) -> StepOutcome:
     if step.instance.number not in state.instances:
-        return StepProgress.DONE  # it has ended: there is nothing to restart
+        return StepProgress.DONE  # an ended instance has no restarts
     answer = migration.answer
     if answer is None or answer.accepted:
         return done_if(answer is not None)
@@ -273,8 +273,8 @@ def _of_executor(state: MasterState, migration: Migration, step: Execute) -> Ste
     if answer is not None:
         return StepFailed(f"{step.executor} failed on {step.host}: {answer.reason}")
     away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
-    # A frozen instance must not wait for a long time-out. A plan that may not stop waits for the
-    # host as long as an instance of it may be there.
+    # If the plan can still be undone, do not wait for the time-out, which would keep an instance
+    # frozen. Otherwise wait for the host as long as an instance of the plan may be there.
     may_stop = migration.undo is None and not migration.committed
     if away and (may_stop or instances_are_gone(state, migration, step)):
         return StepFailed(f"{step.host} {away}")
@@ -284,7 +284,7 @@ def _of_executor(state: MasterState, migration: Migration, step: Execute) -> Ste
 def instances_are_gone(state: MasterState, migration: Migration, step: Execute) -> bool:
     """Return True if a host is away, and its instances of a migration have ended or count as lost.
 
-    An executor could do nothing for them there, and the host may never return.
+    An executor there has no effect any more, and the host may never return.
     """
     host = state.hosts.by_name[step.host]
     if migration.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:

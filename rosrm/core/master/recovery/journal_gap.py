@@ -1,18 +1,18 @@
-"""Journal gap: records that the journal has lost, as hosts show, and the master's response.
+"""Journal gap: newest records that the journal has lost, and the wait of the master for reports.
 
 A power failure (with `sync: normal`), a damaged write-ahead log or a restored older copy silently
-removes the newest part of a journal. Its decisions are unknown: submissions, and the hosts on which
-instances run. A process that is queued by the rest of the journal may run on a host that has not
-reported yet. So the master assigns no work
+removes the newest part of a journal. The decisions in it are unknown: submissions, and the hosts on
+which instances run. A process that is queued by the rest of the journal may run on a host that has
+not reported yet. So the master assigns no work
 
 - after a reboot of the machine, until every host in the journal has rejoined or is lost;
-- once a host has seen more of the journal than there is, for one lease from the master's start.
+- if a slave reports a newer record than the journal has, for one lease from the master's start.
 
 An unknown instance is stopped when its host registers, and a queued process of the same name waits
 for that end.
 
-A master that ends while it waits leaves the wait to the next one, as an intent `unheard`. After a
-loss that hosts have shown, the next master waits again for a whole lease.
+A master that ends during the wait passes it to the next one, as the intent `unheard`. If records
+are known to be lost, the next master waits again for a whole lease.
 """
 
 from __future__ import annotations
@@ -22,22 +22,23 @@ from typing import Any, Final
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
-from rosrm.extensions.contracts import Intent
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent
 from rosrm.wording import counted
 
 _KEY: Final = "unheard"
 
 
 def begin(state: MasterState, newest: int, now: float, *, machine_rebooted: bool) -> None:
-    """Begin the wait of a master that starts, with its restored state.
+    """Begin the wait at the start of a master, after its state was restored.
 
-    Afterwards `intent` is to become durable, together with the mark that distinguishes the next
+    The caller then makes `intent` durable, together with the mark that distinguishes the next
     start from this one.
 
     Args:
-        newest: sequence of the newest record that the journal holds.
-        machine_rebooted: the machine was rebooted, and the last master had not stopped before.
+        newest: sequence of the newest record in the journal.
+        machine_rebooted: True if the machine was rebooted, and the last master had not stopped
+            before.
     """
     gap = state.journal_gap
     gap.newest, gap.started = newest, now
@@ -45,14 +46,14 @@ def begin(state: MasterState, newest: int, now: float, *, machine_rebooted: bool
 
 
 def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
-    """Take over the wait of a former master from the intents `cluster`."""
+    """Restore the wait of a former master from the intents `cluster`."""
     stored, gap = cluster.get(_KEY, {}), state.journal_gap
     gap.machine_rebooted = bool(stored.get("fell"))
     gap.records_missing = bool(stored.get("short"))
 
 
 def intent(state: MasterState) -> Intent:
-    """Return the intent with the conditions that a master started now would wait for."""
+    """Return the intent with the conditions for which the next master must wait."""
     gap = state.journal_gap
     waits = {"fell": gap.machine_rebooted, "short": gap.records_missing}
     return Intent("cluster", _KEY, waits if any(waits.values()) else None)
@@ -73,13 +74,13 @@ def review(state: MasterState, now: float) -> None:
 
 
 def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
-    """Compare the journal with the newest record that a host has seen, and begin a wait."""
+    """Begin a wait if a host has seen a newer record than the journal has."""
     gap = state.journal_gap
     lost = seen - gap.newest
     if lost <= gap.lost:
         return
     gap.lost = lost
-    state.skip_numbers(state.next_instance + lost)  # each may have held a new instance
+    state.skip_numbers(state.next_instance + lost)  # each record may be of a new instance
     left = gap.started + state.settings.lease - now
     if left > 0 and not gap.records_missing:
         gap.records_missing = True

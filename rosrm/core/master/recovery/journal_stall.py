@@ -1,7 +1,7 @@
-"""Journal stall: readings that arrive while no decision can be made durable.
+"""Journal stall: handling of readings while the journal cannot be written.
 
-The core's own clock stops during a stall. So no deadline passes, and no host becomes lost because
-of a full disk. Deadlines continue where they were when the stall ends.
+The core's clock stops during a stall, so that no deadline passes and no host becomes lost because
+of a full disk. After the stall, each deadline has the time left that it had before.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from rosrm.core.master.state.hosts import HostCondition
 
 
 def note_readings(state: MasterState, event: happened.ReadingsReceived, now: float) -> None:
-    """Store a batch of readings: they renew the last contact of hosts, and decide nothing.
+    """Store a batch of readings: renew the last contact of hosts, and place nothing.
 
-    A suspect host becomes up again, and the next beat shows it so; otherwise instances there might
-    have to stop. The rejoin of a lost host needs a decision, so the host stays lost.
+    A suspect host becomes up again, so that the next beat does not name it; otherwise its fences
+    would expire. The rejoin of a lost host needs a durable decision, so the host stays lost.
     """
     take_readings(state.hosts, event, now)
     table = state.hosts

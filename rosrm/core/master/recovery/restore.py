@@ -1,4 +1,4 @@
-"""Restoration of the state from the journal's intents, at the start of a master."""
+"""Restoration of the state at the start of a master, from the journal's intents."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from rosrm.core.master.state import migration
 from rosrm.core.master.state import process as processes
 from rosrm.core.master.state.migration import Migration, end_from_dict, undo_steps
 from rosrm.core.master.state.process import DesiredState, Image, LeftBehind, Process, ProcessPhase
-from rosrm.extensions.contracts import Intent
 from rosrm.model.codec import fields_from_plain, from_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Plan
+from rosrm.model.records import Intent
 from rosrm.model.values import InstanceId, ProcessSpec
 
 _Table = Mapping[str, Mapping[str, Any]]
@@ -25,11 +25,11 @@ _Table = Mapping[str, Mapping[str, Any]]
 def restore(state: MasterState, intents: Callable[[str], _Table], now: float) -> None:
     """Fill an empty state with the intents.
 
-    This starts and stops nothing. Running processes are expected on their hosts, and are compared
-    with the instances there when the slaves register. A migration under way continues with its
-    current step, whose order is repeated; every step can be repeated.
+    This starts and stops nothing. The running processes are reconciled with the instances on their
+    hosts when the slaves register. A migration continues with its current step, whose order is
+    repeated; every step is idempotent.
 
-    `intents` gives the journal's table of a name; the state must know the wall clock.
+    `intents` returns a table of the journal by its name; `state.wall` must be set.
     """
     by_id = sorted(intents("host").items(), key=lambda item: int(item[1]["host_id"]))
     for name, host in by_id:
@@ -59,8 +59,8 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
 
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
     phase = ProcessPhase(item["phase"])
-    wall = float(item.get("since", state.wall))  # older journals lack it
-    left, image = item.get("left_behind"), item.get("image")  # older journals have none
+    wall = float(item.get("since", state.wall))  # absent in older journals
+    left, image = item.get("left_behind"), item.get("image")  # absent in older journals
     process = Process(
         spec=from_plain(ProcessSpec, item["spec"]), phase=phase,
         since=now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
@@ -91,7 +91,7 @@ def _restore_instances(
     state: MasterState, process: Process, item: Mapping[str, Any],
     move: Mapping[str, Any] | None, now: float,
 ) -> None:  # fmt: skip
-    """Add the instances that may still run: the owner, moving ones, and others to be stopped."""
+    """Add the instances that may still run: owner, source, destination, and others to stop."""
     aliases, standby = item.get("node_names", {}), item.get("standby")
     moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
     ended = move.get("ended", {}) if move is not None else {}
@@ -125,14 +125,14 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
 def _restore_standby(
     state: MasterState, process: Process, item: Mapping[str, Any], now: float
 ) -> None:
-    """Restore the standby of a process; its node reports its phase again."""
+    """Restore the standby of a process; its node repeats the report of its phase."""
     standby = item.get("standby")
     if standby is None or int(standby["destination"]) not in process.instances:
         return
     try:
         restored = _restored_migration(state, process, standby, now)
     except (KeyError, TypeError, ValueError):
-        state.instances[int(standby["destination"])].stopping = True  # it is replaced
+        state.instances[int(standby["destination"])].stopping = True  # another standby replaces it
         return
     restored.index = 0
     state.standbys[process.name] = restored
@@ -142,7 +142,7 @@ def _restore_standby(
 
 
 def _numbers_of(move: Mapping[str, Any] | None) -> frozenset[int]:
-    """Return the instances of a migration; none, where it cannot be continued."""
+    """Return the instance numbers of a migration; none if the migration cannot be continued."""
     if move is None or "plan" not in move:
         return frozenset()
     return frozenset({int(move["source"]), int(move["destination"]), *map(int, move["launched"])})
@@ -177,7 +177,7 @@ def _restored_migration(
 ) -> Migration:
     hosts = state.hosts.by_name
     plan = from_plain(Plan, move["plan"])
-    wall = float(move.get("wall", state.wall))  # older journals lack it
+    wall = float(move.get("wall", state.wall))  # absent in older journals
     started = now - max(0.0, state.wall - wall)  # the clock may have been set back
     restored = Migration(
         process.name, plan, started=started,
@@ -197,9 +197,9 @@ def _restored_migration(
 def _discard_migration(
     state: MasterState, process: Process, move: Mapping[str, Any], fault: str, now: float
 ) -> None:
-    """Drop a migration: the owner of the name runs on, any other instance is stopped.
+    """Drop a migration that cannot be continued: stop all of its instances except the owner.
 
-    The source may have been ordered to stop already.
+    An order to stop may already have reached the source, so its end counts as ordered.
     """
     source = state.instances.get(int(move["source"]))
     if source is not None and process.owner == source.id.number:

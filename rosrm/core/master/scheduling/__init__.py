@@ -1,8 +1,8 @@
 """Placement of processes on hosts.
 
-filters.py      the placement rules: which hosts may take a process, and why not the others
+filters.py      placement rules: masks over hosts, with the reasons against hosts
 ranking.py      filter, score, pick
-decision.py     the outcome with its reasons, as `rosrm explain` shows it
-feasibility.py  whether any host may ever take a process
-candidates.py, host_views.py   hosts as filters and as scoring policies see them
+decision.py     outcome with its reasons, for `rosrm explain`
+feasibility.py  hosts that may ever take a process
+candidates.py, host_views.py   views of hosts for filters and for scoring policies
 """

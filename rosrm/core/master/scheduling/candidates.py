@@ -13,21 +13,21 @@ from rosrm.core.master.state.hosts import Host, HostTable
 Columns = slice | IntArray
 
 
-@dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
+@dataclass(slots=True)  # not frozen, because that costs 1 µs for each of thousands
 class Candidates:
     """Some hosts, n of them, with one demand.
 
-    The arrays hold all that assignments change. With an array of columns they are copies.
+    The arrays have all that assignments change. They are copies if `columns` is an array.
 
     Attributes:
-        columns: of the hosts in the table; a column stays with its host.
+        columns: columns of the hosts in the table; a host never changes its column.
         resources: names of the R rows.
         need: (R, n) fractions of the capacity of each host; inf where it lacks the resource.
         cells: (planes, R, n) as in `HostColumns`.
         busy: (R, n) reading plus reservations.
-        processes: (n,) held or reserved.
-        bound: (n,) most processes.
-        empty: True for hosts as if no process ran on them.
+        processes: (n,) number of processes on the host or reserved for it.
+        bound: (n,) highest number of processes.
+        empty: True if the arrays are those of hosts without processes.
     """
 
     table: HostTable
@@ -59,7 +59,7 @@ def candidates(
 
     Args:
         need: (R, H) fractions, of every host.
-        more: (n,) processes of this demand that each host is supposed to hold in addition.
+        more: (n,) number of processes of this demand to add to each host.
     """
     need = need[:, columns]
     cells = table.cells[:, :, columns]  # all planes at once: one copy costs less than five

@@ -24,9 +24,9 @@ from rosrm.extensions.plugin_calls import PluginCalls, required
 from rosrm.model.values import EMPTY
 from rosrm.wording import one_line
 
-#: An explanation names every host up to this many, else the best of those that fit.
+#: Largest number of hosts that an explanation names all; of more, it names the best fitting ones.
 _NAMED_HOSTS: Final = 16
-#: Kind of a decision; "": it has none yet.
+#: Kind of a decision; "": not set yet.
 DecisionKind = Literal["", "assigned", "set_aside", "waits", "migrated"]
 
 
@@ -35,7 +35,7 @@ class Verdict:
     """The verdict on one host.
 
     Attributes:
-        score: where it fits.
+        score: None where the host does not fit.
     """
 
     host: str
@@ -50,15 +50,15 @@ class Verdict:
         }  # fmt: skip
 
 
-@dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
+@dataclass(slots=True)  # not frozen, because that costs 1 µs for each of thousands
 class Moment:
-    """The values of n hosts at the time of a decision; copies, which no longer change.
+    """Copies of the values of n hosts at the time of a decision.
 
     Attributes:
         plugins: guards the calls of the policy.
         hosts: with copies of the arrays that assignments change.
-        value: (n,) score plus tie-break; inf where it did not fit.
-        standing: the first filter that each failed, of those that assignments do not change.
+        value: (n,) score plus tie-break; inf where the host did not fit.
+        standing: for each host the first failed filter that assignments do not change.
     """
 
     policy: NamedPolicy | None
@@ -68,7 +68,7 @@ class Moment:
     standing: tuple[Refusal | None, ...]
 
     def scores(self) -> Scores | None:
-        """Return the policy's scores again (it is pure), for their reasons; None: none."""
+        """Return the policy's scores again, for their reasons (a policy is pure); None: none."""
         if self.policy is None or not len(self.hosts):
             return None
         name, policy = self.policy
@@ -78,7 +78,7 @@ class Moment:
                 "scoring", name, "score", lambda: required(policy.score(hosts, process), Scores)
             )
         except PluginError:
-            return None  # the decision was made before
+            return None  # the decision itself does not need the reasons
 
     def refusals(self) -> list[Refusal | None]:
         """Return for each host the first filter that it failed."""
@@ -90,9 +90,9 @@ class Decision(Lazy):
     """The outcome for one process; as a mapping, it has the form of the event record.
 
     Attributes:
-        column: of the chosen host; -1: none fits now.
-        policy: name of the policy that decided, and of those that were left out.
-        omitted: verdict to the number of hosts with it, beside those that are named.
+        column: column of the chosen host; -1: none fits now.
+        policy: name of the policy that decided, and the policies left out, with reasons.
+        omitted: verdict to the number of hosts with that verdict that are not named.
     """
 
     __slots__ = ("_moment", "column", "kind", "omitted", "policy")
@@ -129,16 +129,17 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     """Return the outcome of a ranking with its reasons.
 
     Args:
-        ranking: refreshed.
-        chosen: column decided elsewhere, -1: none; None: the best.
+        ranking: up to date.
+        chosen: column that the caller has chosen, -1: none; None: choose the best.
     """
     column = ranking.best() if chosen is None else chosen
-    listed = [host.column for host in ranking.table.listed()]
+    listed = ranking.table.listed()
+    first = [host.column for host in listed[:_NAMED_HOSTS]]
     if len(listed) <= _NAMED_HOSTS:
-        moment = _moment(ranking, _first(column, listed))
+        moment = _moment(ranking, _first(column, first))
         return Decision(column, ranking.policy_name, moment, EMPTY)
     # With many hosts, only the runners-up are named, because this path must be quick.
-    nearly = ranking.lowest() if column >= 0 else listed[:_NAMED_HOSTS]
+    nearly = ranking.lowest() if column >= 0 else first
     moment = _moment(ranking, _first(column, nearly))
     named, fitting = len(moment.value), int(np.count_nonzero(ranking.value < np.inf))
     named_fitting = sum(value < np.inf for value in moment.value.tolist())
@@ -150,7 +151,7 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
 
 
 def _first(column: int, columns: Sequence[int]) -> list[int]:
-    """Return the columns, the chosen one first; a chosen one outside replaces the last."""
+    """Return the columns, the chosen one first; if it is not among them, it replaces the last."""
     if column < 0:
         return list(columns)
     others = [other for other in columns if other != column]

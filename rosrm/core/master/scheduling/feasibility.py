@@ -1,4 +1,4 @@
-"""Feasibility: hosts that may ever take a process; one that fits none is set aside."""
+"""Feasibility: the hosts that may ever take a process. A process without one is set aside."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rosrm.core.master.state.host_arrays import BoolArray
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.wording import by_reason, counted, first_line, get_close_matches
 
-#: A reason names every host up to this many.
+#: Largest number of hosts that a reason names.
 _NAMED_HOSTS: Final = 16
 
 _PERMANENT: Final = tuple(one for one in FILTERS if one.lasts is Lasts.PERMANENT)
@@ -33,8 +33,8 @@ _LASTING: Final = tuple(one for one in FILTERS if one.lasts is not Lasts.MOMENT)
 def why_never(table: HostTable, demand: Demand) -> str:
     """Return why no host may take a process before a lasting change; "" if one may.
 
-    A host that is away may not, as long as another one is there: a process that waits for that host
-    must not block the others.
+    An absent host does not count while another host is present, because a process that waits for an
+    absent host must not block the queue.
     """
     if not len(table) or _possible(table, demand).any():
         return ""
@@ -68,7 +68,7 @@ def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
 
 
 def why_all_away(table: HostTable, demand: Demand) -> str:
-    """Return why each host is away; "" if one of them is there."""
+    """Return why each host is away; "" if one of them is present."""
     if passing(_ABSENT, _every(table, demand)).any():
         return ""
     return f"every host is away: {_host_by_host(_ABSENT, table, demand)}"
@@ -80,7 +80,7 @@ def _every(table: HostTable, demand: Demand) -> Candidates:
 
 def _fit_empty(hosts: Candidates) -> BoolArray:
     table = hosts.table
-    is_listed = table.condition != HostCondition.LEFT  # of a host without a reading
+    is_listed = table.condition != HostCondition.LEFT  # read for hosts without a reading
     return np.where(table.without_reading(), is_listed, passing(_PERMANENT, hosts))
 
 
@@ -108,7 +108,7 @@ def _host_by_host(filters: Sequence[Filter], table: HostTable, demand: Demand) -
 
 
 def _unmeasured(table: HostTable, demand: Demand) -> str:
-    """Return a sentence: no host reports a resource; name the nearest one. "": all are reported."""
+    """Return a sentence on a resource that no host reports, with a near name; "": none."""
     for resource in sorted(demand.declared - set(table.resources)):
         near = get_close_matches(resource, table.resources, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -1,7 +1,7 @@
 """Placement filters: the rules by which hosts may take a process, with the reasons against a host.
 
-`FILTERS` is the whole list. Each entry has a mask over many hosts, by which a ranking chooses, and
-beside it the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
+`FILTERS` is the complete list. Each entry has a mask over many hosts, which a ranking reads, and
+the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, Bo
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.wording import amount, counted
 
-#: Sums of fractions are compared with this much tolerance.
+#: Tolerance in comparisons of sums of fractions.
 _CLOSE: Final = 1e-9
-#: As plain numbers, because a comparison with them takes half the time.
+#: Plain integers, because a comparison with an enum member takes twice the time.
 _SUSPECT, _EXPECTED = int(HostCondition.SUSPECT), int(HostCondition.EXPECTED)
 _FIRST_GONE: Final = int(HostCondition.LOST)
 
@@ -30,8 +30,8 @@ class Lasts(Enum):
 
     MOMENT = "until a message or the end of a process changes it"
     RETURN = "until the slave reports to this run of the master, which is expected"
-    AWAY = "until a user or the slave brings the host back"
-    PERMANENT = "until the host registers with something else"
+    AWAY = "until the host registers or rejoins, or a user uncordons it"
+    PERMANENT = "until the host registers with other labels, resources or plugins"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +41,14 @@ class Filter:
     Attributes:
         name: unique.
         mask: (n,) True: the host passes. None: every host passes.
-        reason: why the host of a row does not pass: a predicate of the host without its name, with
-            the setting that limits it, if there is one. Called only where `mask` is False there.
-        lasts: how long a host fails it. A process is set aside, and does not block the queue, if
-            each host fails a permanent one, judged as if the host were empty. Hosts that are away
-            count too, unless all hosts are.
-        by_assignment: True if an assignment changes the mask. Mask and reason then read only the
-            demand and the arrays of the candidates, because a decision keeps a copy of those and
-            spells the reason out later.
+        reason: returns why the host of a row fails, as a predicate without the host's name, with
+            the limiting setting if there is one. Called only for rows where `mask` is False.
+        lasts: how long a host fails the filter. A process is set aside, and does not block the
+            queue, if each host fails a permanent filter even as an empty host. A host that is away
+            counts as failing, unless all hosts are away.
+        by_assignment: True if an assignment changes the mask. Mask and reason then may read only
+            the demand and the arrays of the candidates, because a decision copies those alone and
+            formats the reason later.
         verdict: stands before the reason in an explanation.
     """
 
@@ -206,7 +206,7 @@ def _has_asked(hosts: Candidates) -> BoolArray:
 
 
 def _why_not_asked(_hosts: Candidates, _row: int) -> str:
-    return "it has not asked for work yet"
+    return "it has not requested work yet"
 
 
 # --- filters that an assignment changes -------------------------------------------------------

@@ -36,13 +36,13 @@ def process_view(hosts: Candidates) -> ProcessView:
 
 
 def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Make a view of a standing array read-only, because a policy might write into it."""
+    """Make a view of a shared array read-only, because a policy might write into it."""
     view.flags.writeable = False
     return view
 
 
 class _PerHost(Sequence[T]):
-    """A sequence over hosts, made on demand: it costs too much to list a thousand per decision."""
+    """A lazy sequence over hosts, because building a thousand items per decision costs too much."""
 
     def __init__(self, hosts: Candidates) -> None:
         self._hosts = hosts
@@ -74,7 +74,9 @@ class _Labels(_PerHost[Mapping[str, str]]):
         return MappingProxyType(dict(host.description.labels))
 
 
-def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:
+def checked_scores(
+    scores: Scores, hosts: HostView, fits: BoolArray
+) -> tuple[FloatArray, BoolArray | None]:
     """Return value and veto of a policy's answer; raise PluginError if it breaks the contract."""
     size = len(fits)
     required(scores, Scores)
@@ -107,7 +109,7 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
 
 
 def _unread_by(hosts: HostView, row: int) -> str:
-    """Return the resources that a host does not measure, the source of a NaN; "": none."""
+    """Return a sentence on the resources that a host does not measure (a cause of NaN), or ""."""
     names = [
         name for name, usage in zip(hosts.resources, hosts.usage[row], strict=True)
         if np.isnan(usage)

@@ -1,12 +1,12 @@
 """Ranking of hosts for a process: filter, score, pick.
 
-A host fits when it passes every filter of `filters.py` and the policy does not veto it. Among the
-hosts that fit, the one with the lowest score goes first (Eq. 1 of the paper with the policy
-`weighted`). A `Ranking` keeps the scores of one demand. So a queue of equal processes is judged
-once, and then only where an assignment has changed a host.
+A host fits if it passes every filter of `filters.py` and the policy does not veto it. Of the hosts
+that fit, the one with the lowest score is picked (with the policy `weighted`: Eq. 1 of the paper).
+A `Ranking` caches the scores for one demand. Equal processes share it, and after an assignment only
+the scores of the changed hosts are computed again.
 
-This module is the hot path of the master: a ranking is made once for each demand and batch of
-readings (one pass over all hosts), and one refresh and one argmin follow for each assignment.
+This module is the hot path of the master. A ranking is made once for each demand and batch of
+readings (one pass over all hosts); each assignment costs one refresh and one argmin.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rosrm.core.master.scheduling.filters import (
     passing,
     refusals,
 )
-from rosrm.core.master.scheduling.host_views import host_view, process_view, sound
+from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
@@ -32,11 +32,12 @@ from rosrm.errors import PluginError
 from rosrm.extensions.contracts import ScoringPolicy
 from rosrm.extensions.plugin_calls import PluginCalls
 
-#: Equal scores: the host with fewer processes goes first, then the one registered first.
+#: Added to the score for each process of a host: of equal scores, the host with fewer processes is
+#: picked, then the one that registered first.
 TIE: Final = 1e-9
-#: Number of runners-up that an explanation names beside the chosen host, of many hosts.
+#: Number of runners-up that an explanation names beside the chosen host, if there are many hosts.
 _RUNNERS_UP: Final = 3
-#: Number of equal processes on one host that are judged in one call.
+#: Number of equal processes for which one call of the policy scores a host ahead.
 _AT_A_TIME: Final = 8
 
 #: A scoring policy with its name.
@@ -44,12 +45,12 @@ NamedPolicy = tuple[str, ScoringPolicy]
 
 
 class Ranking:
-    """The judgement of every host for one demand, kept up to date column by column.
+    """The score of every host for one demand, updated column by column.
 
     Attributes:
         need: (R, H) fractions of each host's capacity.
         value: (H,) score plus tie-break; inf where the host does not fit now.
-        judge: the policy that judges; None: every policy was left out, each fitting host scores 0.
+        judge: the policy in use; None: every policy was left out, and each fitting host scores 0.
         plugins: guards every call of a policy.
         failure: why policies were left out.
     """
@@ -78,23 +79,23 @@ class Ranking:
 
     @property
     def judge(self) -> NamedPolicy | None:
-        """Return the policy that judges now, with its name."""
+        """Return the policy in use, with its name."""
         return self._left[0] if self._left else None
 
     @property
     def policy_name(self) -> str:
-        """Return the name of the policy that judges, and the policies left out, with reasons."""
+        """Return the name of the policy in use, and the policies left out, with reasons."""
         name = self._left[0][0] if self._left else ""
         if not self.failure:
             return name
         return f"{name} ({self.failure})" if name else self.failure
 
-    def took(self) -> None:
+    def note_assignment(self) -> None:
         """Note that the newest change of the table was an assignment of this demand."""
         self._own = len(self.table.touched)
 
     def refresh(self) -> None:
-        """Judge again the columns that assignments have changed since."""
+        """Update the columns that assignments have changed since the last refresh."""
         touched = self.table.touched
         if len(touched) == self._seen:
             return
@@ -153,15 +154,15 @@ class Ranking:
         self._lowest = None
         value = self._value(columns)
         if value is None:
-            self._judge(slice(0, len(self.table)))  # scores of two policies do not compare
+            self._judge(slice(0, len(self.table)))  # scores of two policies are not comparable
         else:
             self.value[columns] = value
 
     def _judge_ahead(self, column: int) -> None:
         """Set `value` of a column that just took a process of this demand.
 
-        Thousands of equal processes may be waiting. So one call judges the host with the next few
-        of them, as if it were several hosts.
+        Thousands of equal processes may be waiting. So one call of the policy scores the host with
+        0, 1, 2, … more of them, as if each were a host of its own.
         """
         values = self._ahead.get(column)
         if not values:
@@ -174,7 +175,7 @@ class Ranking:
         self.value[column] = values.pop()
 
     def _value(self, columns: Columns, more: IntArray | None = None) -> FloatArray | None:
-        """Return the values of some hosts; None: the policy was left out, judge all hosts again.
+        """Return the values of some hosts; None: the policy was left out, so all values are void.
 
         `more`, (n,), adds this number of further processes of this demand to each host.
         """
@@ -189,8 +190,9 @@ class Ranking:
         name, policy = self._left[0]
         try:
             value, veto = self.plugins.ask(
-                "scoring", name, "score", lambda: sound(policy.score(hosts, process), hosts, fits)
-            )
+                "scoring", name, "score",
+                lambda: checked_scores(policy.score(hosts, process), hosts, fits),
+            )  # fmt: skip
         except PluginError as error:
             self._leave_out(error)
             return None
@@ -217,9 +219,9 @@ class Ranking:
 
 
 def _tiers(table: HostTable, demand: Demand) -> IntArray | None:
-    """Return the tier of each host, (H,), lower first; None: all are equal.
+    """Return the tier of each host, (H,), of which the lowest is picked; None: all are equal.
 
-    Avoided labels count up, preferred labels and hosts count down.
+    An avoided label raises the tier; a preferred label or host lowers it.
     """
     spec = demand.spec
     if not spec.preferred_labels and not spec.avoided_labels and not demand.near:

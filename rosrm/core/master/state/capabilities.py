@@ -14,11 +14,11 @@ class Answer:
     """The answer of one host about one strategy.
 
     Attributes:
-        incarnation: of the slave that was asked.
-        order: by which it was asked; None: it was not.
-        facts: None: it has not answered, or the strategy does not work there.
+        incarnation: incarnation of the slave that received the order.
+        order: order of the check; None: it was not sent.
+        facts: result of the check; None: no answer yet, or the strategy does not work there.
         reason: why the strategy does not work there.
-        ask_at: time at which it is asked again; inf: never.
+        ask_at: time at which the check is repeated; inf: never.
     """
 
     incarnation: int

@@ -1,4 +1,4 @@
-"""Demand of a process: all that placement depends on."""
+"""Demand of a process: needs, constraints and preferences for its placement."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _plain_fields_of: Final = attrgetter(*(name for name in STANDARD_FIELDS if name 
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """All that the placement of a process depends on; equal demands share a ranking.
+    """Inputs of the placement of one process; equal demands share a ranking.
 
     Attributes:
         amounts: needs in base units by resource.
-        estimated: resources whose amount is a guess, not declared and not measured.
-        excluded: host name to the reason why it must not go there.
+        estimated: resources with an estimated amount, neither declared nor measured.
+        excluded: host name to the reason why the process must not run there.
         headroom: fraction by which a host must stay under each limit.
-        near: hosts with a replica of its snapshot; preferred as by one more preferred label.
+        near: hosts with a replica of its snapshot; each counts as one more preferred label.
         reads: fields of the spec that scoring policies read beyond the standard ones.
-        key: equal for processes that every host judges alike.
+        key: equal for demands with equal rankings.
     """
 
     spec: ProcessSpec

@@ -1,7 +1,7 @@
-"""Standing arrays of the hosts: one column per host, one row per resource.
+"""Arrays of the values of all hosts: one column per host, one row per resource.
 
-They grow by doubling and are never rebuilt. The values of every host lie in one block of memory, so
-that a few hosts can be copied in one step.
+The arrays grow by doubling and are never rebuilt. They are planes of one block of memory, so that
+the values of a few hosts are copied in one step.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ IntArray = npt.NDArray[np.int64]
 USAGE, LOAD, LIMIT, CAPACITY, BUSY = range(5)
 _ABSENT: Final = (np.nan, 0.0, 1.0, np.nan, np.nan)
 
-#: Stands for "no bound" where a number of processes is compared.
+#: Number of processes that means "no bound".
 NO_BOUND: Final = 2**62
 
 
@@ -36,16 +36,19 @@ class HostColumns:
         capacity: (R, H) base units; NaN where a host has no such resource.
         busy: (R, H) usage + load.
         condition: (H,) HostCondition.
-        asking: (H,) it has asked for work since its registration.
-        accepting: (H,) by its newest reading it is under all its limits.
+        asking: (H,) the host has requested work since its registration.
+        accepting: (H,) the host is under all its limits, by its newest reading.
         closed: (H,) cordoned or draining.
-        report_due: (H,) it was lost, and has not reported its instances since.
+        report_due: (H,) the host was lost, and has not reported its instances since.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
-        last_contact, registered: (H,) time of the last contact; of the registration.
-        period: (H,) seconds between its readings.
-        processes, bound: (H,) held or reserved; most of them.
-        incarnation, sequence: (H,) of the slave's run; of its newest reading.
-        reported: (H,) sequence of the newest status batch that it claims to have sent.
+        last_contact: (H,) time of the newest message.
+        registered: (H,) time of the registration.
+        period: (H,) seconds between two readings.
+        processes: (H,) number of processes on the host or reserved for it.
+        bound: (H,) highest number of processes.
+        incarnation: (H,) incarnation of the slave.
+        sequence: (H,) sequence of the newest reading.
+        reported: (H,) sequence of the newest status batch that the slave has sent.
         status_sequence: (H,) sequence of the newest status batch that has arrived.
         row_of_slot: (H, RESOURCE_SLOTS) slot of a message -> row here; -1: not in use.
     """

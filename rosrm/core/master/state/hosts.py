@@ -26,8 +26,8 @@ from rosrm.core.master.state.host_arrays import (
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.values import HostDescription
 
-#: An estimate, unlike a declared need, fills at most this share of a host's limit, because a guess
-#: alone must not exclude a process from every host.
+#: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
+#: could exclude a process from every host. Declared needs have no such bound.
 _MOST_GUESSED: Final = 0.5
 
 
@@ -42,7 +42,7 @@ class HostCondition(IntEnum):
     DETACHED = 5  # its slave was stopped and left processes running
 
     def words(self, *only: HostCondition) -> str:
-        """Return the condition of a host as a predicate; "" if it is up or not in `only`."""
+        """Return a predicate for the condition; "" for UP and conditions not in `only`."""
         return _WORDS.get(self, "") if self in (only or _WORDS) else ""
 
 
@@ -51,7 +51,7 @@ _WORDS: Final[Mapping[HostCondition, str]] = {
     HostCondition.LOST: "is lost",
     HostCondition.LEFT: "has left",
     HostCondition.DETACHED: "is detached: its slave was stopped and left processes running",
-    HostCondition.EXPECTED: "has not come back since the master started",
+    HostCondition.EXPECTED: "has not reported since the master started",
 }
 
 
@@ -60,20 +60,19 @@ class Host:
     """One host: the values that are read for single hosts.
 
     Attributes:
-        column: of this host in the arrays of `HostTable`.
-        instances: numbers of the instances that it holds or that are assigned to it.
-        over_since: resource name to the time since when it is over its limit.
-        over_at: resource name to the time of its last reading over the limit; only resources whose
-            excess is on record without its end.
-        drained: it is draining, and no process is left on it that can leave.
-        pruned: it is in no listing, until it registers.
-        recorded_at: kind of a record that is not repeated at once, to the time of the record.
-        blocked: cause of an eviction to the last recorded reason why nothing could leave.
-        detached_since: time at which its slave was stopped, while it is detached.
-        lost_since: time at which it was lost, while it is; of a detached host the time at which its
-            lease ends.
-        failing: kind and name of the plugins that fail there, as the slave reports. A probe is
-            named after the resource that it reads.
+        column: column of this host in the arrays of `HostTable`.
+        instances: numbers of the instances that run on the host or are assigned to it.
+        over_since: resource name to the time since when the host is over this limit.
+        over_at: resource name to the time of the last reading over the limit, from the record
+            `over_limit` to the record `under_limit`.
+        drained: the host is draining, and no process that can leave is left on it.
+        pruned: the host is left out of listings until it registers.
+        recorded_at: kind of a record to its last time, for records that are not repeated at once.
+        blocked: cause of an eviction to the last recorded reason why no process could leave.
+        detached_since: for a detached host: time at which its slave was stopped.
+        lost_since: for a lost host: time of the loss; for a detached host: end of its lease.
+        failing: kind and name of each failing plugin to its failure, as the slave reports. A probe
+            has the name of its resource.
     """
 
     column: int
@@ -106,8 +105,8 @@ class HostTable(HostColumns):
     """All known hosts.
 
     Attributes:
-        version: grows with every change that concerns many hosts.
-        touched: columns that single assignments and ends have changed since `version` grew.
+        version: counter of changes that concern many hosts.
+        touched: columns that assignments and ends have changed since `version` grew.
     """
 
     def __init__(self) -> None:
@@ -135,7 +134,7 @@ class HostTable(HostColumns):
         return host
 
     def register(self, description: HostDescription, now: float) -> Host:
-        """Register a host, or a new run of a known one; its readings are still to come."""
+        """Register a host, or the new run of a known host's slave, without readings yet."""
         host = self.by_name.get(description.name) or self.expect(description.name)
         column = host.column
         host.description, host.pruned = description, False
@@ -164,7 +163,7 @@ class HostTable(HostColumns):
         return host
 
     def prune(self, host: Host) -> None:
-        """Leave a host out of every listing until its slave registers, then as a new host."""
+        """Remove a host from every listing; its slave may register it later as a new host."""
         host.pruned, host.description = True, HostDescription(host.name, 0)
         self._listed = None
         for known in (host.over_since, host.over_at, host.recorded_at, host.blocked, host.failing):
@@ -175,7 +174,7 @@ class HostTable(HostColumns):
         self.set_condition(host, HostCondition.LEFT)
 
     def find(self, host_id: int, incarnation: int) -> Host | None:
-        """Return the host of this number; None: there is none with this incarnation."""
+        """Return the host with this number and incarnation; None: there is none."""
         column = host_id - 1
         if not 0 <= column < len(self.hosts) or int(self.incarnation[column]) != incarnation:
             return None
@@ -187,7 +186,7 @@ class HostTable(HostColumns):
         return host if host and self.condition_of(host) is HostCondition.UP else None
 
     def listed(self) -> Sequence[Host]:
-        """Return every host that was not pruned; cached, because each decision needs them."""
+        """Return every host that was not pruned; cached, because each decision reads the list."""
         if self._listed is None:
             self._listed = [host for host in self.hosts if not host.pruned]
         return self._listed
@@ -203,12 +202,12 @@ class HostTable(HostColumns):
     # --- changes -------------------------------------------------------------------------
 
     def changed(self) -> None:
-        """Note that many hosts changed: rankings made before are void."""
+        """Note that many hosts have changed, which makes earlier rankings void."""
         self.version += 1
         self.touched.clear()
 
     def ask(self, host: Host) -> None:
-        """Note a request for work; the host gets none before its first reading."""
+        """Note a request for work; placement also waits for the host's first reading."""
         if not self.asking[host.column]:
             self.asking[host.column] = True
             self.changed()
@@ -231,13 +230,13 @@ class HostTable(HostColumns):
         self.changed()
 
     def set_bound(self, host: Host, bound: int) -> None:
-        """Set the most processes that a host may hold or have reserved."""
+        """Set the highest number of processes on a host, reserved ones included."""
         if int(self.bound[host.column]) != bound:
             self.bound[host.column] = bound
             self.touched.append(host.column)
 
     def add_reservation(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
-        """Add to (or, negative, take from) the reservations and process count of one host.
+        """Add to the reservations and process count of one host; negative values release.
 
         `amount` is (R',) fractions, R' at most the resources known now.
         """
@@ -258,7 +257,7 @@ class HostTable(HostColumns):
     ) -> FloatArray:
         """Return base-unit amounts as fractions, (R, H), of each host's capacity.
 
-        inf where a host has no such resource, and 0 there for an amount that is only estimated.
+        inf where a host has no such resource; 0 there for an estimated amount.
         """
         return self._fractions(slice(0, len(self)), amounts, estimated)
 
@@ -285,7 +284,7 @@ class HostTable(HostColumns):
         return need
 
     def without_reading(self) -> BoolArray:
-        """Return the mask, (H,), of hosts without a reading of this run: unknown limits."""
+        """Return the mask, (H,), of hosts with unknown limits: no reading in their slave's run."""
         # A refused reading has marked every resource of the host as stale.
         unread = (self.sequence == 0) & (self.stale == 0)
         return np.asarray((self.incarnation == 0) | unread)
@@ -299,7 +298,7 @@ class HostTable(HostColumns):
         return np.flatnonzero(young & silent)
 
     def silent_hosts(self) -> list[int]:
-        """Return the numbers of hosts that have reported and are silent now."""
+        """Return the ids of hosts that have reported and are silent now."""
         silent = np.isin(self.condition, _SILENT)
         return [int(column) + 1 for column in np.flatnonzero(silent)]
 
@@ -324,7 +323,7 @@ class HostTable(HostColumns):
         return np.flatnonzero(over & (self.condition == HostCondition.UP))
 
     def statuses_missing(self) -> IntArray:
-        """Return the columns of hosts with missing statuses, by their reading or after a loss."""
+        """Return the columns of hosts with missing statuses, shown by a reading or after a loss."""
         behind = (self.reported > self.status_sequence) | self.report_due
         return np.flatnonzero(behind & (self.condition == HostCondition.UP))
 
@@ -346,15 +345,15 @@ class HostTable(HostColumns):
         return "next" if sequence == newest + 1 else "after a gap"
 
     def is_accepting(self, host: Host) -> bool:
-        """Return True if a host is under all its limits and has asked for work."""
+        """Return True if a host is under all its limits and has requested work."""
         return bool(self.accepting[host.column] and self.asking[host.column])
 
 
 def _over(usage: FloatArray, limit: FloatArray) -> BoolArray:
-    """Return the mask of usage at or over its limit; a limit of 1 or a usage of NaN never is."""
+    """Return the mask of usage at or over its limit; False for a limit of 1 and a usage of NaN."""
     return np.asarray((usage >= limit) & (limit < 1.0))
 
 
-#: Conditions of hosts that reported before, and do not now.
+#: Conditions of hosts that have reported and are silent now.
 _SILENT: Final = (HostCondition.SUSPECT, HostCondition.LOST, HostCondition.DETACHED)
 _NO_ANSWER: Final = (HostCondition.LOST, HostCondition.DETACHED, HostCondition.EXPECTED)

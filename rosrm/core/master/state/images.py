@@ -10,14 +10,14 @@ from rosrm.core.master.commands import OrderId
 
 @dataclass(slots=True)
 class UnwantedImage:
-    """An image that is to be removed.
+    """An image that must be removed from its host.
 
     Attributes:
         process: name of its process.
         host: name of the host that stores it.
         drop: the executor that removes it.
-        numbers: of the instance that was dumped, and of those that were to be restored from it.
-        order: of the removal; None: none is under way.
+        numbers: numbers of the dumped instance and of instances that restores of it created.
+        order: order of the removal; None: no order awaits its answer.
         ask_at: time of the next order to remove it.
     """
 
@@ -34,8 +34,8 @@ class Images:
     """All images that the master knows.
 
     Attributes:
-        of: names of the processes that are checkpointed.
-        unwanted: by the number of the instance.
+        of: names of the checkpointed processes.
+        unwanted: number of the dumped instance to its image.
     """
 
     of: set[str] = field(default_factory=set)

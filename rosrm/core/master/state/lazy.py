@@ -1,4 +1,4 @@
-"""Mappings that are rendered when first read, because most facts are never read."""
+"""Mappings that are rendered at the first read, because most facts are never read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm.model.values import ProcessSpec
 
 
 class Lazy(Mapping[str, Any]):
-    """A mapping rendered once, from values that no longer change (a copy, a frozen spec)."""
+    """A mapping that is rendered once, from immutable values (a copy, a frozen spec)."""
 
     __slots__ = ("_rendered",)
 
@@ -19,7 +19,7 @@ class Lazy(Mapping[str, Any]):
         self._rendered: Mapping[str, Any] | None = None
 
     def render(self) -> Mapping[str, Any]:
-        """Return the mapping; read only values that no longer change."""
+        """Return the mapping; read only immutable values."""
         raise NotImplementedError
 
     def _made(self) -> Mapping[str, Any]:

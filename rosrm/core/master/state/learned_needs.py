@@ -10,8 +10,8 @@ from rosrm.model.values import EMPTY, ProcessSpec
 
 #: Weight of the newest run: the mean follows a changed program within a few runs.
 _NEWEST: Final = 0.3
-#: The learned amount follows the mean only when it differs by this share. So equal processes keep
-#: equal demands while runs of them end, and the journal need not hold every run.
+#: The learned amount follows the mean only if they differ by this share. Otherwise each end of a
+#: run would change the demands of equal waiting processes, and write to the journal.
 _NOTICEABLE: Final = 0.1
 
 
@@ -30,7 +30,7 @@ class LearnedNeeds:
     """Peaks of earlier runs by program, as a moving mean.
 
     Attributes:
-        version: grows whenever the learned amount of any program has changed.
+        version: counter of changes of learned amounts.
     """
 
     def __init__(self) -> None:

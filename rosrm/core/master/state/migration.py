@@ -21,9 +21,9 @@ class End:
     """The end of an instance.
 
     Attributes:
-        ordered: it had been ordered to stop, so that its exit code has no meaning.
-        completed: a job that ran to its own end, even if an order to stop was under way.
-        gone: its host no longer holds it and reports no end.
+        ordered: the instance was ordered to stop, so its exit code has no meaning.
+        completed: a job ran to completion, even if an order to stop was on its way.
+        gone: the instance is missing or lost, and its process may be queued again.
     """
 
     status: InstanceStatus
@@ -37,8 +37,8 @@ class HandoffReports:
     """Reports of the source or the destination of a handoff.
 
     Attributes:
-        phases: all reported phases, with the newest message of each.
-        message: the newest of all.
+        phases: reported phase to its newest message.
+        message: newest message of all phases.
     """
 
     phases: dict[ReportPhase, str] = field(default_factory=dict)
@@ -50,28 +50,28 @@ class Migration:
     """A migration: the execution of a plan.
 
     Attributes:
-        started: time of its begin by this master's clock; before the master's own start, where a
+        started: time of its begin by this master's clock; earlier than the master's own start if a
             former master began it.
-        wall: unix time at which it began.
-        source_node, destination_node: names of their nodes, without the namespace.
-        index: of the current step, in the plan or, going back, in `undo`.
-        undo: steps still to be done on the way back; None: going forward.
-        turned_at: index of the current step when it turned back.
+        wall: unix time of its begin.
+        source_node, destination_node: names of the nodes, without the namespace.
+        index: index of the current step in the plan, or in `undo` on the way back.
+        undo: steps of the way back; None: the migration goes forward.
+        turned_at: index of the current step when the undo began.
         committed: the destination owns the name.
-        deadline: of the current step.
+        deadline: time at which the current step times out.
         begun: the current step has been ordered.
-        order: of the current step; None: it has none.
-        stuck: a step that must be done failed; it is retried from `retry_at` on.
-        answer: of the slave to the order of the current step; None: it has not answered.
+        order: order of the current step; None: the step has none.
+        stuck: a step that must succeed failed; it is retried from `retry_at` on.
+        answer: the slave's answer to the order of the current step; None: no answer yet.
         launched: numbers of the instances that were ordered to start.
-        suspended: numbers of the instances whose slave was ordered not to restart them. A later
-            order may have allowed it again: its answer may arrive before the report of an end.
+        suspended: numbers of the instances that their slave was ordered not to restart. A later
+            order that allows restarts does not remove a number, because its answer may arrive
+            before the report of an end.
         ended: instance number to the end of that instance.
         handoff_reports: instance number to its reports on a handoff.
         taking_over: the destination was ordered to take over without its source.
         results: executor name to its result.
-        aim: purpose of the plan. Source and destination of a checkpoint or a restore have the same
-            host.
+        aim: purpose of the plan. Source and destination of a checkpoint or restore are on one host.
     """
 
     process: str
@@ -112,7 +112,7 @@ class Migration:
 
     @property
     def current_step(self) -> Step | None:
-        """Return the current or next step; None: all are done."""
+        """Return the current or next step; None: all steps are done."""
         steps = self._steps
         return steps[self.index] if self.index < len(steps) else None
 
@@ -127,13 +127,13 @@ class Migration:
 
     @property
     def begun_steps(self) -> Sequence[Step]:
-        """Return the steps of the plan that were or may have been begun on the way forward."""
+        """Return the steps of the plan up to the last one that may have been begun forward."""
         reached = self.index if self.undo is None else self.turned_at
         return self.plan.steps[: reached + 1]
 
     @property
     def destination_is_active(self) -> bool:
-        """Return True if an executor has found the destination running: there is no way back."""
+        """Return True if an executor has found the destination running, which forbids an undo."""
         return any(result.get("active") is True for result in self.results.values())
 
     @property
@@ -152,13 +152,13 @@ class Migration:
         return next(step for step in self.plan.steps if isinstance(step, Commit))
 
     def begin_undo(self) -> None:
-        """Turn to the undo of every step so far, the current one included, newest first."""
+        """Begin the undo of all steps up to the current one, newest first."""
         self.turned_at = self.index
         self.undo = undo_steps(self.plan, self.turned_at)
         self.index, self.begun = 0, False
 
     def how_ended(self, instance: InstanceId) -> str:
-        """Return how one of its instances ended, in words."""
+        """Return a phrase on how one of its instances ended."""
         end = self.ended.get(instance.number)
         if end is None:
             return "it was never started"
@@ -177,7 +177,7 @@ def undo_steps(plan: Plan, turned_at: int) -> Sequence[Step]:
     return [step.undo for step in reversed(begun_steps) if step.undo is not None]
 
 
-#: Fields that the journal has unchanged: of a migration, of an end, and of the status of an end.
+#: Fields that are journaled unchanged: of a migration, of an end, and of the status of an end.
 JOURNALED: Final = (
     "strategy", "cause", "wall", "source_node", "destination_node", "index", "turned_at",
     "committed", "failure", "launched", "suspended", "results", "aim",
@@ -187,9 +187,9 @@ _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")
 
 
 def migration_to_dict(migration: Migration, stopping: Sequence[int]) -> dict[str, Any]:
-    """Return all facts about a migration that a restarted master needs.
+    """Return all fields of a migration that a restarted master needs.
 
-    Reports of a handoff are left out, because the nodes send them again. `stopping`: numbers of its
+    Reports of a handoff are left out, because the nodes repeat them. `stopping`: numbers of its
     instances that were ordered to stop.
     """
     return {
@@ -208,6 +208,6 @@ def _end_to_dict(end: End) -> dict[str, Any]:
 
 
 def end_from_dict(instance: InstanceId, plain: Mapping[str, Any]) -> End:
-    """Return the end of an instance from `migration_to_dict`, with the fields used later."""
+    """Return an end from its form in `migration_to_dict`."""
     status = InstanceStatus(instance, **fields_from_plain(InstanceStatus, plain, _STATUS))
     return End(status, **fields_from_plain(End, plain, _END))

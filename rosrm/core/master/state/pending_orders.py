@@ -1,4 +1,4 @@
-"""Table of pending orders: the purpose of each order that awaits its slave's answer."""
+"""Table of pending orders: the purpose of each order without an answer yet."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm.core.master.commands import OrderId
 
 @dataclass(frozen=True, slots=True)
 class MigrationStep:
-    """The order carries out the current step of a process's migration."""
+    """The order is that of the current step of a process's migration."""
 
     process: str
 
@@ -21,7 +21,7 @@ class ImageRemoval:
     """The order removes an unwanted checkpoint image.
 
     Attributes:
-        number: of the instance that was dumped.
+        number: number of the dumped instance.
     """
 
     number: int
@@ -36,7 +36,7 @@ class Replication:
 
 @dataclass(frozen=True, slots=True)
 class CapabilityQuery:
-    """The order asks a host about a migration strategy."""
+    """The order checks whether a migration strategy works on a host."""
 
     strategy: str
     host: str
@@ -44,15 +44,15 @@ class CapabilityQuery:
 
 @dataclass(frozen=True, slots=True)
 class PeriodicCheckpoint:
-    """The order makes a periodic checkpoint of an instance, or removes those of an ended one."""
+    """The order makes a periodic checkpoint of an instance, or removes all of an ended one."""
 
     number: int
 
 
 Purpose = MigrationStep | ImageRemoval | Replication | CapabilityQuery | PeriodicCheckpoint
 
-#: Purposes that depend on optional plugins have a series of numbers each, because a recording that
-#: is replayed without such a plugin must give all other orders the same numbers.
+#: Purposes with their own series of numbers, because they depend on optional plugins: a replay
+#: without such a plugin must give all other orders the same numbers.
 _SERIES: Final[dict[type, Literal["replication", "capability", "periodic"]]] = {
     Replication: "replication",
     CapabilityQuery: "capability",
@@ -61,14 +61,14 @@ _SERIES: Final[dict[type, Literal["replication", "capability", "periodic"]]] = {
 
 
 class PendingOrders:
-    """Purposes of the orders without an answer; a former master's orders have none here."""
+    """Purposes of the unanswered orders of this master; orders of a former master have none."""
 
     def __init__(self) -> None:
         self._purposes: dict[OrderId, Purpose] = {}
         self._numbers = Counter[str]()
 
     def add(self, purpose: Purpose | None = None) -> OrderId:
-        """Return the id of a new order; without a purpose, its answer is ignored."""
+        """Return the id of a new order; the answer to an order without a purpose is ignored."""
         series = _SERIES.get(type(purpose), "")
         self._numbers[series] += 1
         number = self._numbers[series]
@@ -78,5 +78,5 @@ class PendingOrders:
         return order
 
     def pop(self, order: OrderId) -> Purpose | None:
-        """Remove an answered order and return its purpose; None: it has none."""
+        """Remove an answered order and return its purpose; None: the order has none."""
         return self._purposes.pop(order, None)

@@ -15,16 +15,16 @@ class Dumped:
 
     Attributes:
         process, host: names.
-        strategy: name of the strategy that makes them.
-        discard: the executor that removes its images; None: none does; `Rejected`: the strategy
-            failed to name it.
-        since: time of the last dump, or time since when the first is due.
-        made: at least one exists.
-        size: bytes of the newest.
+        strategy: name of the strategy that makes the checkpoints.
+        discard: name of the executor that removes the images; None: there is none; `Rejected`: the
+            strategy failed to name it.
+        since: time of the last dump, or of the start of the wait for the first one.
+        made: at least one checkpoint exists.
+        size: size of the newest checkpoint in bytes.
         pause: seconds for which the newest dump paused the process.
-        order: of the dump under way; None: none is.
+        order: order of a dump without an answer yet; None: there is none.
         asked: incarnation of the slave that received the order.
-        trouble: why there is none, or no newer one.
+        trouble: why the last dump failed; "": it did not.
     """
 
     process: str

@@ -63,17 +63,18 @@ class Instance:
         demand: base units that the assignment reserved.
         estimated: resources whose amount is an estimate and stops counting after `settle`.
         reserved: (R',) reservation on its host, fractions.
-        state: as last reported by the slave; None: assigned, nothing reported yet.
+        state: state that the slave has reported last; None: assigned, without a report yet.
         seen: newest usage in base units.
-        peak: highest usage seen.
-        restarting: it was ordered to restart, and no report shows the restart yet.
+        peak: highest usage in base units.
+        restarting: the slave was ordered to restart it, and no report shows the restart yet.
         settled: its estimates no longer count.
         redelivered: the assignment was delivered again, because its slave did not accept it.
-        recalled: a former run of the master ordered it to stop, so its end counts as ordered.
-        at_once: it is to end without delay, because another instance owns the name.
-        order_at: time of the last order to stop it, or to withdraw it; -inf: none.
-        node_name: name of its node, where that is not the process's name.
-        ready_at: time at which this master learned that it is ready.
+        recalled: a former run of the master may have ordered it to stop, so its end counts as
+            ordered.
+        at_once: it must be killed without delay, because another instance owns the name.
+        order_at: time of the last order to stop or withdraw it; -inf: none.
+        node_name: name of its node, if it differs from the name of the process.
+        ready_at: time at which the first report of its readiness arrived at this master.
     """
 
     id: InstanceId
@@ -99,12 +100,12 @@ class Instance:
 
     @property
     def is_running(self) -> bool:
-        """Return True if its slave reports that it runs, ready or not."""
+        """Return True if the slave reports that the instance runs, ready or not."""
         return self.state in _RUNS
 
     @property
     def measured(self) -> dict[str, float]:
-        """Return the newest usage of the resources that a probe of its host reads, base units."""
+        """Return the newest usage, in base units, of the resources that its host measures."""
         probed = {resource.name for resource in self.host.description.resources}
         return {name: amount for name, amount in self.seen.items() if name in probed}
 
@@ -114,7 +115,7 @@ _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 @dataclass(frozen=True, slots=True)
 class LeftBehind:
-    """The owning instance of a process on a host that was lost, as long as it has no successor."""
+    """The owning instance of a process on a lost host, until a successor is assigned."""
 
     number: int
     host: str
@@ -123,16 +124,16 @@ class LeftBehind:
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The checkpoint image of a checkpointed process; it owns the name.
+    """The checkpoint image of a checkpointed process; the image owns the name.
 
     Attributes:
-        number: of the instance that was dumped.
+        number: number of the dumped instance.
         host: name of the host that stores it.
-        strategy: name of the strategy that made and restores it.
-        drop: the executor that removes it.
-        made_at: unix time.
-        node_name: name of the node, where that is not the process's name.
-        needs: resource name to the measured usage of the instance, base units.
+        strategy: name of the strategy that made it and can restore it.
+        drop: name of the executor that removes it.
+        made_at: unix time of the dump.
+        node_name: name of the node, if it differs from the name of the process.
+        needs: resource name to the measured usage of the instance, in base units.
     """
 
     number: int
@@ -144,7 +145,7 @@ class Image:
     needs: Mapping[str, float] = field(default_factory=dict)
 
 
-#: Fields of a process that the journal has unchanged.
+#: Fields of a process that are journaled unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
 )  # fmt: skip
@@ -155,28 +156,30 @@ class Process:
     """One submitted process.
 
     Attributes:
-        order: place in the queue; kept when it returns to the queue.
-        since: start of its phase by this master's clock; before the master's own start, where the
-            journal has it.
-        wall: unix time at which its phase began.
+        order: place in the queue; unchanged when the process returns to the queue.
+        since: start of its phase by this master's clock; earlier than the master's own start if the
+            phase is from the journal.
+        wall: unix time of the start of its phase.
         phase_before_loss: its phase when its host was lost, with the start of that phase (`since`
             and `wall`); None: its host reports, or the process has had another phase since.
-        wanted: its desired state.
-        born: lowest number that an instance of it can have; snapshots of lower ones are void.
+        wanted: desired state.
+        born: lowest number of an instance since the submission; snapshots of lower numbers are
+            void.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
-        excluded: host name to the reason why it cannot run there.
-        exit_code: of its last run, a signal as a negative number; None: unknown, or it runs.
-        ended_on: name of the host on which it has ended; "": it has not, or ran nowhere.
-        decision: the newest one about it, with its kind.
-        left_behind: the instance that may still run on a lost host, while this process waits in the
-            queue for another one.
-        image: checkpoint image from which it is to be restored; None: it is not checkpointed.
-        standby_at: time before which no standby is begun.
-        standby_tries: standbys that were lost, one after the other.
+        excluded: host name to the reason why the process cannot run there.
+        exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
+            process runs.
+        ended_on: name of the host of its last run; "": it has not ended, or never ran.
+        decision: newest placement decision about it, with its kind.
+        left_behind: instance that may still run on a lost host, while this process waits in the
+            queue.
+        image: checkpoint image from which it can be restored; None: it is not checkpointed.
+        standby_at: time before which no standby is started.
+        standby_tries: number of standbys that were lost in a row.
         standby_reason: condition of its standby, for listings.
         demand: its demand, with the version of the learned needs in it.
-        node: the node that it adds to the ROS graph, as `node_of` returns it.
+        node: phrase for the node that it adds to the ROS graph (`node_of`).
     """
 
     spec: ProcessSpec

@@ -9,10 +9,10 @@ _Key = tuple[int, int, str]
 
 
 class Queue:
-    """Names of waiting processes in the order in which they are served.
+    """Names of waiting processes in the order of their placement.
 
     Attributes:
-        version: grows with every change.
+        version: counter of changes.
     """
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class Queue:
         self._of: dict[str, _Key] = {}
 
     def add(self, name: str, priority: int, order: int) -> None:
-        """Queue a process; one that returns with its old `order` gets its old place."""
+        """Queue a process; a process that returns with its old `order` gets its old place."""
         if name in self._of:
             raise ValueError(f"{name} is in the queue already")
         key = (-priority, order, name)
@@ -45,7 +45,7 @@ class Queue:
         return (name for _, _, name in list(self._keys))
 
     def head(self) -> str | None:
-        """Return the process that is served next."""
+        """Return the process that is placed next; None: the queue is empty."""
         return self._keys[0][2] if self._keys else None
 
     def position(self, name: str) -> int:

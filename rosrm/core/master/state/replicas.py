@@ -1,6 +1,6 @@
 """Index of snapshots and their replicas, as reported by slaves. Not persisted.
 
-Each report of a host is complete and replaces its former one.
+Each report of a host is complete and replaces the former report.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ class Replica:
     """The newest snapshot of a process on one host.
 
     Attributes:
-        number: of the instance whose snapshot it is.
-        sequence: cycles that it covers.
-        size: bytes.
-        since: time at which this master learned of it.
+        number: number of the instance that wrote it.
+        sequence: number of cycles that it covers.
+        size: size in bytes.
+        since: time of the first report of it to this master.
     """
 
     number: int
@@ -70,7 +70,7 @@ class ReplicaIndex:
         return self._of.get(process, EMPTY)
 
     def hosts_of(self, process: str, since: int) -> tuple[str, ...]:
-        """Return the hosts with snapshots of instances from a number on, the newest first."""
+        """Return the hosts with snapshots of instances numbered `since` or higher, newest first."""
         known = self._of.get(process)
         if known is None:
             return ()
@@ -87,11 +87,11 @@ class ReplicationOrder:
     """The last order to a slave about replicas of an instance's snapshot.
 
     Attributes:
-        number: of the instance.
-        incarnation: of the slave.
-        by_policy: the policy has made this choice since the master started. False: the policy gives
-            no answer, and the hosts are those with a replica already.
-        accepted: the slave has accepted.
+        number: number of the instance.
+        incarnation: incarnation of the slave.
+        by_policy: True: the policy has chosen the hosts since the master started. False: it gives
+            no answer, and the hosts are those that already have a replica.
+        accepted: the slave has accepted the order.
     """
 
     number: int
@@ -109,12 +109,11 @@ class ReplicationState:
 
     Attributes:
         policy: chooses the hosts of replicas; None: snapshots stay on their own hosts alone.
-        policy_name: in the configuration.
+        policy_name: name of the policy in the configuration.
         replicas: index of snapshots by process and host.
         last_orders: process name to the last order to its slave.
         dropped_at: time of the last order to a host to drop its replica of a process.
-        removed: stateful processes that were removed, each with a number above those of all its
-            instances.
+        removed: name of each removed stateful process to a number above those of its instances.
         waiting: processes still to be reviewed in this round.
         reviewed_at: time of the last review.
     """
@@ -129,10 +128,10 @@ class ReplicationState:
     reviewed_at: float = -inf
 
     def in_reach(self, process: str, since: int, hosts: HostTable) -> tuple[str, ...]:
-        """Return the hosts in reach with a snapshot of an instance from a number on, newest first.
+        """Return the hosts in reach with a snapshot of an instance numbered `since` or higher.
 
-        Before them come the hosts that were to get a replica and have not reported one yet: it may
-        have arrived since their report, and would then be newer than all others.
+        The newest snapshot is first, after the hosts that should get a replica and have not
+        reported one yet: it may have arrived since their report, and would be the newest.
         """
         known = self.replicas.hosts_of(process, since)
         last_order = self.last_orders.get(process)

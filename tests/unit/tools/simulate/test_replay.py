@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.settings import CoreSettings
-from rosrm.extensions.contracts import Intent
+from rosrm.model.records import Intent
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Header, Recording
 from rosrm_scoring.weighted import Weighted, WeightedOptions

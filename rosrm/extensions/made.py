@@ -1,0 +1,167 @@
+"""Objects that the offers of plugins created, and their checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from rosrm.errors import PluginError
+from rosrm.extensions.contracts import Executor, Launcher, Probe, ProbeOffer
+from rosrm.extensions.discovery import FAULTS
+from rosrm.model.description_checks import resource_fault
+from rosrm.model.rows import PluginKind
+from rosrm.model.values import RESOURCE_SLOTS, Reading, ResourceDescription
+from rosrm.wording import get_close_matches
+
+#: Members that an object of each kind must have.
+_METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
+    "probe": ("resources", "read", "close"),
+    "scoring": ("score",),
+    "migration": ("propose",),
+    "checkpoint": ("choose",),
+    "launcher": ("prepare",),
+}
+
+#: Seconds between two reads of a `FailedProbe`.
+_FAILED_PERIOD: Final = 10.0
+
+
+@dataclass(frozen=True)
+class MadeProbe:
+    """A probe on this host; period and deadline, in seconds, are those of its offer."""
+
+    name: str
+    probe: Probe
+    resources: tuple[ResourceDescription, ...]
+    period: float
+    deadline: float
+
+
+@dataclass(frozen=True)
+class Probes:
+    """The probes of a host.
+
+    Attributes:
+        made: created probes, and a `FailedProbe` for each probe that could not be created.
+        absent: name of each probe that is absent on this host to the reason (`SkipPlugin`).
+    """
+
+    made: tuple[MadeProbe, ...]
+    absent: Mapping[str, str]
+
+
+class FailedProbe:
+    """Substitute for a chosen probe that could not be created; each read fails with the reason.
+
+    So its resources are stale, and the host gets no new work if one of them has a limit, as after a
+    failed read of a probe.
+
+    Attributes:
+        resources: resources that the offer declares and no other probe reads, of unknown capacity.
+        reason: why the probe could not be created, with the plugin and the place.
+    """
+
+    def __init__(self, resources: Sequence[ResourceDescription], reason: str) -> None:
+        self.resources = resources
+        self.reason = reason
+
+    def read(self) -> Iterable[Reading]:
+        """Raise `PluginError` with the reason."""
+        raise PluginError(self.reason)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True)
+class MadeLauncher:
+    """A launcher of this host, and the environment variables that it sets."""
+
+    launcher: Launcher
+    variables: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MadeLaunchers:
+    """The launchers of a host.
+
+    Attributes:
+        made: name to the created launcher.
+        absent: name of each launcher that is absent on this host to the reason (`SkipPlugin`).
+        broken: name of each launcher that could not be created to the reason.
+    """
+
+    made: Mapping[str, MadeLauncher]
+    absent: Mapping[str, str]
+    broken: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class OfferedExecutor:
+    """An executor, and the name of the migration strategy that offers it."""
+
+    strategy: str
+    call: Executor
+
+
+# --- checks -----------------------------------------------------------------------------------
+
+
+def failed_probe(offer: ProbeOffer, reason: str, others: Sequence[MadeProbe]) -> MadeProbe:
+    """Return a substitute for a probe that could not be created."""
+    taken = {resource.name for other in others for resource in other.resources}
+    described = [
+        ResourceDescription(resource, "1", 1.0, "unknown")
+        for resource in dict.fromkeys(offer.resources)
+        if resource not in taken
+    ]
+    valid = [one for one in described if not resource_fault(one)]
+    probe = FailedProbe(tuple(valid[: RESOURCE_SLOTS - len(taken)]), reason)
+    return MadeProbe(offer.name, probe, tuple(probe.resources), _FAILED_PERIOD, 1.0)
+
+
+def missing_method(kind: PluginKind, thing: object) -> str:
+    """Return the fault of an object that an offer created; "": it has all its methods."""
+    if thing is None:
+        wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
+        return f"None; an object with {wanted} is required (does it lack a `return`?)"
+    for name in _METHODS[kind]:
+        if not hasattr(type(thing), name) and not hasattr(thing, name):
+            has = [one for one in dir(thing) if not one.startswith("_")]
+            near = get_close_matches(name, has, 1)
+            misspelt = f"; is its `{near[0]}` misspelt?" if near else ""
+            return f"a {type(thing).__name__}, which has no `{name}`{misspelt}"
+    return ""
+
+
+def fault_of_resources(
+    resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
+) -> str:
+    """Return why a host cannot have these resources, as a predicate; "" if it can."""
+    taken = {resource.name: other.name for other in before for resource in other.resources}
+    if not resources:
+        return "describes no resource; raise SkipPlugin in `create` where there is nothing to read"
+    for resource in resources:
+        fault = resource_fault(resource)
+        if fault:
+            return fault
+        if resource.name in taken:
+            return f"reads {resource.name!r}, as {taken[resource.name]!r} does already"
+        if resource.name not in offer.resources:
+            declared = repr((*offer.resources, resource.name))
+            return (
+                f"reads {resource.name!r}, which its offer does not declare: "
+                f"write ProbeOffer(..., resources={declared})"
+            )
+    if len(taken) + len(resources) > RESOURCE_SLOTS:
+        return f"exceeds the {RESOURCE_SLOTS} resources that a host may have"
+    return ""
+
+
+def close_quietly(probe: Probe) -> None:
+    """Close a probe that is not used; ignore a failure."""
+    try:
+        probe.close()
+    except FAULTS:
+        return

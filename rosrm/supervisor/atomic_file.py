@@ -1,0 +1,35 @@
+"""Replacement of a whole file, for a reader that must never see a part of the new content."""
+
+from __future__ import annotations
+
+import os
+
+from rosrm.runtime.private_files import open_private
+
+
+def replace(path: str, content: bytes, flags: int = 0) -> int:
+    """Replace a file by a new one, and return the open descriptor of the new one.
+
+    After a failure the old file is unchanged, and no part of the new content is left: it would
+    take the room that a full disk no longer has.
+
+    Args:
+        path: of the file; the new content is first written to a file beside it.
+        content: of the new file.
+        flags: further flags of its descriptor.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    new = f"{path}.new"
+    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
+    try:
+        view = memoryview(content)
+        while view:
+            view = view[os.write(file, view) :]
+        os.replace(new, path)
+    except OSError:
+        os.close(file)
+        os.unlink(new)
+        raise
+    return file
