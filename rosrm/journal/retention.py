@@ -69,6 +69,7 @@ class Retention:
         self._all = _Bound("1", keep_events, keep_bytes)
         self._refusals = _Bound(_IS_REFUSAL, keep_events // _SHARE, keep_bytes // _SHARE)
         self._pause = 0
+        self._is_first = True  # short runs would add up to any excess
         held = database.execute(
             f"SELECT {_IS_REFUSAL}, count(*), sum({_SIZE}) FROM record GROUP BY 1"  # noqa: S608 - fixed words
         )
@@ -87,8 +88,9 @@ class Retention:
             return
         try:
             for bound in (self._refusals, self._all):
-                if bound.is_exceeded:
+                if bound.is_exceeded or (self._is_first and not bound.is_kept):
                     self._delete(bound)
+            self._is_first = False
         except sqlite3.Error:
             self._pause = _TRY_AGAIN
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from rosrm.errors import describe_fault, place_in_rosrm
+from rosrm.errors import Refused, describe_fault, place_in_rosrm
 
 _log = logging.getLogger("rosrm.callbacks")
 
@@ -40,6 +40,8 @@ class CallbackGuard:
             place = place_in_rosrm(fault)
             reason = f"{describe_fault(fault)} ({place})"
             self._note(place, getattr(callback, "__qualname__", str(callback)), reason)
+            if isinstance(fault, Refused):  # its text is meant for peers
+                return describe_fault(fault)
             return f"{type(fault).__name__}; its log has the cause"
         except BaseException as interrupt:  # noqa: BLE001 - nothing may reach the executor
             self.interrupted = interrupt  # caused by a signal, which may arrive only once
