@@ -47,6 +47,8 @@ def make_private_directory(directory: str | os.PathLike[str]) -> int:
     mode = stat.S_IMODE(state.st_mode)
     if not mode & _OTHERS:
         return 0
+    if mode & stat.S_ISVTX:
+        raise _refusal(path, "all users share it, as /tmp; name a directory below it")
     os.chmod(path, 0o700)
     return mode
 
