@@ -13,6 +13,7 @@ import stat
 from typing import Final
 
 _OTHERS: Final = 0o077
+_SHARED: Final = frozenset({"/tmp", "/var/tmp", "/dev/shm"})  # noqa: S108 - never used
 _user_umask = -1
 
 
@@ -47,8 +48,8 @@ def make_private_directory(directory: str | os.PathLike[str]) -> int:
     mode = stat.S_IMODE(state.st_mode)
     if not mode & _OTHERS:
         return 0
-    if mode & stat.S_ISVTX:
-        raise _refusal(path, "all users share it, as /tmp; name a directory below it")
+    if path in _SHARED:
+        raise _refusal(path, "all users share it; name a directory below it")
     os.chmod(path, 0o700)
     return mode
 
