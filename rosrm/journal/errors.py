@@ -17,19 +17,19 @@ def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
     beginning = f"the journal {path} cannot be used ({text}); "
     cause = getattr(error, "strerror", None) or text
 
-    def blocked(advice: str, room: str = "") -> JournalBlocked:
+    def blocked(advice: str) -> JournalBlocked:
         return JournalBlocked(
-            beginning + advice.format(room=room),
-            f"the journal of the master cannot be used ({cause}); {advice.format(room='')}",
+            beginning + advice, f"the journal of the master cannot be used ({cause}); {advice}"
         )
 
     if path.is_dir():
         return JournalError(f"{beginning}it is a directory: move it away, or {_OTHER_STATE}")
     if "full" in text or "No space" in text or "quota" in text:
         room = room_for(path)
-        return blocked(
-            f"the disk is full{{room}}: make room; {_NOTHING_LOST}", room and f" ({room})"
-        )
+        where, _, free = room.rpartition(" has ")
+        fault = blocked(f"the disk is full{room and f' ({room})'}: make room; {_NOTHING_LOST}")
+        fault.public = fault.public.replace(f"{where} has {free}", free)
+        return fault
     if "I/O" in text:
         return blocked(
             f"writing to the disk fails: make room, check quotas and the disk itself; "

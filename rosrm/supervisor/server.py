@@ -172,20 +172,22 @@ class Server:
                 self._spawn(key)
             else:
                 failed = f"not started, for it could not be recorded: {self._record.trouble}"
-                self._happened(SpawnFailed(key, failed, transient=True))
+                self._spawn_failed(key, failed, transient=True)
 
     def _spawn(self, key: Key) -> None:
         birth = procfs.ticks_now()
         try:
             pid = self._spawn_process(key)
         except spawn.SpawnError as error:
-            # Everybody reads the reason: it names no path of this machine that no user wrote.
-            reason = str(error).replace(self._state, "STATE")
-            self._happened(SpawnFailed(key, reason, error.transient))
+            self._spawn_failed(key, str(error), error.transient)
             return
         self._trees.add_child(key, pid, birth)
         self._logs.watch(key, time.monotonic(), pid)
         self._happened(Spawned(key, pid))
+
+    def _spawn_failed(self, key: Key, reason: str, transient: bool) -> None:
+        """Report a failure. All clients may read the reason, so STATE stands for the directory."""
+        self._happened(SpawnFailed(key, reason.replace(self._state, "STATE"), transient))
 
     def _spawn_process(self, key: Key) -> int:
         launch = self._launches.get(key)
