@@ -26,9 +26,9 @@ def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
         return JournalError(f"{beginning}it is a directory: move it away, or {_OTHER_STATE}")
     if "full" in text or "No space" in text or "quota" in text:
         room = room_for(path)
-        where, _, free = room.rpartition(" has ")
         fault = blocked(f"the disk is full{room and f' ({room})'}: make room; {_NOTHING_LOST}")
-        fault.public = fault.public.replace(f"{where} has {free}", free)
+        if room:
+            fault.public = fault.public.replace(room, room.rpartition(" has ")[2])
         return fault
     if "I/O" in text:
         return blocked(
