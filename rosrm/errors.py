@@ -56,7 +56,16 @@ class JournalError(RosrmError):
 
 
 class JournalBlocked(JournalError):
-    """The journal cannot be written at the moment; nothing was changed, and a retry is safe."""
+    """The journal cannot be written at the moment; nothing was changed, and a retry is safe.
+
+    Args:
+        message: text for the user who started the master.
+        public: text for clients, without paths of the master's machine; "": the message.
+    """
+
+    def __init__(self, message: str, public: str = "") -> None:
+        super().__init__(message)
+        self.public = public or message
 
 
 class RecordError(RosrmError):

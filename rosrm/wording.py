@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from typing import Final
@@ -19,6 +20,18 @@ _STANDING: Final = {
     "finished": "has finished",
     "cancelled": "was cancelled",
 }
+
+
+#: Control characters of ASCII and ISO 8859-1 (C0, DEL, C1), except newline and tab.
+_CONTROLS: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+def printable(text: str) -> str:
+    """Return text for a terminal or log, with each control character but newline as its number.
+
+    Terminals execute such characters: they rename windows, hide lines, or answer as a keyboard.
+    """
+    return _CONTROLS.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
 
 def get_close_matches(
@@ -99,8 +112,8 @@ def sendable(text: str) -> str:
     return text.encode(errors="replace").decode()
 
 
-def printable(text: str, most: int = 4096) -> str:
-    """Return a text without control characters, which a terminal would execute, and not too long.
+def sanitized(text: str, most: int = 4096) -> str:
+    """Return a sender's text as one line of bounded length, without unprintable characters.
 
     Args:
         text: by any sender.

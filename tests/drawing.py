@@ -9,6 +9,7 @@ from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 
 from hypothesis import strategies as st
 
+from rosrm.model.durations import LONGEST
 from rosrm.model.values import ProcessSpec
 
 Drawn = st.SearchStrategy[Any]
@@ -50,7 +51,15 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "factor": st.floats(1.0, 100.0),
     "capacity": st.floats(1e-3, 1e18),
     "period": st.floats(1e-3, 10.0),
-}
+    "rate": st.floats(0.0, 1e6),
+    **{
+        name: st.floats(0.0, LONGEST)
+        for name in (
+            "delay", "max_delay", "window", "timeout", "interrupt_grace", "terminate_grace",
+            "after", "grace",
+        )
+    },
+}  # fmt: skip
 
 
 def drawn(kind: Any, **others: Drawn) -> Drawn:

@@ -11,6 +11,7 @@ import typer
 
 from rosrm.cli import early
 from rosrm.cli.options import CommonOptions
+from rosrm.cli.output.plain import echo
 from rosrm.cli.process import BEGUN
 from rosrm.client import connecting
 from rosrm.model.ros_settings import RosSettings
@@ -48,7 +49,7 @@ def master(ctx: typer.Context, domain: int | None) -> Iterator[Client]:
 
 def note(text: str) -> None:
     """Print a sentence about the progress of the command to standard error."""
-    typer.echo(f"rosrm: {text}", err=True)
+    echo(f"rosrm: {text}", err=True)
 
 
 def print_trouble(snapshot: Listing) -> None:

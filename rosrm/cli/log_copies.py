@@ -13,6 +13,7 @@ import typer
 
 from rosrm.cli.options import seconds_of
 from rosrm.cli.output.log_lines import LogStream, Piece, show
+from rosrm.cli.output.plain import echo
 from rosrm.client.logs import PERIOD, LogReader, LogSelection
 from rosrm.errors import RosrmError
 
@@ -98,4 +99,4 @@ class _Copy:
     def _fail(self, error: RosrmError) -> None:
         """Report that the log cannot be read any more."""
         self.reader.at_end, self.exit_code = True, error.exit_code
-        typer.echo(f"rosrm: {error}", err=True)
+        echo(f"rosrm: {error}", err=True)

@@ -10,6 +10,7 @@ from typing import Final
 import typer
 
 from rosrm.cli.options import seconds_of
+from rosrm.cli.output.plain import echo
 from rosrm.client.waiting import UNTIL_ASKED, WaitResult
 from rosrm.errors import NoMaster
 from rosrm.model.rows import ProcessRow
@@ -29,7 +30,7 @@ def interruptible(what_follows: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(f"rosrm: no longer waiting; {what_follows}", err=True)
+        echo(f"rosrm: no longer waiting; {what_follows}", err=True)
         raise
     except NoMaster as error:
         raise NoMaster(f"--timeout has passed: {error}") from None
@@ -39,24 +40,24 @@ def show_change(row: ProcessRow) -> None:
     """Print the state of an awaited process if it needs the user's attention."""
     if row.state in _NOTEWORTHY:
         why = f": {row.reason}" if row.reason else ""
-        typer.echo(f"{row.name} {standing(row.state)}{why}", err=True)
+        echo(f"{row.name} {standing(row.state)}{why}", err=True)
 
 
 def show_processes(result: WaitResult) -> None:
     """Print the result of a wait for processes; exit with 1 if they are not done."""
     counts = Counter(words(row.state) for row in result.processes)
     summary = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
-    typer.echo(summary or "all processes were removed")
+    echo(summary or "all processes were removed")
     states = {row.name: row.state for row in result.processes}
     ended = [name for name in result.failed if states[name] == "finished"]
     if ended:
-        typer.echo(
+        echo(
             f"rosrm: services that finished: {listed(ended)}; declare a program that is meant to "
             f"end as `kind: job`",
             err=True,
         )
     if result.pending and not result.timed_out:
-        typer.echo(
+        echo(
             f"rosrm: no longer waiting for {listed(result.pending)}: set aside until a host "
             f"registers or changes (`rosrm explain NAME` shows the requirements)",
             err=True,
@@ -64,7 +65,7 @@ def show_processes(result: WaitResult) -> None:
     elif result.pending:
         _say_time_is_up(result.pending)
     if result.missing:
-        typer.echo(
+        echo(
             f"rosrm: no longer listed, and not seen to be done: {listed(result.missing)} "
             f"(`rosrm events --process NAME` shows what happened)",
             err=True,
@@ -77,9 +78,9 @@ def show_end(result: WaitResult) -> None:
     if result.pending:
         _say_time_is_up(result.pending)
     elif result.done or result.event:
-        typer.echo(result.message, err=not result.done)
+        echo(result.message, err=not result.done)
     else:
-        typer.echo(f"rosrm: {result.message}", err=True)
+        echo(f"rosrm: {result.message}", err=True)
     _exit_unless_done(result)
 
 
@@ -89,4 +90,4 @@ def _exit_unless_done(result: WaitResult) -> None:
 
 
 def _say_time_is_up(awaited: Sequence[str]) -> None:
-    typer.echo(f"rosrm: --timeout has passed; still waiting for {listed(awaited)}", err=True)
+    echo(f"rosrm: --timeout has passed; still waiting for {listed(awaited)}", err=True)

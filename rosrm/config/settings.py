@@ -165,11 +165,13 @@ class JournalSettings:
     Attributes:
         sync: "normal" survives a SIGKILL of the master, "full" also a power failure.
         keep_events: number of the newest events that are not deleted.
+        keep_bytes: most bytes of the events; refusals get a tenth of both bounds at most.
         keep_ended: number of the newest terminal processes that are not garbage-collected.
     """
 
     sync: Literal["normal", "full"] = "normal"
     keep_events: PositiveCount = 100_000
+    keep_bytes: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 200_000_000
     keep_ended: PositiveCount = _CORE.keep_ended
 
 
@@ -269,10 +271,13 @@ class LogSettings:
     Attributes:
         max_bytes: size at which a log file is rotated.
         keep: number of rotated files beside the current one.
+        keep_bytes: most bytes of all logs on this host; beyond, logs of the processes that were
+            started longest ago are removed. Current files of running processes stay.
     """
 
     max_bytes: Annotated[int, Quantity("size", low=4096, whole=True)] = 10_000_000
-    keep: Count = 3
+    keep: Annotated[int, Quantity(high=1000, whole=True)] = 3
+    keep_bytes: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)

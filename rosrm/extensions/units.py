@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
+from rosrm.model.durations import LONGEST
 from rosrm.wording import get_close_matches
 
 _SIZES: Final = {
@@ -76,7 +77,7 @@ class Quantity:
     """Annotation of a number that may have a unit and must lie within a range.
 
     Attributes:
-        measures: key of `UNITS` with the allowed units.
+        measures: key of `UNITS` with the allowed units. A duration is at most ten years.
         low: lowest allowed value.
         high: highest allowed value.
         above: True: the value must be greater than `low`.
@@ -97,6 +98,8 @@ class Quantity:
         if not math.isfinite(value) or self._outside(value):
             hint = f" ({self.hint})" if self.hint else ""
             raise ValueError(f"{given!r} is not {self.range()}{hint}")
+        if self.measures == "duration" and value > LONGEST:
+            raise ValueError(f"{given!r} is longer than ten years")
         if self.whole and value != int(value):
             raise ValueError(f"{given!r} is not a whole number")
         return int(value) if self.whole else value

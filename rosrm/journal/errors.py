@@ -15,26 +15,34 @@ def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
     """Return the error for the user; a `JournalBlocked` if the failure may be temporary."""
     text = str(error)
     beginning = f"the journal {path} cannot be used ({text}); "
+    cause = getattr(error, "strerror", None) or text
+
+    def blocked(advice: str) -> JournalBlocked:
+        return JournalBlocked(
+            beginning + advice, f"the journal of the master cannot be used ({cause}); {advice}"
+        )
+
     if path.is_dir():
         return JournalError(f"{beginning}it is a directory: move it away, or {_OTHER_STATE}")
     if "full" in text or "No space" in text or "quota" in text:
-        where = room_for(path)
-        where = f" ({where})" if where else ""
-        return JournalBlocked(f"{beginning}the disk is full{where}: make room; {_NOTHING_LOST}")
+        room = room_for(path)
+        fault = blocked(f"the disk is full{room and f' ({room})'}: make room; {_NOTHING_LOST}")
+        if room:
+            fault.public = fault.public.replace(room, room.rpartition(" has ")[2])
+        return fault
     if "I/O" in text:
-        return JournalBlocked(
-            f"{beginning}writing to the disk fails: make room, check quotas and the "
-            f"disk itself; {_NOTHING_LOST}"
+        return blocked(
+            f"writing to the disk fails: make room, check quotas and the disk itself; "
+            f"{_NOTHING_LOST}"
         )
     if "unable to open" in text or "readonly" in text or isinstance(error, OSError):
-        return JournalBlocked(
-            f"{beginning}check owner and permissions of the file, its folder and the files beside "
-            f"it (-wal, -shm), or {_OTHER_STATE}"
+        return blocked(
+            f"check owner and permissions of the file, its folder and the files beside it (-wal, "
+            f"-shm), or {_OTHER_STATE}"
         )
     if "locked" in text:
-        return JournalBlocked(
-            f"{beginning}another program has it open: does a second master use this state "
-            "directory?"
+        return blocked(
+            "another program has it open: does a second master use this state directory?"
         )
     return JournalError(beginning + DAMAGED)
 

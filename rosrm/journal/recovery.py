@@ -91,7 +91,7 @@ def _recover(path: Path, wall: Callable[[], float]) -> str:
             with contextlib.suppress(FileNotFoundError):
                 Path(f"{path}{suffix}").replace(f"{aside}{suffix}")
         new.replace(path)
-    return _summary(found, aside)
+    return _summary(found, str(aside))
 
 
 def _not_recovered(path: Path, error: BaseException) -> JournalError:
@@ -191,7 +191,7 @@ def _write(path: Path, found: _Found, aside: Path) -> None:
     journal = SqliteJournal(path, keep_events=_MOST_EVENTS)  # the master's own bound holds later
     intents = [Intent(table, key, value) for (table, key), value in found.intents.items()]
     journal.write(
-        [Record(EventKind.JOURNAL_RECOVERED, message=_summary(found, aside))], intents, 0.0
+        [Record(EventKind.JOURNAL_RECOVERED, message=_summary(found, aside.name))], intents, 0.0
     )
     journal.close()
 
@@ -230,7 +230,7 @@ def _largest_reported(found: _Found) -> int:
     return largest
 
 
-def _summary(found: _Found, aside: Path) -> str:
+def _summary(found: _Found, aside: str) -> str:
     processes = sum(table == "process" for table, _ in found.intents)
     hosts = sum(table == "host" for table, _ in found.intents)
     part = "with all of its rows:" if found.whole else "with its readable rows:"

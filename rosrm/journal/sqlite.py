@@ -7,7 +7,6 @@ disk, so the group also survives a power failure.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sqlite3
 import time
@@ -16,8 +15,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.journal.errors import fault_of, no_journal, other_version
+from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record, StoredRecord
+from rosrm.runtime.private_files import make_private_directory, make_private_file
 
 #: Version of the tables; a file with another version is refused.
 SCHEMA: Final = 1
@@ -35,8 +36,8 @@ CREATE TABLE IF NOT EXISTS intent (
 
 #: Milliseconds for which a write waits while another program has locked the file.
 _PATIENCE_MS: Final = 200
-#: Number of new records after which old ones are deleted.
-_PRUNE_EVERY: Final = 1000
+#: Bytes to which the write-ahead log is cut after a checkpoint.
+_LONGEST_LOG: Final = 16 << 20
 
 
 class SqliteJournal:
@@ -46,6 +47,7 @@ class SqliteJournal:
         path: path of the file; a missing file or folder is created.
         sync: "normal" or "full".
         keep_events: number of the newest records that are not deleted.
+        keep_bytes: most bytes of the records; the file is larger by its intents and indexes.
         wall: returns the unix time in seconds.
 
     Raises:
@@ -59,13 +61,14 @@ class SqliteJournal:
         *,
         sync: str = "normal",
         keep_events: int = 100_000,
+        keep_bytes: int = 200_000_000,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._path = path
-        self._keep = keep_events
         self._wall = wall
         try:
-            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            make_private_directory(path.parent)
+            self._make_private()
         except OSError as error:
             raise fault_of(path, error) from error
         self._database = self._guarded(lambda: self._open(sync))
@@ -73,14 +76,17 @@ class SqliteJournal:
             lambda: self._database.execute("SELECT max(sequence) FROM record").fetchone()
         )
         self._sequence = int(newest[0] or 0)
-        # The first write prunes, because short runs would add up to any number of records.
-        self._since_pruned = _PRUNE_EVERY
+        self._retention: Retention = self._guarded(
+            lambda: Retention(self._database, keep_events, keep_bytes)
+        )
 
     def _open(self, sync: str) -> sqlite3.Connection:
         if self._path.is_file() and not self._path.stat().st_size:
             raise sqlite3.DatabaseError("it is empty: not even tables are in it")
         database = sqlite3.connect(self._path, isolation_level=None, timeout=2.0)
         database.execute("PRAGMA journal_mode=WAL")
+        self._make_private()  # SQLite creates its files by the umask
+        database.execute(f"PRAGMA journal_size_limit={_LONGEST_LOG}")
         database.execute(f"PRAGMA synchronous={'FULL' if sync == 'full' else 'NORMAL'}")
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version not in (0, SCHEMA):
@@ -93,6 +99,11 @@ class SqliteJournal:
             self._make(database)
         database.execute(f"PRAGMA busy_timeout={_PATIENCE_MS}")
         return database
+
+    def _make_private(self) -> None:
+        """Keep the intents, which hold environments, from other users."""
+        for suffix in ("", "-wal", "-shm"):
+            make_private_file(f"{self._path}{suffix}")
 
     def _make(self, database: sqlite3.Connection) -> None:
         if database.execute("SELECT 1 FROM sqlite_master").fetchone() is not None:
@@ -123,38 +134,21 @@ class SqliteJournal:
         first = self._sequence + 1
         stored = [StoredRecord(first + i, wall, now, record) for i, record in enumerate(records)]
         newest = {(intent.table, intent.key): intent.value for intent in intents}
-        self._guarded(lambda: self._write(stored, newest))
+        rows = [_row(one) for one in stored]
+        self._guarded(lambda: self._write(rows, newest))
         self._sequence += len(stored)
-        self._since_pruned += len(stored)
-        if self._since_pruned >= _PRUNE_EVERY:
-            self._prune()
+        self._retention.add(rows)
         return stored
-
-    def _prune(self) -> None:
-        """Delete old records; ignore a failure, because the next call deletes them."""
-        self._since_pruned = 0
-        oldest = self._sequence - self._keep
-        with contextlib.suppress(sqlite3.Error):
-            self._database.execute("DELETE FROM record WHERE sequence <= ?", (oldest,))
 
     def _write(
         self,
-        stored: Sequence[StoredRecord],
+        rows: Sequence[Row],
         intents: Mapping[tuple[str, str], Mapping[str, Any] | None],
     ) -> None:
         database = self._database
         database.execute("BEGIN IMMEDIATE")
         try:
-            database.executemany(
-                "INSERT INTO record VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                [
-                    (
-                        s.sequence, s.wall_time, s.elapsed, str(s.record.kind), s.record.process,
-                        s.record.host, s.record.message, json.dumps(s.record.facts, default=_plain),
-                    )
-                    for s in stored
-                ],
-            )  # fmt: skip
+            database.executemany("INSERT INTO record VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
             database.executemany(
                 "INSERT OR REPLACE INTO intent VALUES (?, ?, ?)",
                 [
@@ -215,6 +209,14 @@ class SqliteJournal:
     def close(self) -> None:
         """Flush and close the files."""
         self._guarded(self._database.close)
+
+
+def _row(stored: StoredRecord) -> Row:
+    record = stored.record
+    return (
+        stored.sequence, stored.wall_time, stored.elapsed, str(record.kind), record.process,
+        record.host, record.message, json.dumps(record.facts, default=_plain),
+    )  # fmt: skip
 
 
 def _facts(text: str) -> Mapping[str, Any]:

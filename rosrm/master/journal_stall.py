@@ -31,7 +31,7 @@ class JournalStall:
 
     Attributes:
         commands: the commands that are not durable yet, in order.
-        reason: text of the failure, for the user.
+        reason: text of the failure, for clients.
         since: monotonic time of the first failure, seconds.
         core_now: time of the core's stopped clock.
         tried: monotonic time of the last attempt to write, seconds.

@@ -21,6 +21,7 @@ from rosrm.errors import ConfigError
 from rosrm.recording.encoding import decisions, encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
 from rosrm.recording.reader import Header
+from rosrm.runtime.private_files import make_safe_directory
 
 _log = logging.getLogger("rosrm.master")
 
@@ -62,7 +63,7 @@ class Recorder:
         self._why = ""
         self._put = self._done = 0  # bytes; the first is the loop's, the second the thread's
         try:
-            directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            make_safe_directory(directory)
             _make_room(directory, header.master, keep - 1)
             self.path, self._file = _new_file(directory, f"{header.master}-{header.epoch:04d}")
             self._size = self._file.write(opening())

@@ -133,6 +133,7 @@ class MasterRuntime:
             self._journal = SqliteJournal(
                 config.state / "journal.sqlite",
                 sync=config.journal.sync, keep_events=config.journal.keep_events,
+                keep_bytes=config.journal.keep_bytes,
             )  # fmt: skip
             opened.callback(self._journal.close)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
@@ -327,7 +328,7 @@ class MasterRuntime:
         try:
             stored = self._write(commands)
         except JournalBlocked as fault:
-            self._held = JournalStall(commands, str(fault), now, self._core_now(now), now)
+            self._held = JournalStall(commands, fault.public, now, self._core_now(now), now)
             _log.error(
                 "%s. Running processes continue; the master accepts no new work until then", fault
             )
@@ -348,7 +349,7 @@ class MasterRuntime:
         try:
             stored = self._write([back, *held.commands])
         except JournalBlocked as fault:
-            held.reason = str(fault)
+            held.reason = fault.public
             return False
         self._held, self._behind = None, now - held.core_now
         self._endpoint.events[:0] = held.waiting()

@@ -8,5 +8,6 @@ records.py              records and intents, and the protocol of a journal
 rows.py                 rows of listings
 ros_settings.py         ROS settings of a part: domain, discovery, transports
 codec.py                conversion of values to JSON and back
+durations.py            bound of all times
 description_checks.py   checks of the description of a host
 """

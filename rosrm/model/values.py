@@ -18,8 +18,6 @@ RESOURCE_SLOTS: Final = 16
 ABSURD_USAGE: Final = 64.0
 #: More than this of a resource (base units), used by one process, is an error, not a measurement.
 MOST_USED: Final[Mapping[str, float]] = MappingProxyType({"cpu": 65_536.0, "memory": 2.0**53})
-#: Seconds: no run, delay or deadline is longer (10 years).
-LONGEST_TIME: Final = 3.2e8
 #: Instance numbers and journal records grow one by one, and so never get as large as this.
 LARGEST_NUMBER: Final = 2**53
 

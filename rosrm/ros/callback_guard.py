@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from rosrm.errors import describe_fault, place_in_rosrm
+from rosrm.errors import Refused, describe_fault, place_in_rosrm
 
 _log = logging.getLogger("rosrm.callbacks")
 
@@ -33,14 +33,16 @@ class CallbackGuard:
         self._places: dict[str, tuple[float, int]] = {}
 
     def call(self, callback: Callable[..., Any], *arguments: Any) -> str:
-        """Call a callback; return "" or the exception with file and line."""
+        """Call a callback; return "" or the exception for the peer, without paths of this host."""
         try:
             callback(*arguments)
         except (Exception, SystemExit, GeneratorExit) as fault:  # noqa: BLE001 - the guard
             place = place_in_rosrm(fault)
             reason = f"{describe_fault(fault)} ({place})"
             self._note(place, getattr(callback, "__qualname__", str(callback)), reason)
-            return reason
+            if isinstance(fault, Refused):  # its text is meant for peers
+                return describe_fault(fault)
+            return f"{type(fault).__name__}; its log has the cause"
         except BaseException as interrupt:  # noqa: BLE001 - nothing may reach the executor
             self.interrupted = interrupt  # caused by a signal, which may arrive only once
         return ""

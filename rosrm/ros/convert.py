@@ -17,20 +17,23 @@ from rosrm.model.description_checks import (
     is_resource_name,
     name_fault,
 )
+from rosrm.model.durations import LONGEST
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
-from rosrm.wording import printable, sendable
+from rosrm.wording import sanitized, sendable
 from rosrm_msgs import msg
 
 #: Greatest amount of a resource that a process may need, in base units.
 _MOST_NEEDED: Final = 1e18
 #: Greatest factor by which the delay of restarts may grow.
 _MOST_GROWTH: Final = 1e6
+#: Greatest rate of a topic, in Hz.
+_MOST_RATE: Final = 1e6
 #: Greatest values in the status of an instance, in base units.
 _MOST_REPORTED: Final = {
     "peak_memory": values.MOST_USED["memory"],
-    "cpu_time": values.LONGEST_TIME * values.MOST_USED["cpu"],
-    "run_time": values.LONGEST_TIME,
+    "cpu_time": LONGEST * values.MOST_USED["cpu"],
+    "run_time": LONGEST,
 }
 _STATES: Final = frozenset(state.value for state in values.InstanceState)
 
@@ -225,12 +228,13 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "stop.terminate_grace": message.stop.terminate_grace,
         "host_loss.delay": message.host_loss.delay,
         "isolation.after": message.isolation.after,
-        "health.rate": message.health.rate,
         "health.timeout": message.health.timeout,
     }
     for name, seconds in times.items():
-        if not 0.0 <= seconds <= values.LONGEST_TIME:
-            return f"{name} is {seconds}; allowed: 0 to {values.LONGEST_TIME:g}"
+        if not 0.0 <= seconds <= LONGEST:
+            return f"{name} is {seconds}; allowed: 0 to {LONGEST:g}"
+    if not 0.0 <= message.health.rate <= _MOST_RATE:
+        return f"health.rate is {message.health.rate}; allowed: 0 to {_MOST_RATE:g}"
     return ""
 
 
@@ -254,11 +258,8 @@ def _restart_fault(message: msg.RestartPolicy) -> str:
     if not 1.0 <= message.factor <= _MOST_GROWTH:
         return f"the factor of its restarts is {message.factor}; allowed: 1 to {_MOST_GROWTH:g}"
     for name in ("delay", "max_delay", "window"):
-        if not 0.0 <= getattr(message, name) <= values.LONGEST_TIME:
-            return (
-                f"restart.{name} is {getattr(message, name)} s; allowed: 0 to "
-                f"{values.LONGEST_TIME:g}"
-            )
+        if not 0.0 <= getattr(message, name) <= LONGEST:
+            return f"restart.{name} is {getattr(message, name)} s; allowed: 0 to {LONGEST:g}"
     return ""
 
 
@@ -286,7 +287,7 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
 def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
     """Return the inverse of `assignment_to_msg`; raises `Refused`."""
     for name in ("fence_after", "fence_grace"):  # a lease and a delay, each at most this long
-        if not 0.0 <= getattr(message, name) <= 2.0 * values.LONGEST_TIME:
+        if not 0.0 <= getattr(message, name) <= 2.0 * LONGEST:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
     fence = None
     if message.fence_after:
@@ -316,7 +317,7 @@ def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
     if [resource.slot for resource in resources] != list(range(len(resources))):
         raise Refused(f"host {message.name!r:.250}: its resources do not fill the slots 0, 1, 2, …")
     described = _description(message, resources)
-    absent = {probe: printable(reason) for probe, reason in described.absent.items()}
+    absent = {probe: sanitized(reason) for probe, reason in described.absent.items()}
     description = replace(described, absent=absent)
     fault = description_fault(description)
     if fault:
@@ -349,7 +350,7 @@ def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
             raise Refused(f"{process}: {name} is {getattr(message, name)}; at most {most:g}")
     lines = message.message.split("\n")
     return _from_msg(
-        values.InstanceStatus, message, message="\n".join(printable(line) for line in lines)
+        values.InstanceStatus, message, message="\n".join(sanitized(line) for line in lines)
     )
 
 

@@ -8,6 +8,7 @@ from typing import Final
 
 from rosrm.errors import Refused
 from rosrm.model.description_checks import name_fault
+from rosrm.model.durations import LONGEST
 from rosrm.model.orders import (
     DropReplica,
     FenceInstance,
@@ -20,7 +21,7 @@ from rosrm.model.orders import (
     StartInstance,
     StopInstance,
 )
-from rosrm.model.values import LONGEST_TIME, InstanceId
+from rosrm.model.values import InstanceId
 from rosrm.ros import convert
 from rosrm_msgs import srv
 
@@ -88,8 +89,8 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
 def _fault(request: srv.ControlHost.Request) -> str:
     """Return an impossible name or time in an order; "" for none. Unused fields are empty."""
     for seconds in (request.timeout, request.keep_every):
-        if not 0.0 <= seconds <= LONGEST_TIME:
-            return f"a time of {seconds} s; allowed: 0 to {LONGEST_TIME:g}"
+        if not 0.0 <= seconds <= LONGEST:
+            return f"a time of {seconds} s; allowed: 0 to {LONGEST:g}"
     process = request.instance.process
     faults = [name_fault(host, "host") for host in request.keep_on]
     return next(filter(None, faults), "") or (process and name_fault(process, "process"))

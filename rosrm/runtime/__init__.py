@@ -1,7 +1,8 @@
-"""Code shared by the entry points of master and slave.
+"""Code shared by the entry points of master, slave and supervisor.
 
-bootstrap.py    settings and plugins, passed from the command to the runtime
-state_lock.py   one runtime for one state directory
-disk_space.py   free space on the disk of a directory
-ros_wheels.py   the environment of ROS 2 from wheels
+bootstrap.py       settings and plugins, passed from the command to the runtime
+state_lock.py      one runtime for one state directory
+private_files.py   owner, mode and links of directories and files
+disk_space.py      free space on the disk of a directory
+ros_wheels.py      the environment of ROS 2 from wheels
 """

@@ -18,6 +18,8 @@ from typing import Final
 
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress, installed_plugins
+from rosrm.runtime import private_files
+from rosrm.wording import printable
 
 _OPTION: Final = "--settings-fd"
 
@@ -86,6 +88,18 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], None]) -> Non
             signal.signal(number, handler)
 
 
+class LogFormatter(logging.Formatter):
+    """Format of log lines without control characters, which messages may have from outside."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
+        """Return the line; further lines are indented, so that no message looks like two."""
+        return super().formatMessage(record).replace("\n", "\n    ")
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line and its traceback, if any."""
+        return printable(super().format(record))
+
+
 def run(role: str, serve: Callable[[Handover], int]) -> int:
     """Read the input that the command passed, and serve; return the exit code.
 
@@ -93,14 +107,14 @@ def run(role: str, serve: Callable[[Handover], int]) -> int:
         role: "master" or "slave".
         serve: runs until a stop signal; the message of a `RosrmError` that it raises is printed.
     """
+    private_files.set_private_umask()
     # The starting process blocked SIGINT (see `interrupts_held`); from now on it ends this one.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    logging.basicConfig(
-        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
-        datefmt="%H:%M:%S",
-    )  # fmt: skip
+    output = logging.StreamHandler(sys.stderr)
+    output.setFormatter(LogFormatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    logging.basicConfig(level=logging.INFO, handlers=[output])
     try:
         return serve(take_over(sys.argv[1:]))
     except RosrmError as error:
-        sys.stderr.write(f"rosrm {role}: {error}\n")
+        sys.stderr.write(printable(f"rosrm {role}: {error}\n"))
         return error.exit_code

@@ -45,16 +45,19 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
     path = log_path(state_directory, instance)
     numbers = tuple(_logged(state_directory, query.process))
     for _ in range(_TRIES):
-        before = log_index.base(str(path))
         try:
+            before = log_index.base(str(path))
             part = _read(path, _segments(path), query, numbers, ended=ended)
+            after = log_index.base(str(path))
         except FileNotFoundError:
             if not path.exists():
                 break
             continue  # rotated during the read
-        if log_index.base(str(path)) == before:
+        except OSError as error:
+            raise Refused(f"the log of {instance} cannot be read: {error.strerror}") from None
+        if after == before:
             return part
-    raise Refused(f"this host has no log of {instance} (any more): {path}", "unknown")
+    raise Refused(f"this host has no log of {instance} (any more)", "unknown")
 
 
 def newest_instance(state_directory: Path, process: str) -> InstanceId:

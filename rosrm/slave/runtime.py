@@ -42,7 +42,7 @@ from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.replication import ReplicationEndpoint
-from rosrm.ros.slave.services import Duties, LogQuery, SlaveServices
+from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
@@ -465,7 +465,13 @@ class SlaveRuntime:
             "pids": {one: pid for one, pid in live.items() if pid},
         }  # fmt: skip
         arguments = dict(order.arguments)
-        self._executors.execute(order.executor, arguments, order.timeout, here=here, done=done)
+
+        def answer(outcome: ExecutorOutcome) -> None:
+            # Clients read the message; STATE stands for the state directory in it.
+            message = outcome.message.replace(str(self._config.state), "STATE")
+            done(outcome._replace(message=message))
+
+        self._executors.execute(order.executor, arguments, order.timeout, here=here, done=answer)
 
 
 def _random_number() -> int:

@@ -70,7 +70,7 @@ class SupervisorLink:
         ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.state = state
-        self._limits = LogLimits(logs.max_bytes, logs.keep)
+        self._limits = LogLimits(logs.max_bytes, logs.keep, keep_bytes=logs.keep_bytes)
         self._post, self._take, self._follow, self._ended = post, take, follow, ended
         self._is_shutting_down = False
         self._is_closed = False

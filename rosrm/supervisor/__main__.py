@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("--log-keep", type=int, default=2, help="older files for each instance")
     parser.add_argument("--log-instances", type=int, default=5, help="logs kept of one process")
     parser.add_argument("--log-processes", type=int, default=500, help="processes with logs kept")
+    parser.add_argument("--log-keep-bytes", type=int, default=2 * 10**9, help="bytes of all logs")
     parser.add_argument("--foreground", action="store_true", help="stay a child of the caller")
     options = parser.parse_args()
     state = os.path.abspath(options.state)
@@ -37,7 +38,8 @@ def main() -> None:
         _detach()
     _become_subreaper()
     limits = (
-        options.log_max_bytes, options.log_keep, options.log_instances, options.log_processes
+        options.log_max_bytes, options.log_keep, options.log_instances, options.log_processes,
+        options.log_keep_bytes,
     )  # fmt: skip
     bare = os.path.join(os.path.dirname(os.path.abspath(__file__)), "bare_interpreter.py")
     command = [sys.executable, "-I", "-S", bare, state, *(str(limit) for limit in limits)]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 
+from rosrm.runtime.private_files import open_private
+
 
 def replace(path: str, content: bytes, flags: int = 0) -> int:
     """Replace a file by a new one, and return the open descriptor of the new one.
@@ -20,8 +22,7 @@ def replace(path: str, content: bytes, flags: int = 0) -> int:
         OSError: the file cannot be written.
     """
     new = f"{path}.new"
-    create = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-    file = os.open(new, create | flags, 0o600)
+    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
     try:
         view = memoryview(content)
         while view:

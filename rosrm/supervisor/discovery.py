@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import SupervisorError
+from rosrm.runtime import private_files
 from rosrm.supervisor import endpoint
 from rosrm.supervisor.logs import LogLimits
 
@@ -47,7 +48,9 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
 def _start(state: Path, log: LogLimits, deadline: float) -> str:
     """Start a supervisor and wait for its first line; return "" if ready, else the error."""
     main = Path(__file__).with_name("__main__.py")
-    names = ("--log-max-bytes", "--log-keep", "--log-instances", "--log-processes")
+    names = (
+        "--log-max-bytes", "--log-keep", "--log-instances", "--log-processes", "--log-keep-bytes"
+    )  # fmt: skip
     limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
     command = [sys.executable, "-I", "-S", str(main), "--state", str(state), *limits]
     process = subprocess.Popen(
@@ -56,6 +59,7 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
+        umask=private_files.user_umask(),  # its processes inherit it
     )
     assert process.stdout is not None
     with process.stdout as output:

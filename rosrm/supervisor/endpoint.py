@@ -8,10 +8,9 @@ import socket
 import struct
 from typing import Final
 
-from rosrm.supervisor import paths
+from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.supervisor import own_log, paths
 
-#: Bytes of the supervisor's own log beyond which the next start empties it.
-MOST_OWN_LOG: Final = 1 << 20
 #: First words of the error for a state directory that is served already.
 ANOTHER: Final = "another supervisor"
 #: Least seconds for a connection; a limit of 0 would mean none.
@@ -25,14 +24,14 @@ class EndpointError(Exception):
 def listen(state: str) -> socket.socket:
     """Lock the state directory and return the listening socket. Raises EndpointError."""
     try:
-        os.makedirs(state, mode=0o700, exist_ok=True)
-        os.chmod(state, 0o700)
+        make_private_directory(state)
         for folder in (paths.log_folder(state), paths.work_directory(state)):
-            os.makedirs(folder, mode=0o700, exist_ok=True)
+            os.makedirs(folder, mode=0o700, exist_ok=True)  # the owner may link them elsewhere
         _lock(state)
         return _bind(state)
     except OSError as error:
-        raise EndpointError(f"the state directory {state} cannot be used: {error}") from None
+        reason = error.strerror or error
+        raise EndpointError(f"the state directory {state} cannot be used: {reason}") from None
 
 
 def connect(state: str, timeout: float) -> socket.socket:
@@ -77,8 +76,8 @@ def let_go_of_terminal(state: str) -> None:
     os.write(1, b"ready\n")
     path = os.path.join(state, paths.OWN_LOG)
     null = os.open(os.devnull, os.O_RDWR)
-    log = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-    if os.fstat(log).st_size > MOST_OWN_LOG:
+    log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    if os.fstat(log).st_size > own_log.MOST_BYTES:
         os.ftruncate(log, 0)
     for source, target in ((null, 0), (null, 1), (log, 2)):
         os.dup2(source, target)
@@ -88,7 +87,7 @@ def let_go_of_terminal(state: str) -> None:
 
 def _lock(state: str) -> None:
     """Hold the lock until the process ends; the kernel releases it, even after a SIGKILL."""
-    file = os.open(os.path.join(state, paths.LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    file = open_private(os.path.join(state, paths.LOCK), os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

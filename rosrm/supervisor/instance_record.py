@@ -19,9 +19,21 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
-from rosrm.core.supervisor.instance import Instance
+from rosrm.core.supervisor.instance import (
+    BACKOFF,
+    ENDED,
+    RUNNING,
+    STARTING,
+    STEPS,
+    STOPPING,
+    THEN_END,
+    THEN_POLICY,
+    THEN_RESTART,
+    Instance,
+)
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
+from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import atomic_file, json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
 
@@ -29,6 +41,8 @@ VERSION: Final = 1
 #: The file is compacted beyond this size, and beyond this multiple of its size after the last time.
 COMPACT_BYTES: Final = 1 << 20
 COMPACT_FACTOR: Final = 4
+#: Most faults of the record that are reported one by one.
+MOST_NOTES: Final = 20
 
 
 class InstanceRecordError(Exception):
@@ -75,6 +89,9 @@ def read(state: str) -> Recorded:
             _take(recorded, json_lines.parse(line))
         except (json_lines.ProtocolError, *messages.UNREADABLE) as error:
             recorded.notes.append(f"{path}:{number}: left out, it cannot be read: {error}")
+    if len(recorded.notes) > MOST_NOTES:
+        more = len(recorded.notes) - MOST_NOTES
+        recorded.notes[MOST_NOTES:] = [f"{path}: {more} more lines were left out"]
     return recorded
 
 
@@ -88,10 +105,12 @@ def _take(recorded: Recorded, fields: Mapping[str, Any]) -> None:
     elif kind == "spawning":
         recorded.spawning.update(messages.read_key(key) for key in fields["instances"])
     elif kind == "environment":
-        recorded.environments[fields["id"]] = dict(fields["variables"])
+        identity = messages.read_text(fields["id"])
+        recorded.environments[identity] = messages.read_texts(fields["variables"])
     elif kind == "dead":
-        recorded.dead[fields["process"]] = int(fields["number"])
         key = messages.read_key(fields["key"])
+        process, number = messages.read_key((fields["process"], fields["number"]))
+        recorded.dead[process] = number
         if recorded.instances.pop(key, None) is not None:
             recorded.launches.pop(key, None)
     elif kind == "header":
@@ -108,20 +127,75 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
         messages.read_restart(fields["restart"]),
         messages.read_stop(fields["stop"]),
     )
-    for name in _PLAIN_FIELDS:
+    for name, reader in _FIELD_READERS.items():
         if name in fields or name not in _NEW_FIELDS:
-            setattr(instance, name, fields[name])
+            setattr(instance, name, reader(fields[name]))
     instance.fence = messages.read_fence(fields.get("fence"))
+    birth = messages.read_whole(fields["birth"], 0)
+    _check(instance)
     recorded.instances[instance.key] = instance
-    recorded.births[instance.key] = fields["birth"]
+    recorded.births[instance.key] = birth
     recorded.spawning.discard(instance.key)
     if instance.ended:
         recorded.launches.pop(instance.key, None)
 
 
-_PLAIN_FIELDS: Final = tuple(
-    name for name in Instance.__slots__ if name not in ("key", "restart", "stop", "fence")
-)
+def _check(instance: Instance) -> None:
+    """Set the deadline that the phase implies; raises `ValueError` for an impossible state."""
+    if instance.phase == RUNNING and not instance.pid:
+        raise ValueError("it runs without a pid")
+    if instance.phase not in (STOPPING, BACKOFF):
+        instance.deadline = None  # a deadline that no transition clears would be due for ever
+    elif instance.deadline is None:
+        instance.deadline = 0.0  # due at once; otherwise the stop or back-off would never end
+
+
+def _one_of(*allowed: str) -> Callable[[Any], str]:
+    def read(value: Any) -> str:
+        if value not in allowed:
+            raise ValueError(f"{value!r} is not one of {', '.join(map(repr, allowed))}")
+        return str(value)
+
+    return read
+
+
+def _optional_time(value: Any) -> float | None:
+    return None if value is None else messages.read_time(value)
+
+
+def _times(value: Any) -> list[float]:
+    return [messages.read_time(one) for one in value]
+
+
+def _int32(value: Any) -> int:
+    return messages.read_whole(value, -(2**31), 2**31 - 1)
+
+
+#: Reader of each recorded field; the rules are read beside these.
+_FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
+    "phase": _one_of(STARTING, RUNNING, STOPPING, BACKOFF, *sorted(ENDED)),
+    "then": _one_of("", THEN_END, THEN_RESTART, THEN_POLICY),
+    "pid": lambda value: messages.read_whole(value, 0, 2**31 - 1),
+    "exit_code": _int32,
+    "exit_signal": _int32,
+    "restarts": lambda value: messages.read_whole(value, 0, 2**31 - 1),
+    "recent": _times,
+    "started": messages.read_time,
+    "deadline": _optional_time,
+    "step": lambda value: messages.read_whole(value, -1, len(STEPS) - 1),
+    "kills": _int32,
+    "stop_began": messages.read_time,
+    "trail": messages.read_text,
+    "fault": messages.read_text,
+    "heard": messages.read_time,
+    "fenced": messages.read_text,
+    "kill_by": _optional_time,
+    "withdrawn": bool,
+    "peak_memory": messages.read_amount,
+    "cpu_time": messages.read_amount,
+    "run_time": messages.read_amount,
+    "message": messages.read_text,
+}
 #: Fields that may be missing in older records.
 _NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by", "withdrawn"})
 
@@ -229,8 +303,7 @@ class InstanceRecord:
     def _open_old(self) -> None:
         """Keep using the existing record, behind a tail that may be torn."""
         if self._file < 0:
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
-            self._file = os.open(self._path, flags, 0o600)
+            self._file = open_private(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
             self._waiting.insert(0, b"\n")
 
     def _add(self, fields: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 
 from rosrm.core.supervisor.events import ContactReported
+from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import own_log, paths, procfs
 
 
@@ -31,8 +32,7 @@ class LastContact:
         self._newest = newest
         try:
             if self._file < 0:
-                flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
-                self._file = os.open(self._path, flags, 0o600)
+                self._file = open_private(self._path, os.O_WRONLY | os.O_CREAT)
             line = f"{self._boot} {newest.at:020.6f} {newest.alive:020.6f}\n"
             os.pwrite(self._file, line.encode(), 0)
             self._trouble = ""

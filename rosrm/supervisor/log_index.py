@@ -17,6 +17,7 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import atomic_file
 
 if TYPE_CHECKING:
@@ -40,8 +41,7 @@ def path_of(log: str) -> str:
 
 def add(log: str, mark: Mark) -> None:
     """Append a record; a start replaces the one before it if nothing was written in between."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
-    index = os.open(path_of(log), flags, 0o600)
+    index = open_private(path_of(log), os.O_RDWR | os.O_CREAT)
     try:
         end = os.fstat(index).st_size // _RECORD.size * _RECORD.size
         if mark.pid and end:

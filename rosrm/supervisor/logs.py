@@ -9,12 +9,14 @@ record.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Collection, Container, Iterable
 from typing import Final, NamedTuple
 
 from rosrm.core.supervisor.rules import Key
+from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import log_index, own_log, paths
 from rosrm.supervisor.log_index import Mark
 
@@ -23,6 +25,10 @@ BUSY: Final = 0.2
 QUIET: Final = 1.0
 #: Excess of processes at which the logs of the oldest ones are removed.
 PROCESSES_AT_ONCE: Final = 50
+#: Part of the bound on all logs that may be written until it is applied.
+EXCESS_PART: Final = 32
+#: Most older files of one instance: a rotation renames each.
+MOST_KEPT: Final = 1000
 #: Suffixes of files that may lie beside a log and are removed with it.
 FILES_BESIDE: Final = (".parameters.yaml",)
 
@@ -35,12 +41,24 @@ class LogLimits(NamedTuple):
         keep: older files beside the current one, for each instance.
         instances: instances of one process whose logs are kept.
         processes: processes whose logs are kept.
+        keep_bytes: of all logs; current files of running instances may exceed it.
     """
 
     max_bytes: int = 10 << 20
     keep: int = 2
     instances: int = 5
     processes: int = 500
+    keep_bytes: int = 2_000_000_000
+
+    @classmethod
+    def bounded(
+        cls, max_bytes: int, keep: int, instances: int, processes: int, keep_bytes: int
+    ) -> LogLimits:
+        """Return received limits, each within the range that the supervisor can hold."""
+        return cls(
+            max(max_bytes, 1), min(max(keep, 0), MOST_KEPT), max(instances, 1),
+            max(processes, 1), max(keep_bytes, 1),
+        )  # fmt: skip
 
 
 class LogKeeper:
@@ -53,6 +71,7 @@ class LogKeeper:
         self._opened: dict[Key, int] = {}
         self._due: float | None = None
         self._folder = LogFolder(state)
+        self._unchecked = limits.keep_bytes  # bytes that may lie there from earlier
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
         """Open the log of a starting instance; make room, but keep logs of `known` instances.
@@ -60,11 +79,8 @@ class LogKeeper:
         Raises:
             OSError: the log cannot be opened. An old log that cannot be removed prevents no start.
         """
-        log = os.open(
-            paths.log_file(self._state, *instance),
-            os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC,
-            0o600,
-        )
+        path = paths.log_file(self._state, *instance)
+        log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         self._opened[instance] = os.fstat(log).st_size
         try:
             self._folder.add(instance, known, self.limits)
@@ -89,9 +105,10 @@ class LogKeeper:
         self._opened.pop(instance, None)
         log = self._logs.pop(instance, None)
         if log is not None:
-            log.look(self.limits)
+            self._unchecked += log.look(self.limits)
         if not self._logs:
             self._due = None
+        self._remove_excess()
 
     def deadline(self) -> float | None:
         """Return the monotonic time of the next check; None: no process runs."""
@@ -101,8 +118,20 @@ class LogKeeper:
         """Check all logs if a check is due, and rotate those that exceed the limits."""
         if self._due is None or now < self._due:
             return
-        grown = [log for log in self._logs.values() if log.look(self.limits)]
+        grown = sum(log.look(self.limits) for log in self._logs.values())
         self._due = now + (BUSY if grown else QUIET)
+        self._unchecked += grown
+        self._remove_excess()
+
+    def _remove_excess(self) -> None:
+        """Apply the bound on all logs, once enough was written since the last time."""
+        if self._unchecked < self.limits.keep_bytes // EXCESS_PART:
+            return
+        self._unchecked = 0
+        try:
+            self._folder.remove_excess(self._logs, self.limits.keep_bytes)
+        except OSError as error:
+            own_log.write(f"an old log cannot be removed: {error}")
 
 
 class _Log:
@@ -120,14 +149,15 @@ class _Log:
             self.size = index.mark(index.count - 1).offset - self.base if index.count else 0
             self._has_index = index.count > 0
 
-    def look(self, limits: LogLimits) -> bool:
-        """Record growth in the index, and rotate a log over its limits; True: it has grown."""
+    def look(self, limits: LogLimits) -> int:
+        """Record growth in the index, and rotate a log over its limits; return the new bytes."""
         try:
             size = os.stat(self.path).st_size
         except OSError:
-            return False  # the log was removed; the process writes into a file without a name
+            return 0  # the log was removed; the process writes into a file without a name
         if size == self.size:
-            return False
+            return 0
+        grown = abs(size - self.size)
         self.note(size, 0)
         if size > limits.max_bytes or log_index.size(self.path) > limits.max_bytes:
             try:
@@ -135,7 +165,7 @@ class _Log:
             except OSError as error:
                 own_log.write(f"{self.path} was truncated, but not rotated: {error}")
             self.base, self.size = log_index.base(self.path) or 0, 0
-        return True
+        return grown
 
     def note(self, size: int, pid: int) -> None:
         """Record in the index that the log file now has `size` bytes."""
@@ -186,6 +216,40 @@ class LogFolder:
             for number in self._numbers.pop(name):
                 self._remove(name, number)
 
+    def remove_excess(self, running: Iterable[Key], keep_bytes: int) -> None:
+        """Remove logs until their bytes are within a bound, those of old processes first.
+
+        First go the logs of instances that have ended, then the older files of running ones.
+        """
+        sizes = self._sizes()
+        total = sum(map(sum, (files.values() for files in sizes.values())))
+        stay = {(paths.safe_name(process), number) for process, number in running}
+        order = [(name, number) for name, numbers in self._numbers.items() for number in numbers]
+        for name, number in order:
+            if total > keep_bytes and (name, number) not in stay:
+                total -= sum(sizes.get((name, number), {}).values())
+                self._numbers[name].remove(number)
+                self._remove(name, number)
+        for at in filter(stay.__contains__, order):
+            files = sizes.get(at, {})
+            for file in sorted(files, key=paths.age_of, reverse=True):
+                if total > keep_bytes and paths.age_of(file):
+                    total -= files[file]
+                    _unlink(os.path.join(paths.log_folder(self._state), file))
+        self._numbers = {name: numbers for name, numbers in self._numbers.items() if numbers}
+
+    def _sizes(self) -> dict[tuple[str, int], dict[str, int]]:
+        """Return the bytes of each file of each instance."""
+        sizes: dict[tuple[str, int], dict[str, int]] = {}
+        with os.scandir(paths.log_folder(self._state)) as files:
+            for file in files:
+                at = paths.instance_of(file.name)
+                if at is not None:
+                    with contextlib.suppress(OSError):  # a process may remove its own files
+                        size = file.stat(follow_symlinks=False).st_size
+                        sizes.setdefault(at, {})[file.name] = size
+        return sizes
+
     def _place(self, name: str, number: int) -> list[int]:
         """Add a log, mark its process as the newest, and return its instance numbers."""
         numbers = self._numbers[name] = self._numbers.pop(name, [])
@@ -226,7 +290,7 @@ def rotate(path: str, size: int, limits: LogLimits) -> None:
 
 
 def _copy(log: int, target: str, offset: int, end: int) -> None:
-    copy = os.open(target, os.O_WRONLY | os.O_TRUNC | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    copy = open_private(target, os.O_WRONLY | os.O_TRUNC | os.O_CREAT)
     try:
         while offset < end:
             sent = os.sendfile(copy, log, offset, end - offset)

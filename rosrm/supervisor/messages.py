@@ -5,7 +5,8 @@ lines. An instance is `[process, number]`. Times are seconds, sizes bytes.
 
 The client sends orders; the key `do` names the order:
 
-    hello        protocol, pid, log             the first order; log: the limits of `LogLimits`
+    hello        protocol, pid, log,            the first order; log: the first four limits of
+                 log_bytes                      `LogLimits`; log_bytes: the last one
     environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
                  heard, memo
@@ -58,12 +59,18 @@ from typing import Any, Final, NamedTuple
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
+from rosrm.model.durations import LONGEST
 from rosrm.supervisor.json_lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
 
 PROTOCOL: Final = 3
 #: What a reader of JSON raises for values of another shape.
 UNREADABLE: Final = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+
+#: Largest number in a message: that of an instance is an unsigned integer of 64 bits.
+_MOST_NUMBER: Final = 2**64 - 1
+#: Largest time or amount in a message, so that sums stay finite.
+_MOST_TIME: Final = 1e300
 
 
 class Hello(NamedTuple):
@@ -165,7 +172,9 @@ class Status(NamedTuple):
 def encode_order(order: Order) -> bytes:
     """Return an order as one line."""
     fields = order._asdict()
-    if isinstance(order, Environment):
+    if isinstance(order, Hello):
+        fields["log"], fields["log_bytes"] = order.log[:4], order.log.keep_bytes
+    elif isinstance(order, Environment):
         fields["variables"] = dict(order.variables)
     elif isinstance(order, Launch):
         fields = launch_fields(order)
@@ -212,29 +221,29 @@ def decode_order(text: bytes) -> Order:
 
 def read_launch(fields: Mapping[str, Any]) -> Launch:
     """Undo `launch_fields`. Raises one of `UNREADABLE`."""
-    argv = tuple(_text(argument) for argument in fields["argv"])
+    argv = tuple(read_text(argument) for argument in fields["argv"])
     directory = fields["directory"]
     if not argv:
         raise ValueError("argv is empty")
     if directory is not None:
-        _text(directory)
+        read_text(directory)
     return Launch(
         read_key(fields["instance"]),
         argv,
-        _text(fields["environment"]),
+        read_text(fields["environment"]),
         _changes(fields["changes"]),
         directory,
         read_restart(fields["restart"]),
         read_stop(fields["stop"]),
-        _text(fields.get("memo", "")),  # records from before protocol 2 have no memo
+        read_text(fields.get("memo", "")),  # records from before protocol 2 have no memo
         read_fence(fields.get("fence")),  # before protocol 3 neither of these
-        float(fields.get("heard", 0.0)),
+        read_time(fields.get("heard", 0.0)),
     )
 
 
 def _read_fail(fields: Mapping[str, Any]) -> events.FailOrdered:
-    key, pid = read_key(fields["instance"]), int(fields["pid"])
-    return events.FailOrdered(key, pid, _text(fields["reason"]), bool(fields["kill"]))
+    key, pid = read_key(fields["instance"]), read_whole(fields["pid"])
+    return events.FailOrdered(key, pid, read_text(fields["reason"]), bool(fields["kill"]))
 
 
 def _read_amend(fields: Mapping[str, Any]) -> Amend:
@@ -244,17 +253,21 @@ def _read_amend(fields: Mapping[str, Any]) -> Amend:
 
 _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     "hello": lambda fields: Hello(
-        int(fields["protocol"]), int(fields["pid"]), _limits(fields["log"])
+        read_whole(fields["protocol"]), read_whole(fields["pid"]), _limits(fields)
     ),
-    "environment": lambda fields: Environment(_text(fields["id"]), _texts(fields["variables"])),
+    "environment": lambda fields: Environment(
+        read_text(fields["id"]), read_texts(fields["variables"])
+    ),
     "start": read_launch,
     "stop": lambda fields: events.StopOrdered(read_key(fields["instance"])),
     "fence": lambda fields: events.FenceOrdered(read_key(fields["instance"])),
-    "heard": lambda fields: events.ContactReported(float(fields["at"]), float(fields["alive"])),
+    "heard": lambda fields: events.ContactReported(
+        read_amount(fields["at"]), read_amount(fields["alive"])
+    ),
     "restart": lambda fields: events.RestartOrdered(read_key(fields["instance"])),
     "fail": _read_fail,
     "amend": _read_amend,
-    "remember": lambda fields: Remember(read_key(fields["instance"]), _text(fields["memo"])),
+    "remember": lambda fields: Remember(read_key(fields["instance"]), read_text(fields["memo"])),
     "forget": lambda fields: Forget(
         tuple(events.StatusStored(read_key(key)) for key in fields["instances"])
     ),
@@ -265,7 +278,8 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
 def read_key(value: Any) -> Key:
     """Return an instance from its JSON list."""
     process, number = value
-    return _text(process), int(number)
+    read_text(process).encode("utf-8", "surrogateescape")  # it becomes part of a file's name
+    return process, read_whole(number, -1, _MOST_NUMBER)
 
 
 def read_restart(value: Sequence[Any]) -> RestartRule:
@@ -274,14 +288,15 @@ def read_restart(value: Sequence[Any]) -> RestartRule:
     if when not in ("never", "on-failure", "always"):
         raise ValueError(f"restart when {when!r}")
     return RestartRule(
-        when, float(delay), float(max_delay), float(factor), int(attempts), float(window)
-    )
+        when, _wait(delay), _wait(max_delay), read_amount(factor), read_whole(attempts, 0),
+        _wait(window),
+    )  # fmt: skip
 
 
 def read_stop(value: Sequence[Any]) -> StopRule:
     """Return a stop policy from its JSON list."""
     interrupt_grace, terminate_grace = value
-    return StopRule(float(interrupt_grace), float(terminate_grace))
+    return StopRule(_wait(interrupt_grace), _wait(terminate_grace))
 
 
 def read_fence(value: Sequence[Any] | None) -> FenceRule | None:
@@ -289,28 +304,65 @@ def read_fence(value: Sequence[Any] | None) -> FenceRule | None:
     if value is None:
         return None
     after, grace, alive = value
-    return FenceRule(float(after), float(grace), bool(alive))
+    return FenceRule(_wait(after), _wait(grace), bool(alive))
 
 
-def _limits(value: Any) -> LogLimits:
-    max_bytes, keep, instances, processes = value
-    return LogLimits(int(max_bytes), int(keep), int(instances), int(processes))
-
-
-def _text(value: Any) -> str:
+def read_text(value: Any) -> str:
+    """Return a JSON value that must be a text. Raises TypeError."""
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is not a text")
     return value
 
 
+def read_texts(value: Any) -> dict[str, str]:
+    """Return a JSON object that must hold texts alone. Raises AttributeError or TypeError."""
+    return {read_text(name): read_text(text) for name, text in value.items()}
+
+
+def read_whole(value: Any, low: int = -_MOST_NUMBER, high: int = _MOST_NUMBER) -> int:
+    """Return a JSON value that must be a whole number in a range. Raises TypeError, ValueError."""
+    if type(value) is not int:
+        raise TypeError(f"{value!r} is not a whole number")
+    if not low <= value <= high:
+        raise ValueError(f"{value} is not within {low}..{high}")
+    return value
+
+
+def read_time(value: Any) -> float:
+    """Return a JSON value that must be a finite number. Raises TypeError or ValueError."""
+    if type(value) not in (int, float):
+        raise TypeError(f"{value!r} is not a number")
+    if not -_MOST_TIME <= value <= _MOST_TIME:  # never true for NaN
+        raise ValueError(f"{value} is not a time or an amount")
+    return float(value)
+
+
+def read_amount(value: Any) -> float:
+    """Return a JSON value that must be a finite number from 0. Raises TypeError or ValueError."""
+    amount = read_time(value)
+    if amount < 0.0:
+        raise ValueError(f"{value} is negative")
+    return amount
+
+
+def _wait(value: Any) -> float:
+    """Return a delay or grace in seconds; records of earlier releases may hold longer ones."""
+    return min(read_amount(value), LONGEST)
+
+
+def _limits(fields: Mapping[str, Any]) -> LogLimits:
+    max_bytes, keep, instances, processes = map(read_whole, fields["log"])
+    keep_bytes = read_whole(
+        fields.get("log_bytes", LogLimits().keep_bytes)
+    )  # older slaves do not send it
+    return LogLimits.bounded(max_bytes, keep, instances, processes, keep_bytes)
+
+
 def _changes(value: Any) -> dict[str, str | None]:
     return {
-        _text(name): None if change is None else _text(change) for name, change in value.items()
+        read_text(name): None if change is None else read_text(change)
+        for name, change in value.items()
     }
-
-
-def _texts(value: Any) -> dict[str, str]:
-    return {_text(name): _text(text) for name, text in value.items()}
 
 
 # --- messages of the supervisor ---------------------------------------------------------------

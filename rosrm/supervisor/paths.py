@@ -27,6 +27,7 @@ RECORD = "instances.jsonl"
 HEARD = "heard"
 
 _LOG_NAME = re.compile(r"(.+)\.([0-9]+)\.log")
+_ANY_LOG_FILE = re.compile(r"(.+)\.([0-9]+)\.(?:log(?:\.([0-9]+))?(?:\.[a-z.]+)?|parameters\.yaml)")
 _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-.")
 
 
@@ -52,6 +53,18 @@ def log_number(name: str) -> tuple[str, int] | None:
     """Return the safe name and number in a log's file name; None: no instance's current log."""
     found = _LOG_NAME.fullmatch(name)
     return (found[1], int(found[2])) if found else None
+
+
+def instance_of(name: str) -> tuple[str, int] | None:
+    """Return the safe name and number of the instance that a file in the log folder belongs to."""
+    found = _ANY_LOG_FILE.fullmatch(name)
+    return (found[1], int(found[2])) if found else None
+
+
+def age_of(name: str) -> int:
+    """Return the number of rotations since a log, or its index, was current; 0: it is current."""
+    found = _ANY_LOG_FILE.fullmatch(name)
+    return int(found[3]) if found and found[3] else 0
 
 
 def work_directory(state: str) -> str:

@@ -6,6 +6,7 @@ status is recorded before it is sent; a spawn is recorded as imminent before it 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import selectors
 import signal
@@ -32,6 +33,8 @@ from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 SPAWNS_A_ROUND: Final = 8
 #: Seconds between attempts to write the record while the disk is full.
 RECORD_AGAIN: Final = 1.0
+#: Most seconds of one wait: `epoll` takes 24.8 days at most, and raises an error for more.
+LONGEST_WAIT: Final = 3600.0
 #: Seconds that the client has to read the last messages.
 END_PATIENCE: Final = 1.0
 
@@ -107,10 +110,11 @@ class Server:
         if self._record.trouble:
             deadlines.append(time.monotonic() + RECORD_AGAIN)
         due = [deadline for deadline in deadlines if deadline is not None]
-        return max(0.0, min(due) - time.monotonic()) if due else None
+        return min(max(0.0, min(due) - time.monotonic()), LONGEST_WAIT) if due else None
 
     def _leave(self) -> None:
-        os.unlink(os.path.join(self._state, paths.SOCKET))
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(os.path.join(self._state, paths.SOCKET))
         if self._client is not None:
             self._client.finish(messages.encode_ended(), END_PATIENCE)
 
@@ -168,18 +172,22 @@ class Server:
                 self._spawn(key)
             else:
                 failed = f"not started, for it could not be recorded: {self._record.trouble}"
-                self._happened(SpawnFailed(key, failed, transient=True))
+                self._spawn_failed(key, failed, transient=True)
 
     def _spawn(self, key: Key) -> None:
         birth = procfs.ticks_now()
         try:
             pid = self._spawn_process(key)
         except spawn.SpawnError as error:
-            self._happened(SpawnFailed(key, str(error), error.transient))
+            self._spawn_failed(key, str(error), error.transient)
             return
         self._trees.add_child(key, pid, birth)
         self._logs.watch(key, time.monotonic(), pid)
         self._happened(Spawned(key, pid))
+
+    def _spawn_failed(self, key: Key, reason: str, transient: bool) -> None:
+        """Report a failure. All clients may read the reason, so STATE stands for the directory."""
+        self._happened(SpawnFailed(key, reason.replace(self._state, "STATE"), transient))
 
     def _spawn_process(self, key: Key) -> int:
         launch = self._launches.get(key)
@@ -188,7 +196,7 @@ class Server:
         try:
             log = self._logs.open(key, self._core.instances)
         except OSError as error:
-            message = f"its log {error.filename} cannot be opened: {error.strerror}"
+            message = f"its log cannot be opened: {error.strerror}"
             raise spawn.SpawnError(message, transient=True) from None
         try:
             directory = launch.directory or paths.work_directory(self._state)
@@ -240,7 +248,10 @@ class Server:
     # --- the client ---------------------------------------------------------------------------
 
     def _accept(self) -> None:
-        peer, _ = self._listener.accept()
+        try:
+            peer, _ = self._listener.accept()
+        except OSError:  # the peer is gone, or no descriptor is left: it connects again
+            return
         connection = Connection(peer)
         self._watch(connection, lambda: self._readable(connection))
         if connection.uid not in (0, os.geteuid()):
@@ -254,6 +265,9 @@ class Server:
                     self._obey(connection, messages.decode_order(line))
         except ProtocolError as error:
             self._refuse(connection, str(error))
+        except Exception as fault:  # noqa: BLE001 - no order may end the parent of all processes
+            own_log.write_fault("an order failed, and its connection is closed")
+            self._refuse(connection, f"the order failed in the supervisor: {fault!r}")
         self._send(connection, b"")
 
     def _obey(self, connection: Connection, order: messages.Order) -> None:

@@ -75,9 +75,9 @@ def spawn(
 def _enter(directory: str) -> None:
     try:
         os.chdir(directory)
-    except (OSError, ValueError) as error:  # ValueError: a NUL byte, a text without encoding
-        why = error.strerror if isinstance(error, OSError) else error
-        message = f"the working directory {directory!r} cannot be entered: {why}"
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
+        reason = getattr(error, "strerror", None) or error
+        message = f"the working directory {directory!r} cannot be entered: {reason}"
         raise SpawnError(message) from None
 
 

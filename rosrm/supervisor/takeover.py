@@ -11,6 +11,7 @@ and its restart policy decides.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterator
 
@@ -37,7 +38,8 @@ def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
         leader = procfs.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]
         if leader is not None and leader.alive and procfs.was_born(leader, birth):
-            trees.take_over(instance.key, leader)
+            with contextlib.suppress(OSError):  # it has ended since
+                trees.take_over(instance.key, leader)
     return recorded
 
 

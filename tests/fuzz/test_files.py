@@ -79,7 +79,6 @@ names = st.sampled_from(["p", "p", "..", "../p", "/etc/passwd", "p\0", ""]) | te
 )
 
 
-@pytest.mark.xfail(reason="the OSError of a name that is too long for a file is no refusal")
 def test_a_name_that_no_file_can_have_is_refused(tmp_path):
     Path(paths.log_folder(str(tmp_path))).mkdir()
     with pytest.raises(Refused):

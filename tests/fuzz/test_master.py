@@ -216,7 +216,6 @@ def test_repeated_events_are_not_remembered_again(stream):
 # --- found by the test above --------------------------------------------------------------------
 
 
-@pytest.mark.xfail(reason="a number beyond the largest one hides the others that a host reports")
 def test_an_instance_gets_no_number_that_a_host_has_claimed():
     """Two instances of one number would overwrite each other."""
     cluster = Besieged()
@@ -231,7 +230,6 @@ def test_an_instance_gets_no_number_that_a_host_has_claimed():
         invariants.the_books_balance(cluster.state)
 
 
-@pytest.mark.xfail(reason="a fence that has passed before the start is assigned again and again")
 @pytest.mark.parametrize("after", [-1.0, -math.inf])
 def test_a_process_whose_fence_has_always_passed_is_not_assigned_without_end(after):
     """Each assignment is a line of the journal."""

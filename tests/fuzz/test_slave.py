@@ -61,8 +61,7 @@ def test_hostile_events_leave_a_sound_slave(stream, bounds):
                 assert held.ready_by is None
 
 
-@pytest.mark.xfail(reason="a policy may hold times that no clock reaches, and NaN")
-@pytest.mark.parametrize("seconds", [math.nan, math.inf, -1.0, 1e300])
+@pytest.mark.parametrize("seconds", [math.nan, math.inf, -1.0, 1e301])
 @pytest.mark.parametrize("place", range(4))
 def test_times_of_an_order_are_refused_at_the_socket(seconds, place):
     """A deadline of NaN never passes, and epoll cannot wait for a far one."""

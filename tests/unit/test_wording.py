@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.wording import amount, counted, duration, printable, size, standing_for
+from rosrm.wording import amount, counted, duration, sanitized, size, standing_for
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "no hosts"), (1, "1 host"), (2, "2 hosts")])
@@ -69,4 +69,4 @@ def test_amounts_carry_the_unit_of_their_resource(value, unit, text):
 )
 def test_a_text_of_any_sender_has_nothing_that_a_terminal_executes(given: str, text: str) -> None:
     """Control characters are replaced, and the length is bounded."""
-    assert printable(given, 20 if len(given) == 30 else 100) == text
+    assert sanitized(given, 20 if len(given) == 30 else 100) == text

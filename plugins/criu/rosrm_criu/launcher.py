@@ -16,7 +16,7 @@ from rosrm import InstanceId, Launch, LauncherContext, ProcessSpec, options_of
 from rosrm.errors import CriuError, LaunchError, PortableError
 from rosrm.ros.names import token
 from rosrm.supervisor.spawn import SpawnError, find_executable
-from rosrm_criu.control.client import control_root, directory_of
+from rosrm_criu.control.client import directory_of, make_control_root
 from rosrm_criu.control.messages import VARIABLE, State, Status, read_message
 from rosrm_criu.engine import paths, process_tree, restart_from_image, restore_result, slots
 from rosrm_criu.engine.binary import find
@@ -43,7 +43,7 @@ class CriuLauncher:
         if portable and VARIABLE not in spec.environment:
             # The token differs for another cluster of the same name that shares this directory.
             own = token(f"{instance} {launch.cluster} {self._slave:x}")
-            environment[VARIABLE] = str(control_root(os.geteuid()) / own)
+            environment[VARIABLE] = str(_control_root() / own)
         again_from_image = _is_periodic(spec)
         if again_from_image:  # otherwise the restoring program would start, and fail only later
             _check_program(argv[0], environment)
@@ -96,6 +96,14 @@ class CriuLauncher:
         except (OSError, PortableError):  # it has ended, or cannot be read: treat it like any other
             return False
         return status is not None and status.state in (State.LEAVING, State.LEFT, State.JOINING)
+
+
+def _control_root() -> Path:
+    """Create the parent of control directories of this user; raise `LaunchError` if none can be."""
+    try:
+        return make_control_root(os.geteuid())
+    except PortableError as error:
+        raise LaunchError(str(error)) from None
 
 
 def _is_portable(spec: ProcessSpec) -> bool:

@@ -23,6 +23,7 @@ from rosrm.cli.commands import change, check, follow, inspect, runtimes
 from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
 from rosrm.cli.installed_commands import find_commands, load_command
 from rosrm.cli.options import CommonOptions, Domain
+from rosrm.cli.output.plain import echo
 from rosrm.cli.process import INTERRUPTED
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress
@@ -66,7 +67,7 @@ class RootGroup(PlainGroup):
         try:
             return super().invoke(ctx)
         except RosrmError as error:
-            typer.echo(f"rosrm: {error}", err=True)
+            echo(f"rosrm: {error}", err=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
@@ -83,7 +84,7 @@ app = typer.Typer(
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"rosrm {__version__} (protocol {PROTOCOL_VERSION})")
+        echo(f"rosrm {__version__} (protocol {PROTOCOL_VERSION})")
         raise typer.Exit
 
 

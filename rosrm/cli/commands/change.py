@@ -12,6 +12,7 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, Host, Name, Names
+from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
 from rosrm.wording import counted
 
@@ -59,7 +60,7 @@ def submit(
     limit = longest(timeout)
     specs = [spec for file in files for spec in load_work(file)]
     with connection.master(ctx, domain) as client:
-        typer.echo(client.submit(specs))
+        echo(client.submit(specs))
         if wait:
             with interruptible("the submitted processes stay queued or run (`rosrm ps`)"):
                 names = [spec.name for spec in specs]
@@ -97,10 +98,10 @@ def cancel(
             named += [name for name in live if everything or name in filed]
         names = list(dict.fromkeys(named))
         if not names:
-            typer.echo("no process to cancel: all of them have ended, or were never submitted")
+            echo("no process to cancel: all of them have ended, or were never submitted")
             return
         outcome = client.cancel(names)
-        typer.echo(outcome)
+        echo(outcome)
         # If all processes were still queued, the master's reply reports their end already.
         if wait and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
             with interruptible("the processes are still being cancelled (`rosrm ps`)"):
@@ -135,7 +136,7 @@ def restart(
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
         rows = client.list_processes() if wait else ()
-        typer.echo(client.restart(names))
+        echo(client.restart(names))
         if wait:
             with interruptible("the processes are still being restarted (`rosrm ps`)"):
                 show_processes(
@@ -188,7 +189,7 @@ def _with_ending(
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
         since = client.list().last_sequence if wait else 0
-        typer.echo(ask(client))
+        echo(ask(client))
         if wait:
             with interruptible(
                 f"the request for {name} continues (`rosrm events --process {name}`)"
@@ -203,13 +204,13 @@ def _with_ending(
 def cordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
     """Stop giving new work to a host; its processes stay."""
     with connection.master(ctx, domain) as client:
-        typer.echo(client.cordon(host))
+        echo(client.cordon(host))
 
 
 def uncordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
     """Give new work to a host again."""
     with connection.master(ctx, domain) as client:
-        typer.echo(client.uncordon(host))
+        echo(client.uncordon(host))
 
 
 def drain(
@@ -234,7 +235,7 @@ def drain(
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
         since = client.list().last_sequence if wait else 0
-        typer.echo(client.drain(host))
+        echo(client.drain(host))
         if wait:
             with interruptible(f"{host} is still draining (`rosrm uncordon {host}` ends that)"):
                 show_end(client.wait_for_drain(host, after=since, timeout=limit))
@@ -257,7 +258,7 @@ def prune(
     by `--host`; processes that were being cancelled there are cancelled then.
     """
     with connection.master(ctx, domain) as client:
-        typer.echo(client.prune(names or [], hosts or []))
+        echo(client.prune(names or [], hosts or []))
 
 
 COMMANDS: Final = (

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli.groups import DISTRIBUTIONS
+from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError, PluginError, describe_plugin_fault
 from rosrm.wording import counted, get_close_matches, listed
 
@@ -64,7 +65,7 @@ def check(
     wrong = []
     for file in files:
         try:
-            typer.echo(f"{file}: ok, {_checked(file, kind, registry)}")
+            echo(f"{file}: ok, {_checked(file, kind, registry)}")
         except ConfigError as error:
             wrong.append(str(error))
     if wrong:
@@ -140,10 +141,10 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             return _check_of_simulations(file)(file, registry)
         case _:
             for warning in _misspelt_needs(root, registry):  # also for a wrong file
-                typer.echo(warning, err=True)
+                echo(warning, err=True)
             specs = checked_work(root, file, registry)
             for warning in shared_nodes((spec.name, node_of(spec)) for spec in specs):
-                typer.echo(f"{file}: warning: {warning}", err=True)
+                echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)
             numbers = ((jobs, "job"), (len(specs) - jobs, "service"))
             parts = [counted(number, noun) for number, noun in numbers if number]

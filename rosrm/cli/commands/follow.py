@@ -11,6 +11,7 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import AsJson, Domain, Names, seconds_of
+from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def events(  # noqa: PLR0917 - an argument for each option
             elif console.is_terminal:
                 console.print(tables.event(row))
             else:
-                typer.echo(tables.event_line(row))
+                echo(tables.event_line(row))
 
         for row in snapshot.events:
             show(row)
@@ -78,10 +79,10 @@ def _check_names(client: Client, process: str, host: str) -> None:
 
 def _say_left_out(shown: int, newest: int) -> None:
     if shown >= newest:
-        typer.echo(f"rosrm: at most the newest {newest} are shown; -n N shows more", err=True)
+        echo(f"rosrm: at most the newest {newest} are shown; -n N shows more", err=True)
 
 
-def logs(  # noqa: PLR0917 - an argument for each option
+def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
     ctx: typer.Context,
     names: Names,
     follow: Annotated[
@@ -109,21 +110,27 @@ def logs(  # noqa: PLR0917 - an argument for each option
     host: Annotated[
         str, typer.Option("--host", metavar="HOST", help="Print only output from this host.")
     ] = "",
+    raw: Annotated[
+        bool,
+        typer.Option("--raw", help="Print colours and other control characters in a terminal too."),
+    ] = False,
     domain: Domain = None,
 ) -> None:
     """Print the output of processes, from all hosts.
 
     The output is complete over restarts and moves. Where the size limit of logs dropped output, a
-    line gives the dropped size.
+    line gives the dropped size. In a terminal, control characters are printed as numbers; into a
+    file or pipe the output is copied as it is.
     """
     from rosrm.cli.log_copies import copy_logs, since_of
-    from rosrm.cli.output.log_lines import LogStream
+    from rosrm.cli.output.log_lines import LogStream, is_terminal
     from rosrm.client.logs import LogSelection
 
     selection = LogSelection(tail or 0, since_of(since), host, follow)
     width = max(map(len, names)) if len(names) > 1 else 0
+    as_it_is = raw or not is_terminal()
     streams = [
-        LogStream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps)
+        LogStream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps, as_it_is)
         for name in dict.fromkeys(names)
     ]
     with connection.master(ctx, domain) as client:

@@ -11,6 +11,7 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import AsJson, Domain, Name
+from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
 
 
@@ -55,9 +56,9 @@ def ps(
     if listed:
         tables.show(tables.processes(listed))
     if len(listed) < len(shown):
-        typer.echo(f"{len(shown) - len(listed)} finished or cancelled (--all shows them)")
+        echo(f"{len(shown) - len(listed)} finished or cancelled (--all shows them)")
     elif not listed:
-        typer.echo("no process")
+        echo("no process")
 
 
 def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
@@ -76,7 +77,7 @@ def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) ->
     elif rows:
         tables.show(tables.hosts(rows))
     else:
-        typer.echo("no host; start `rosrm slave` on each")
+        echo("no host; start `rosrm slave` on each")
 
 
 def plugins(
@@ -107,7 +108,7 @@ def plugins(
     elif rows:
         tables.show(tables.plugins(rows))
     else:
-        typer.echo("no plugin is installed; rosrm's own are in rosrm-scoring and its siblings")
+        echo("no plugin is installed; rosrm's own are in rosrm-scoring and its siblings")
 
 
 def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Domain = None) -> None:

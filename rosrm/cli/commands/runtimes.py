@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli.options import CommonOptions, Domain
+from rosrm.cli.output.plain import echo
 from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
 
 if TYPE_CHECKING:
@@ -54,9 +55,9 @@ def master(
     settings = load_cluster(file, registry) if file else default_cluster(registry)
     settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
     if recover:
-        typer.echo(_recover(settings.state), err=True)
+        echo(_recover(settings.state), err=True)
     with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
-        typer.echo(_master_summary(settings), err=True)
+        echo(_master_summary(settings), err=True)
     become("rosrm.master", settings.to_json())
 
 
@@ -92,9 +93,7 @@ def slave(
     settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
     if stop_everything:
         if not (settings.state / "supervisor").is_dir():
-            typer.echo(
-                f"nothing to stop: no slave was started with the state directory {settings.state}"
-            )
+            echo(f"nothing to stop: no slave was started with the state directory {settings.state}")
             return
         with only_one(settings.state, "slave", code="name_taken", remedy=""):
             pass  # fails if a slave runs, which must stop its processes itself
@@ -104,7 +103,7 @@ def slave(
         registry.default_probes()  # raises if there is none
     remedy = "another `host:` and `state:`"
     with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
-        typer.echo(_slave_summary(settings), err=True)
+        echo(_slave_summary(settings), err=True)
     become("rosrm.slave", settings.to_json())
 
 

@@ -8,8 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
-import typer
-
+from rosrm.cli.output.plain import echo
 from rosrm.model.codec import to_plain
 from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
 
@@ -40,12 +39,12 @@ def status_form(snapshot: Listing) -> dict[str, Any]:
 
 def show(value: Any) -> None:
     """Print one JSON value."""
-    typer.echo(json.dumps(_finite(value), indent=2))
+    echo(json.dumps(_finite(value), indent=2))
 
 
 def show_line(value: Any) -> None:
     """Print one JSON value on one line."""
-    typer.echo(json.dumps(_finite(value)))
+    echo(json.dumps(_finite(value)))
 
 
 def _finite(value: Any) -> Any:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import sys
 import time
+from codecs import IncrementalDecoder, getincrementaldecoder
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from rosrm.client.logs import LogChunk
-from rosrm.wording import size
+from rosrm.wording import printable, size
 
 Marks = Sequence[tuple[float, int, int]]
 #: Unix time by which the output was written, and the output; time 0.0: unknown.
@@ -26,6 +27,11 @@ def show(pieces: Iterable[Piece]) -> None:
     sys.stdout.flush()
 
 
+def is_terminal() -> bool:
+    """Return True if standard output is a terminal, which executes control characters."""
+    return sys.stdout.isatty()
+
+
 @dataclass
 class LogStream:
     """Output of one process in pieces.
@@ -35,12 +41,14 @@ class LogStream:
         prefix: beginning of each line; b"": no prefix, and bytes are copied unchanged.
         timestamps: True: each line begins with the time by which it was written, by the clock of
             its host.
+        raw: True: control characters, e.g. of colours, stay as the process wrote them.
         wrote: True after the first output.
     """
 
     name: str
     prefix: bytes = b""
     timestamps: bool = False
+    raw: bool = True
     wrote: bool = False
     _host: str = ""
     _is_new: bool = False
@@ -48,6 +56,9 @@ class LogStream:
     _when: float = 0.0
     _at_line_start: bool = True
     _pieces: list[Piece] = field(default_factory=list)
+    _decoder: IncrementalDecoder = field(
+        default_factory=lambda: getincrementaldecoder("utf-8")("backslashreplace")
+    )
 
     def take(self) -> list[Piece]:
         """Return and clear the finished pieces."""
@@ -113,6 +124,9 @@ class LogStream:
         self._add(self.prefix + stamp + line, when)
 
     def _add(self, text: bytes, when: float = 0.0) -> None:
+        if not self.raw:  # a character may be divided between two pieces
+            shown = self._decoder.decode(text).replace("\r\n", "\n")
+            text = printable(shown).encode()
         self._pieces.append((when, text))
         self._at_line_start = text.endswith(b"\n")
 

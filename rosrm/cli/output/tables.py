@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from rich import box
-from rich.console import Console, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
-from rosrm.wording import counted, duration, percent, size, standing, words
+from rosrm.wording import counted, duration, percent, printable, size, standing, words
 
 #: Width of tables in a file or pipe, large enough that no line is cut or wrapped.
 _PIPE_WIDTH: Final = 100_000
@@ -42,12 +43,23 @@ STYLES: Final = {
 }
 
 
+class PrintableConsole(Console):
+    """Console that shows control characters of texts as numbers (`printable`)."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        """Yield the parts of a renderable; control sequences of rich itself stay."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=printable(segment.text))
+
+
 def console() -> Console:
     """Return the console for tables, as wide as the terminal or COLUMNS; else without a limit."""
-    output = Console(highlight=False)
+    output = PrintableConsole(highlight=False)
     if output.is_terminal or os.environ.get("COLUMNS", "").strip("0").isdigit():
         return output
-    return Console(highlight=False, width=_PIPE_WIDTH)
+    return PrintableConsole(highlight=False, width=_PIPE_WIDTH)
 
 
 def table(*columns: str, right: Sequence[str] = ()) -> Table:
@@ -168,7 +180,8 @@ def clock(wall_time: float) -> str:
 
 def event_line(row: EventRow) -> str:
     """Return one line of the event record."""
-    return f"{clock(row.wall_time)}  {words(row.kind):<18} {row.message}"
+    beginning = f"{clock(row.wall_time)}  {words(row.kind):<18} "
+    return beginning + row.message.replace("\n", f"\n{'':{len(beginning)}}")
 
 
 def event(row: EventRow) -> Table:

@@ -35,7 +35,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, LARGEST_NUMBER, Assignment, InstanceId, ProcessSpec
-from rosrm.wording import one_line, printable
+from rosrm.wording import one_line, sanitized
 
 #: Number of the newest records of a process that `explain` shows.
 _HISTORY: Final = 12
@@ -170,7 +170,7 @@ class MasterState:
         """Write a line of the event record; `by` is the client that requested it."""
         if by:
             message, facts = f"{message} (by {by})", {**facts, "by": by}
-        message = printable(one_line(message), _LONGEST_RECORD)
+        message = sanitized(one_line(message), _LONGEST_RECORD)
         self.emit(Record(kind, process, host, message, facts))
         known = self.processes.get(process)
         if known is not None:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from rosrm.model.values import LONGEST_TIME
+from rosrm.model.durations import LONGEST
 from rosrm.ros import names, qos
 from rosrm.ros.control import ControlClient, master_identity, version_refusal
 from rosrm.ros.participant import Participant
@@ -57,7 +57,7 @@ class RivalWatch:
         if beat.incarnation == self._incarnation:
             return
         fault = version_refusal(beat.protocol_version, "another master")
-        if not fault and not 0.0 <= beat.uptime <= LONGEST_TIME:
+        if not fault and not 0.0 <= beat.uptime <= LONGEST:
             fault = f"a beat with an uptime of {beat.uptime} s"
         if fault:
             self._refuse(f"master {beat.name}", fault)

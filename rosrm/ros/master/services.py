@@ -18,7 +18,7 @@ from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.version import PROTOCOL_VERSION, __version__
-from rosrm.wording import printable
+from rosrm.wording import sanitized
 from rosrm_msgs import srv
 
 _Respond = Callable[[Any], None]
@@ -146,7 +146,7 @@ class MasterServices:
     def _take_handshake(self, request: srv.Handshake.Request, open_request: OpenRequest) -> None:
         if request.role == "master" and request.name == self._own_name:
             return
-        who = printable(f"{request.role} {request.name}", _LONGEST_PEER)
+        who = sanitized(f"{request.role} {request.name}", _LONGEST_PEER)
         fault = version_refusal(request.protocol_version, who)
         if fault:
             self._refuse("handshake", who, fault)
@@ -280,4 +280,4 @@ def _pruned(request: srv.Prune.Request, token: int) -> happened.Event:
 
 def _requester(request: Any) -> str:
     """Return the name of the client that sent a request, for records."""
-    return printable(request.envelope.sender.removeprefix("client "), _LONGEST_PEER)
+    return sanitized(request.envelope.sender.removeprefix("client "), _LONGEST_PEER)

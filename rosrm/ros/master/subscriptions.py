@@ -17,7 +17,7 @@ from rosrm.ros.master.slave_links import HostLinks
 from rosrm.ros.participant import Participant
 from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
-from rosrm.wording import printable
+from rosrm.wording import sanitized
 from rosrm_msgs import msg
 
 #: Most letters of the name of a failing plugin.
@@ -114,7 +114,7 @@ class SlaveSubscriptions:
 
 def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:
     return {
-        printable(row.name, _LONGEST_PLUGIN): printable(row.reason)
+        sanitized(row.name, _LONGEST_PLUGIN): sanitized(row.reason)
         for row in message.failing
         if row.kind == kind
     }

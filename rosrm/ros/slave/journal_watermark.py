@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosrm.model.values import LARGEST_NUMBER
+from rosrm.runtime.private_files import open_private
 
 #: Bytes read of the file, at most.
 _LONGEST: Final = 1000
@@ -63,7 +64,7 @@ class JournalWatermark:
 
     def _keep(self, path: Path, newest: Watermark) -> None:
         if self._file < 0:
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            self._file = open_private(str(path), os.O_WRONLY | os.O_CREAT)
         line = f"{newest.sequence:020d} {newest.incarnation:020d} {newest.master}\n".encode()
         os.pwrite(self._file, line, 0)
         os.ftruncate(self._file, len(line))

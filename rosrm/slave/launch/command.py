@@ -137,5 +137,5 @@ def _write_parameters(assignment: Assignment, state_directory: Path) -> str | No
         path.touch(0o600)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise LaunchError(f"the parameters cannot be written to {path}: {error}") from None
+        raise LaunchError(f"the parameters cannot be written: {error.strerror}") from None
     return str(path)

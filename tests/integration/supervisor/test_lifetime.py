@@ -310,6 +310,32 @@ def test_an_unusable_state_directory_is_reported(tmp_path):
         SupervisorClient.connect(tmp_path / "file" / "state")
 
 
+def test_a_back_off_of_decades_ends_no_supervisor(host):
+    """A time-out of more than 24 days is an error of `epoll`: each successor died at once."""
+    client = host.connect()
+    policy = RestartPolicy("always", delay=1e9, max_delay=1e9)
+    client.start([host.order("crash", "false", restart=policy)])
+    host.wait(client, "crash", InstanceState.BACKOFF)
+    for _ in range(2):
+        client = host.replace_supervisor(client)
+        assert host.run(client, host.order(f"job{client.pid}", "true")).exit_code == 0
+    client.send(StopOrdered(("crash", 1)))
+    assert host.ended_after_connect(client, "crash").state is InstanceState.EXITED
+
+
+def test_a_damaged_record_ends_no_supervisor(host):
+    """The rest of the record counts, and the supervisor reports what it left out."""
+    client = host.connect()
+    pid = host.sleeper(client, "stays")
+    host.kill_supervisor(client)
+    with (host.state / "instances.jsonl").open("ab") as record:
+        record.write(b"[" * 100_000 + b"\n")
+        record.write(b'{"record":"state","birth":1,"key":["a",1e999],"phase":9}\n' * 50_000)
+    client = host.connect()
+    assert len(client.notes) < 30
+    assert [one.pid for one in client.instances] == [pid]
+
+
 def test_shutdown_ends_everything_and_leaves_nothing(host, client):
     """After the shutdown no process, no socket and no supervisor is left."""
     client.start([host.order("a", "sleep", "1000"), host.order("b", "sleep", "1000")])

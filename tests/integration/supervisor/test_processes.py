@@ -12,6 +12,7 @@ import pytest
 
 from rosrm.core.supervisor.events import FailOrdered, StopOrdered
 from rosrm.model.values import InstanceState, RestartPolicy
+from rosrm.runtime import private_files
 from tests.waiting import wait_gone, wait_until
 
 IGNORES_ALL = """
@@ -80,6 +81,18 @@ def test_a_process_has_only_its_own_environment_and_directory(host, client, tmp_
     host.run(client, order)
     lines = sorted(host.log("env").read_text().splitlines())
     assert lines == ["A=1", "ROSRM_INSTANCE=env#1", f"ROSRM_SUPERVISOR={host.state}"]
+
+
+def test_a_process_has_the_umask_of_the_user(host, monkeypatch):
+    """The slave keeps its own files from others; the programs of users decide about theirs."""
+    monkeypatch.setattr(private_files, "_user_umask", 0o027)
+    before = os.umask(0o077)
+    try:
+        client = host.connect()
+    finally:
+        os.umask(before)
+    host.run(client, host.order("job", "sh", "-c", "umask"))
+    assert host.log("job").read_text() == "0027\n"
 
 
 def test_environments_of_one_batch_stay_apart(host, client):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine import dump, image, process_tree, restore, udp_ports
+from rosrm_criu.engine import dump, image, process_tree, put_back, udp_ports
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.image import HeldFile
 from rosrm_criu.executors import artifacts, checkpoint, move, periodic
@@ -76,9 +76,9 @@ def test_a_file_that_cannot_be_put_back_leaves_nothing(tmp_path, monkeypatch):
     copy.write_text("from the image")
     (work / "data").write_text("before")
     held = HeldFile(str(work / "data"), 14, 0o600, False, "files/0")
-    monkeypatch.setattr(restore.shutil, "copyfileobj", full)
+    monkeypatch.setattr(put_back.shutil, "copyfileobj", full)
     with pytest.raises(OSError, match="No space left"):
-        restore._put_back(tmp_path, held)
+        put_back._put_back(tmp_path, held, str(work))
     assert [path.name for path in work.iterdir()] == ["data"]
     assert (work / "data").read_text() == "before"
 

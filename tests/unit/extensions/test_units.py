@@ -47,6 +47,7 @@ def test_a_quantity_is_read_in_base_units(marker, given, value):
         (DURATION, None, "is not a number"),
         (DURATION, float("nan"), "is not at least 0"),
         (DURATION, float("inf"), "is not at least 0"),
+        (DURATION, "88000h", "is longer than ten years"),
         pytest.param(DURATION, 10**400, "is not at least 0", id="huge"),
         (NUMBER, "5s", "a number without a unit is required"),
         (Quantity(high=1.0), 1.01, "is not within 0..1"),

@@ -14,7 +14,9 @@ import textwrap
 import pytest
 
 from rosrm.errors import JournalBlocked, JournalError
+from rosrm.journal.errors import fault_of
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record
 
 
@@ -348,3 +350,99 @@ def test_full_sync_works_the_same(opened) -> None:
     journal = opened(sync="full")
     journal.write([Record("a")], [], 0.0)
     assert journal._database.execute("PRAGMA synchronous").fetchone() == (2,)
+
+
+def test_a_journal_is_private_also_in_a_directory_that_existed(tmp_path):
+    """Its intents hold the environment of each process, and so passwords."""
+    tmp_path.chmod(0o755)
+    before = os.umask(0o022)
+    try:
+        journal = SqliteJournal(tmp_path / "journal.sqlite")
+        journal.write([], [Intent("process", "p", {"environment": {"API_TOKEN": "x"}})], 0.0)
+        files = sorted(path.name for path in tmp_path.iterdir())
+        modes = {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+        journal.close()
+    finally:
+        os.umask(before)
+    assert files == ["journal.sqlite", "journal.sqlite-shm", "journal.sqlite-wal"]
+    assert modes == {0o600}
+    assert tmp_path.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_journal_of_an_earlier_release_becomes_private(tmp_path):
+    SqliteJournal(tmp_path / "journal.sqlite").close()
+    (tmp_path / "journal.sqlite").chmod(0o644)
+    SqliteJournal(tmp_path / "journal.sqlite").close()
+    assert (tmp_path / "journal.sqlite").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_journal_that_is_a_link_is_refused(tmp_path):
+    (tmp_path / "elsewhere").touch()
+    (tmp_path / "journal.sqlite").symlink_to("elsewhere")
+    with pytest.raises(JournalError, match="it is a symbolic link"):
+        SqliteJournal(tmp_path / "journal.sqlite")
+
+
+def size_of(journal) -> int:
+    return sum(len(one.record.message) for one in journal.records(newest=10**6))
+
+
+def test_old_events_are_pruned_by_their_bytes(path, opened) -> None:
+    """Ten thousand long messages fill no disk, and neither does the write-ahead log."""
+    journal = opened(keep_bytes=1_000_000)
+    for _ in range(300):
+        journal.write([Record("n", message="x" * 10_000)] * 10, [], 0.0)
+    kept = journal.records(newest=10**6)
+    assert 900_000 < size_of(journal) <= 1_000_000
+    assert kept[-1].sequence == 3000
+    assert sum(file.stat().st_size for file in path.parent.iterdir()) < 8_000_000
+    journal.close()
+    assert 900_000 < size_of(opened(keep_bytes=1_000_000)) <= 1_000_000
+
+
+def test_one_event_larger_than_the_bound_is_kept(opened) -> None:
+    """The newest event holds the number at which the next master continues."""
+    journal = opened(keep_bytes=1_000_000)
+    journal.write([Record("n")], [], 0.0)
+    journal.write([Record("n", message="x" * 2_000_000)], [], 0.0)
+    assert [one.sequence for one in journal.records()] == [2]
+    journal.close()
+    assert opened(keep_bytes=1_000_000).last_sequence == 2
+
+
+@pytest.mark.parametrize("long", ["", "x" * 1000])
+@pytest.mark.parametrize(
+    "kind", [EventKind.PEER_REFUSED, EventKind.HOST_REFUSED, EventKind.READING_REFUSED]
+)
+def test_a_flood_of_refusals_does_not_wipe_the_audit_trail(opened, kind, long) -> None:
+    """Anybody can cause refusals: they get a tenth of the record."""
+    journal = opened(keep_events=5000, keep_bytes=5_000_000)
+    trail = [Record(EventKind.SUBMITTED, f"p{number}") for number in range(1000)]
+    journal.write(trail, [], 0.0)
+    for _ in range(200):
+        journal.write([Record(kind, message=f"a host was refused{long}")] * 100, [], 0.0)
+    kept = journal.records(newest=10**6)
+    submitted = [one for one in kept if one.record.kind is EventKind.SUBMITTED]
+    assert len(submitted) == 1000
+    assert 400 <= len(kept) - 1000 <= 1500 + 100
+    assert journal.last_sequence == 21_000
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        sqlite3.OperationalError("database or disk is full"),
+        sqlite3.OperationalError("disk I/O error"),
+        sqlite3.OperationalError("unable to open database file"),
+        sqlite3.OperationalError("database is locked"),
+        PermissionError(13, "Permission denied", "/home/ada/state/journal.sqlite"),
+    ],
+)
+def test_clients_read_the_cause_of_a_stall_without_a_path(tmp_path, fault) -> None:
+    """Everybody may ask the master; who started it needs the path."""
+    error = fault_of(tmp_path / "journal.sqlite", fault)
+    assert isinstance(error, JournalBlocked)
+    assert str(tmp_path) in str(error)
+    assert str(tmp_path) not in error.public
+    assert "/home" not in error.public
+    assert error.public.startswith("the journal of the master cannot be used (")

@@ -145,6 +145,57 @@ def test_nothing_else_is_given_to_a_user(of_nobody, precious, monkeypatch) -> No
     assert unchanged(precious)
 
 
+@pytest.fixture
+def roots(tmp_path, monkeypatch):
+    """Use parents of control directories in the test's own folder; /run/rosrm does not exist."""
+    (tmp_path / "tmp").mkdir()
+    (tmp_path / "tmp").chmod(0o1777)
+    names = ("service/0/portable", "tmp/rosrm-0/portable", "tmp/second/portable")
+    monkeypatch.setattr(client, "control_roots", lambda uid: tuple(tmp_path / n for n in names))
+    monkeypatch.setattr(client, "_SERVICE", tmp_path / "service")
+    return tmp_path
+
+
+def test_the_directory_of_the_service_is_preferred_where_it_exists(roots) -> None:
+    """No other user can take a name there, and no cleaner of /tmp removes its files."""
+    assert client.make_control_root(os.geteuid()) == roots / "tmp/rosrm-0/portable"
+    assert not (roots / "service").exists()
+    (roots / "service").mkdir()
+    assert client.make_control_root(os.geteuid()) == roots / "service/0/portable"
+
+
+def test_a_taken_name_costs_another_directory(roots, precious) -> None:
+    """Any user can create /tmp/rosrm-UID first, as a directory of its own or as a link."""
+    taken = roots / "tmp/rosrm-0"
+    taken.symlink_to(precious.parent)
+    assert client.make_control_root(os.geteuid()) == roots / "tmp/second/portable"
+    if os.geteuid() == 0:
+        taken.unlink()
+        taken.mkdir()
+        os.chown(taken, NOBODY, -1)
+        assert client.make_control_root(os.geteuid()) == roots / "tmp/second/portable"
+    assert unchanged(precious)
+
+
+def test_where_every_name_is_taken_each_reason_is_given(roots) -> None:
+    """The launcher refuses the start with it, and the master tries another host."""
+    for name in ("rosrm-0", "second"):
+        (roots / "tmp" / name).write_text("taken")
+    with pytest.raises(PortableError, match="no control directory can be made") as refusal:
+        client.make_control_root(os.geteuid())
+    for name in ("rosrm-0", "second"):
+        assert f"{roots}/tmp/{name} is no directory" in str(refusal.value)
+
+
+def test_a_control_directory_has_a_known_parent() -> None:
+    """A path of another host is accepted if that host may have chosen it."""
+    for root in client.control_roots(1000):
+        assert client.is_control_directory(root / "token", 1000)
+        assert not client.is_control_directory(root / "token", 1001)
+        assert not client.is_control_directory(root / "token/deeper", 1000)
+    assert not client.is_control_directory(Path("/etc/cron.d"), 1000)
+
+
 def test_a_user_gets_no_directory_elsewhere(of_nobody, precious) -> None:
     """A path outside the user's control root is refused, since a process could report any path."""
     with pytest.raises(PortableError, match=r"no control directory of user 65534"):

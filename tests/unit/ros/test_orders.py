@@ -53,6 +53,15 @@ def test_an_order_is_the_same_after_its_way_to_the_slave(order):
     assert order_from_msg(order_to_msg(order)) == order
 
 
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -1.0, 4e8])
+@pytest.mark.parametrize("order", [ORDERS[-3], ORDERS[-2]], ids=["timeout", "keep_every"])
+def test_an_order_with_a_time_that_never_ends_is_refused(order, seconds):
+    request = order_to_msg(order)
+    request.timeout = request.keep_every = seconds
+    with pytest.raises(Refused, match="allowed: 0 to"):
+        order_from_msg(request)
+
+
 @pytest.mark.parametrize(("order", "event"), EVENTS, ids=lambda one: type(one).__name__)
 def test_an_order_for_the_core_becomes_its_event(order, event):
     assert event_of(order, 5.0) == event

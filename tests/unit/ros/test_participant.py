@@ -74,7 +74,7 @@ def asked(kind, handle, request=None):
 
 
 def test_a_request_whose_handler_raises_is_answered_as_failed(caplog) -> None:
-    """The caller need not wait for a time-out; the answer names the error and its place."""
+    """The caller need not wait for a time-out; the answer names the error."""
 
     def handle(_request, _open_request):
         raise Refused("a result is a JSON NoneType, not an object")
@@ -86,6 +86,17 @@ def test_a_request_whose_handler_raises_is_answered_as_failed(caplog) -> None:
     (greeting,) = asked(srv.Handshake, handle)
     assert not greeting.accepted
     assert "not an object" in greeting.message
+
+
+def test_an_error_of_the_receiver_is_answered_without_its_paths(caplog) -> None:
+    """Everybody may ask; the log of the receiver has the text and the place."""
+
+    def handle(_request, _open_request):
+        raise OSError(36, "File name too long", "/home/ada/.local/state/rosrm/x")
+
+    (response,) = asked(srv.Submit, handle)
+    assert response.answer.message == "an error of the receiver: OSError; its log has the cause"
+    assert "/home/ada" in caplog.messages[0]
 
 
 def test_a_request_that_was_answered_is_not_answered_again(caplog) -> None:

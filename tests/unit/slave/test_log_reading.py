@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import stat
 
+import hypothesis.strategies as st
 import pytest
+from hypothesis import HealthCheck, given, settings
 
 from rosrm.errors import Refused
 from rosrm.model.values import InstanceId
@@ -196,11 +198,46 @@ def test_one_answer_is_bounded(tmp_path, log) -> None:
 
 
 def test_a_missing_log_is_refused(tmp_path) -> None:
-    """The refusal names the file."""
-    with pytest.raises(Refused, match="no log of robot/p#3"):
+    """The refusal names no path: everybody may ask."""
+    with pytest.raises(Refused, match="no log of robot/p#3") as refusal:
         read(tmp_path)
+    assert str(tmp_path) not in str(refusal.value)
     with pytest.raises(Refused, match="no log of nobody"):
         newest_instance(tmp_path, "nobody")
+
+
+def test_a_log_that_cannot_be_read_is_refused_without_its_path(tmp_path) -> None:
+    """A name of 300 letters ended the slave by an `OSError`."""
+    (tmp_path / "logs").mkdir()
+    query = LogQuery("p" * 300, 1)
+    with pytest.raises(Refused, match="cannot be read: File name too long") as refusal:
+        read_log(tmp_path, query, ended=True)
+    assert str(tmp_path) not in str(refusal.value)
+
+
+@given(
+    st.builds(
+        LogQuery,
+        st.sampled_from([P.process, "", ".", "..", "../../etc/passwd", "/etc/passwd", "a\0b"])
+        | st.text(),
+        st.just(P.number) | st.integers(0, 2**64 - 1),
+        st.integers(0, 2**64 - 1),
+        st.integers(0, 2**32 - 1),
+        st.floats(),
+        st.integers(0, 2**32 - 1),
+    )
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_any_request_is_answered_with_a_part_or_a_refusal(tmp_path, log, query) -> None:
+    """Whatever a client sends, the slave raises nothing else, and names no path."""
+    log.write_bytes(b"a line\n" * 100)
+    refusal, part = "", None
+    try:
+        part = read_log(tmp_path, query, ended=True)
+    except Refused as refused:
+        refusal = str(refused)
+    assert str(tmp_path) not in refusal
+    assert part is None or 0 <= part.offset <= part.next_offset <= 700
 
 
 def test_newest_instance(tmp_path, log) -> None:

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import LabError
+from rosrm.runtime.private_files import open_private
 from rosrm_lab import needs
 from rosrm_lab.plan import HostPlan
+from rosrm_lab.store import make_private_folder
 
 #: Seconds for mkfs on a sparse file.
 _FORMAT: Final = 60.0
@@ -21,8 +23,8 @@ def make(image: Path, host: HostPlan) -> None:
     Raises:
         LabError: it could not be made.
     """
-    image.parent.mkdir(parents=True, exist_ok=True)
-    with image.open("wb") as file:
+    make_private_folder(image.parent)
+    with os.fdopen(open_private(str(image), os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "wb") as file:
         file.truncate(host.disk)
     command = [
         needs.find_command("mkfs.ext4"),

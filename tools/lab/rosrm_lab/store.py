@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import socket
 import time
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import LabError
+from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.supervisor.procfs import read_stat
 from rosrm_lab import wires
 from rosrm_lab.plan import PREFIX, LabPlan
@@ -123,10 +125,25 @@ def read(lab: str) -> LabRecord | None:
 def write(record: LabRecord) -> None:
     """Write the state of a lab; a reader sees the old or the new file, never a part."""
     folder = RUN / record.plan.name
-    folder.mkdir(parents=True, exist_ok=True)
+    make_private_folder(folder)
     part = folder / f"{_FILE}.part"
-    part.write_text(json.dumps(record.to_plain()))
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+    with os.fdopen(open_private(str(part), flags), "w", encoding="utf-8") as file:
+        file.write(json.dumps(record.to_plain()))
     part.replace(folder / _FILE)
+
+
+def make_private_folder(folder: Path) -> None:
+    """Create the folder of a lab below `RUN` or `IMAGES`, both for the lab's user alone.
+
+    Raises:
+        LabError: it cannot be created, or belongs to another user.
+    """
+    try:
+        make_private_directory(folder.parent)
+        make_private_directory(folder)
+    except OSError as error:
+        raise LabError(f"the folder {folder} cannot be used: {error.strerror}") from None
 
 
 def image(lab: str, host: str) -> Path:

@@ -30,9 +30,53 @@ from rosrm_criu.control.messages import (
 _LOOK: Final = 0.005
 
 
+#: Made by an administrator or a service manager on all hosts, if at all; see `control_roots`.
+_SERVICE: Final = Path("/run/rosrm")
+
+
 def control_root(uid: int) -> Path:
-    """Return the parent of all control directories of a user; every host can create this path."""
+    """Return the usual parent of the control directories of a user; every host can create it."""
     return Path(f"/tmp/rosrm-{uid}/portable")  # noqa: S108 - owner and mode are checked
+
+
+def control_roots(uid: int) -> tuple[Path, ...]:
+    """Return all parents that control directories of a user may have, the preferred one first.
+
+    The path of a node stays the same on all hosts that it moves to. So a directory that only exists
+    during a login comes after /tmp, where another user may have taken the name.
+    """
+    return (
+        _SERVICE / str(uid) / "portable",
+        control_root(uid),
+        Path(f"/run/user/{uid}/rosrm/portable"),
+        Path(f"/var/tmp/rosrm-{uid}/portable"),  # noqa: S108 - owner and mode are checked
+    )
+
+
+def make_control_root(uid: int) -> Path:
+    """Create the first parent of control directories that can be used, and return it.
+
+    Raises:
+        PortableError: none can be used; the message has the reason for each.
+    """
+    faults = []
+    for root in control_roots(uid):
+        if root.is_relative_to(_SERVICE) and not _SERVICE.is_dir():
+            continue
+        try:
+            make(root, uid)
+        except OSError as error:
+            faults.append(f"{root}: {error.strerror}")
+        except PortableError as error:
+            faults.append(str(error))
+        else:
+            return root
+    raise PortableError(f"no control directory can be made for user {uid}: {'; '.join(faults)}")
+
+
+def is_control_directory(directory: Path, uid: int) -> bool:
+    """Return True if a path is one of a control directory of a user."""
+    return directory.parent in control_roots(uid) and not directory.name.startswith(".")
 
 
 def control_directory(token: str, uid: int) -> Path:
@@ -66,15 +110,15 @@ def make_directory(directory: Path, uid: int | None = None) -> None:
     """Create an empty control directory, before a process starts or is restored.
 
     Args:
-        directory: an absolute path, readable by its owner alone. For another user it must be
-            one of `control_directory`, because a process chooses the path that it reports.
+        directory: an absolute path, readable by its owner alone. For another user it must be one
+            of `is_control_directory`, because a process chooses the path that it reports.
         uid: the owner; None: this process's user.
 
     Raises:
         PortableError: it cannot be created, or belongs to another user.
     """
     owner = os.geteuid() if uid is None else uid
-    if owner != os.geteuid() and directory != control_directory(directory.name, owner):
+    if owner != os.geteuid() and not is_control_directory(directory, owner):
         raise PortableError(
             f"{directory} is no control directory of user {owner}: these are in "
             f"{control_root(owner)}"

@@ -129,13 +129,17 @@ def _replace(source: Path, folder: int, name: str, mode: int) -> None:
     with contextlib.suppress(FileNotFoundError):
         os.unlink(new, dir_fd=folder)
     descriptor = os.open(new, _NEW, 0o600, dir_fd=folder)
-    with source.open("rb") as copy, os.fdopen(descriptor, "wb") as file:
-        shutil.copyfileobj(copy, file)
-        if os.geteuid() == 0:
-            before = _status(folder, name)
-            os.fchown(descriptor, before.st_uid, before.st_gid)
-        os.fchmod(descriptor, mode & _PERMISSIONS)
-    os.rename(new, name, src_dir_fd=folder, dst_dir_fd=folder)
+    try:
+        with source.open("rb") as copy, os.fdopen(descriptor, "wb") as file:
+            shutil.copyfileobj(copy, file)
+            if os.geteuid() == 0:
+                before = _status(folder, name)
+                os.fchown(descriptor, before.st_uid, before.st_gid)
+            os.fchmod(descriptor, mode & _PERMISSIONS)
+        os.rename(new, name, src_dir_fd=folder, dst_dir_fd=folder)
+    except OSError:
+        os.unlink(new, dir_fd=folder)
+        raise
 
 
 def _status(folder: int, name: str) -> os.stat_result:

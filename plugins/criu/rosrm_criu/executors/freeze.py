@@ -10,8 +10,8 @@ from rosrm_criu.control.client import (
     ask_prepare,
     ask_resume,
     await_left,
-    control_directory,
     directory_of,
+    is_control_directory,
     listens,
     make_directory,
 )
@@ -84,7 +84,7 @@ def control_of(pid: int) -> Path:
         )
     owner = owner_of(pid)
     # A process chooses its environment: another user could name a place for root to write to.
-    if owner != os.geteuid() and found != control_directory(found.name, owner):
+    if owner != os.geteuid() and not is_control_directory(found, owner):
         raise CriuError(f"process {pid} of user {owner} names {found}: that is no place for it")
     return found
 

@@ -16,7 +16,7 @@ from rosrm.errors import CriuError, PortableError
 from rosrm_criu.control.client import (
     ask_resume,
     await_joined,
-    control_directory,
+    is_control_directory,
     make_directory,
 )
 from rosrm_criu.control.directory import remove_directory
@@ -198,7 +198,7 @@ def fetch_image(arguments: Answer) -> Answer:
 def _fetch(asked: StepArguments) -> Answer:
     dumped = asked.results[CHECKPOINT]
     uid, control = int(dumped["uid"]), Path(dumped["control"])
-    if control != control_directory(control.name, uid):
+    if not is_control_directory(control, uid):
         raise PortableError(f"{control} is no control directory of user {uid}")
     received.check_source(uid)
     directory = incoming(asked.state, asked.destination)

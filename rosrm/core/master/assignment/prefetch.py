@@ -14,7 +14,8 @@ from typing import Final
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import Instance
-from rosrm.model.values import LONGEST_TIME, InstanceState, InstanceStatus, Kind, ProcessSpec
+from rosrm.model.durations import LONGEST
+from rosrm.model.values import InstanceState, InstanceStatus, Kind, ProcessSpec
 
 #: Longest mean run time, in seconds, of a short job.
 _SHORT: Final = 0.5
@@ -27,7 +28,7 @@ _NEWEST: Final = 0.3
 def learn_run_time(state: MasterState, spec: ProcessSpec, status: InstanceStatus) -> None:
     """Update the mean run time of a program with a job that has exited."""
     is_job = spec.kind is Kind.JOB and status.state is InstanceState.EXITED
-    if is_job and 0.0 < status.run_time <= LONGEST_TIME:
+    if is_job and 0.0 < status.run_time <= LONGEST:
         before = state.run_times.get(spec.program, status.run_time)
         state.run_times[spec.program] = before + _NEWEST * (status.run_time - before)
 

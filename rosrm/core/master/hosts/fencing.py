@@ -31,12 +31,13 @@ def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
     follows = spec.host_loss.then == "elsewhere" or spec.standby.wanted
     stops = spec.isolation.then == "stop"
     graces = spec.stop.interrupt_grace + spec.stop.terminate_grace
+    own = max(spec.isolation.after, 0.0)  # a negative one would end each instance at its start
     if not follows:
-        return Fence(spec.isolation.after or settings.lease, graces) if stops else None
+        return Fence(own or settings.lease, graces) if stops else None
     delay = 0.0 if spec.standby.wanted else spec.host_loss.delay
     until_successor = max(settings.lease + delay - settings.suspect - _MARGIN, _MARGIN)
     grace = min(graces, _TO_END * until_successor)
-    after = spec.isolation.after or until_successor - grace
+    after = own or until_successor - grace
     grace = min(graces, max(0.0, until_successor - after))
     return Fence(after, grace, alive=not stops)
 

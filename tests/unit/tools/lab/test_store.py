@@ -37,6 +37,15 @@ def test_a_record_is_read_as_it_was_written():
     assert store.read("lab") == record()
 
 
+def test_the_files_of_a_lab_are_for_its_user_alone():
+    """The disks of the hosts hold state directories."""
+    store.write(record())
+    store.make_private_folder(store.image("lab", "host1").parent)
+    folders = (store.RUN, store.RUN / "lab", store.IMAGES, store.IMAGES / "lab")
+    assert {folder.stat().st_mode & 0o777 for folder in folders} == {0o700}
+    assert (store.RUN / "lab" / "lab.json").stat().st_mode & 0o777 == 0o600
+
+
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"version": 2}', '{"version": 1}', "null"])
 def test_a_damaged_record_is_as_good_as_none(damage):
     """The parts of a lab can be removed without its record."""
