@@ -28,7 +28,7 @@ class Stage:
         self.master = Participant(settings, "rosrm_master")
         self.nodes = Participant(settings, "p_1700000000")
         self.events: list[object] = []
-        self.refused: list[tuple[str, str]] = []
+        self.refused: list[tuple[str, str, str]] = []
         self.configs: list[StateConfig] = []
         self.endpoint = HandoffEndpoint(
             self.master, "ours", 5, self.events.append, lambda *why: self.refused.append(why)
@@ -103,8 +103,8 @@ def test_invalid_reports_and_other_handoffs_have_no_effect(stage):
     stage.report(12)
     stage.wait(lambda: stage.events, "a report")
     assert stage.events == [HandoffReported("p", 2, 2, ReportPhase.READY, 0, "")]
-    assert [who for who, _ in stage.refused] == ["p#2 in a handoff"] * 2
-    assert stage.refused[1][1] == "unknown phase 99"
+    assert [one[:2] for one in stage.refused] == [("handoff", "p#2 in a handoff")] * 2
+    assert stage.refused[1][2] == "unknown phase 99"
 
 
 def test_after_done_the_master_does_not_listen(stage):
