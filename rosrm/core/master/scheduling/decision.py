@@ -133,12 +133,13 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
         chosen: column decided elsewhere, -1: none; None: the best.
     """
     column = ranking.best() if chosen is None else chosen
-    listed = [host.column for host in ranking.table.listed()]
+    listed = ranking.table.listed()
+    first = [host.column for host in listed[:_NAMED_HOSTS]]
     if len(listed) <= _NAMED_HOSTS:
-        moment = _moment(ranking, _first(column, listed))
+        moment = _moment(ranking, _first(column, first))
         return Decision(column, ranking.policy_name, moment, EMPTY)
     # With many hosts, only the runners-up are named, because this path must be quick.
-    nearly = ranking.lowest() if column >= 0 else listed[:_NAMED_HOSTS]
+    nearly = ranking.lowest() if column >= 0 else first
     moment = _moment(ranking, _first(column, nearly))
     named, fitting = len(moment.value), int(np.count_nonzero(ranking.value < np.inf))
     named_fitting = sum(value < np.inf for value in moment.value.tolist())
