@@ -13,6 +13,7 @@ import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 import yaml
 
@@ -64,6 +65,30 @@ def make_secret(home: Path) -> ClusterSecret:
             raise ConfigError(f"{home / CLUSTER_FILE} was removed at this moment") from None
         return found
     return secret
+
+
+def rotate(home: Path, directory: Path) -> list[Path]:
+    """Replace the cluster's secret, and write new key files of all principals.
+
+    Args:
+        home: directory of this user's keys.
+        directory: for the key files; created if it is missing.
+
+    Returns:
+        The key files. They are written first, so that no principal is without a key.
+
+    Raises:
+        ConfigError: a file is invalid, or others can read it.
+        OSError: a file cannot be written; the former secret is still valid.
+    """
+    secret = ClusterSecret(os.urandom(KEY_BYTES))
+    written = []
+    for grant in read_grants(home):
+        path = directory / f"{grant.principal.kind}-{quote(grant.principal.name, safe='@')}.key"
+        _write(path, _fields_of(secret.key_of(grant)))
+        written.append(path)
+    _write(home / CLUSTER_FILE, {"secret": _text_of(secret.secret)})
+    return written
 
 
 # --- grants --------------------------------------------------------------------------------
@@ -129,10 +154,11 @@ def _write_grants(home: Path, entries: list[tuple[Grant, bool]]) -> None:
 
 def text_of(key: PrincipalKey) -> str:
     """Return the content of a principal's key file."""
-    return _WARNING + yaml.safe_dump(
-        {**_row_of(key.grant), "key": _text_of(key.key), "master": _text_of(key.master)},
-        sort_keys=False,
-    )
+    return _text(_fields_of(key))
+
+
+def _fields_of(key: PrincipalKey) -> dict[str, Any]:
+    return {**_row_of(key.grant), "key": _text_of(key.key), "master": _text_of(key.master)}
 
 
 def read_key(path: Path) -> PrincipalKey:
@@ -271,6 +297,10 @@ def _check_private(path: Path, facts: os.stat_result) -> None:
         )
 
 
+def _text(fields: Mapping[str, Any]) -> str:
+    return _WARNING + yaml.safe_dump(dict(fields), sort_keys=False)
+
+
 def _write(path: Path, fields: Mapping[str, Any], *, new: bool = False) -> None:
     """Write a file that only its owner can read, whole or not at all.
 
@@ -282,7 +312,7 @@ def _write(path: Path, fields: Mapping[str, Any], *, new: bool = False) -> None:
     descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
         with os.fdopen(descriptor, "w") as file:
-            file.write(_WARNING + yaml.safe_dump(dict(fields), sort_keys=False))
+            file.write(_text(fields))
             file.flush()
             os.fsync(file.fileno())
         if new:
