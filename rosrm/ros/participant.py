@@ -174,14 +174,14 @@ def _call_bounded(callback: Callable[..., None], *arguments: Any) -> None:
     callback(*arguments)
 
 
-def failed_response(service_type: Any, reason: str) -> Any:
-    """Return the response to a request whose handler raised."""
+def failed_response(service_type: Any, reason: str, code: str = "failed") -> Any:
+    """Return the response to a request whose handler raised, or that cannot be handled."""
     response = service_type.Response()
     answer = getattr(response, "answer", response)  # a handshake's response is itself the answer
     answer.protocol_version, answer.accepted = PROTOCOL_VERSION, False
-    answer.message = f"an error of the receiver: {reason}"
+    answer.message = f"an error of the receiver: {reason}" if code == "failed" else reason
     if hasattr(answer, "code"):
-        answer.code = "failed"
+        answer.code = code
     return response
 
 
