@@ -39,6 +39,7 @@ _CORE: Final = CoreSettings()
 Options = Annotated[Mapping[str, Any], NullIsEmpty()]
 Ros = Annotated[RosSettings, RosSection()]
 Scope = Literal["machine", "cgroup", "slice"]
+SecurityMode = Literal["keys", "none"]
 
 
 def default_state(name: str, role: str) -> Path:
@@ -58,6 +59,19 @@ def default_scope() -> Scope:
     if word not in scopes:
         raise ConfigError(f"ROSRM_SCOPE={word!r}; allowed: machine, cgroup")
     return scopes[word]
+
+
+def default_security() -> SecurityMode:
+    """Return the default security of a part: ROSRM_SECURITY, or "keys".
+
+    Raises:
+        ConfigError: the variable has a value that is not allowed.
+    """
+    modes: Mapping[str, SecurityMode] = {"": "keys", "keys": "keys", "none": "none"}
+    word = os.environ.get("ROSRM_SECURITY", "")
+    if word not in modes:
+        raise ConfigError(f"ROSRM_SECURITY={word!r}; allowed: keys, none")
+    return modes[word]
 
 
 # --- cluster.yaml -----------------------------------------------------------------------------
@@ -197,6 +211,7 @@ class ClusterConfig:
     Attributes:
         name: name of the cluster and its master.
         ros: domain, discovery and transports.
+        security: "keys": only holders of keys are heard; "none": every participant is.
         state: state directory of the master; by default under XDG_STATE_HOME.
         scoring: policy that orders the hosts that fit.
         migration: strategies and limits of migrations.
@@ -213,6 +228,7 @@ class ClusterConfig:
 
     name: str = "rosrm"
     ros: Ros = field(default_factory=RosSettings)
+    security: SecurityMode = field(default_factory=default_security)
     state: Path = Path()
     scoring: ScoringChoice = field(default_factory=ScoringChoice)
     migration: MigrationSettings = field(default_factory=MigrationSettings)
@@ -314,6 +330,7 @@ class HostConfig:
     Attributes:
         host: name of the host; each name has at most one live slave.
         ros: domain, discovery and transports.
+        security: "keys" or "none", as the master's.
         state: state directory of the slave; by default under XDG_STATE_HOME.
         labels: labels that processes may require, prefer or avoid.
         scope: scope of the probes: the machine, the cgroup of the slave, or the process trees of
@@ -334,6 +351,7 @@ class HostConfig:
 
     host: str = field(default_factory=socket.gethostname)
     ros: Ros = field(default_factory=RosSettings)
+    security: SecurityMode = field(default_factory=default_security)
     state: Path = Path()
     labels: Mapping[str, Annotated[str, PlainWord()]] = field(default_factory=lambda: EMPTY)
     scope: Scope = field(default_factory=default_scope)

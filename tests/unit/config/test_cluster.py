@@ -80,6 +80,8 @@ def test_every_setting_is_read(file, tmp_path):
               discovery: {range: localhost, server: "10.0.0.1:11811"}
               transports: UDPv4
               namespace: /fleet/rosrm
+              interface: wg0
+            security: none
             state: here
             scoring: {policy: threshold, options: {a: 1}}
             migration:
@@ -102,7 +104,8 @@ def test_every_setting_is_read(file, tmp_path):
     assert (config.name, config.state) == ("lab", tmp_path / "here")
     assert (config.ros.domain, config.ros.discovery_range) == (7, "localhost")
     assert (config.ros.discovery_server, config.ros.transports) == ("10.0.0.1:11811", "UDPv4")
-    assert config.ros.namespace == "/fleet/rosrm"
+    assert (config.ros.namespace, config.ros.interface) == ("/fleet/rosrm", "wg0")
+    assert config.security == "none"
     assert (config.scoring.policy, config.scoring.options) == ("threshold", {"a": 1})
     assert dict(config.migration.strategies) == {"relaunch": {}, "handoff": {"x": 2}}
     assert config.core() == CoreSettings(
