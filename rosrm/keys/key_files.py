@@ -7,10 +7,10 @@ as ssh does. A principal's file may have any name that ends in ".key".
 from __future__ import annotations
 
 import base64
-import errno
+import contextlib
+import fcntl
 import os
-import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -21,12 +21,21 @@ from rosrm.errors import ConfigError
 from rosrm.keys.cluster import ClusterSecret, PrincipalKey, own_grant
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.keys.roles import Grant, Principal, Role, principal_of
+from rosrm.runtime import atomic_file
+from rosrm.runtime.private_files import (
+    make_private_directory,
+    make_safe_directory,
+    open_own,
+    open_private,
+)
 
 #: File of the cluster's secret, on the master's machine alone.
 CLUSTER_FILE: Final = "cluster.key"
 #: File of the grants, beside it.
 GRANTS_FILE: Final = "principals.yaml"
 
+_LOCK_FILE: Final = "keys.lock"
+_OTHERS: Final = 0o077
 _LARGEST: Final = 1 << 20
 _WARNING: Final = "# Secret: whoever reads this file can act as its owner. Mode 0600.\n"
 
@@ -55,16 +64,22 @@ def make_secret(home: Path) -> ClusterSecret:
     """Return the cluster's secret, drawn now if this directory has none.
 
     Two masters that start at once get the same one.
+
+    Raises:
+        ConfigError: the file is invalid, others can read it, or it cannot be written.
     """
+    with _locked(home):
+        return read_secret(home) or _draw_secret(home)
+
+
+def _draw_secret(home: Path) -> ClusterSecret:
     secret = ClusterSecret(os.urandom(KEY_BYTES))
-    try:
-        _write(home / CLUSTER_FILE, {"secret": _text_of(secret.secret)}, new=True)
-    except FileExistsError:
-        found = read_secret(home)
-        if found is None:
-            raise ConfigError(f"{home / CLUSTER_FILE} was removed at this moment") from None
-        return found
+    _write_secret(home, secret)
     return secret
+
+
+def _write_secret(home: Path, secret: ClusterSecret) -> None:
+    _write(home / CLUSTER_FILE, {"secret": _text_of(secret.secret)})
 
 
 def rotate(home: Path, directory: Path) -> list[Path]:
@@ -78,16 +93,17 @@ def rotate(home: Path, directory: Path) -> list[Path]:
         The key files. They are written first, so that no principal is without a key.
 
     Raises:
-        ConfigError: a file is invalid, or others can read it.
-        OSError: a file cannot be written; the former secret is still valid.
+        ConfigError: a file is invalid, others can read it, or it cannot be written. Then the former
+            secret is still valid.
     """
     secret = ClusterSecret(os.urandom(KEY_BYTES))
     written = []
-    for grant in read_grants(home):
-        path = directory / f"{grant.principal.kind}-{quote(grant.principal.name, safe='@')}.key"
-        _write(path, _fields_of(secret.key_of(grant)))
-        written.append(path)
-    _write(home / CLUSTER_FILE, {"secret": _text_of(secret.secret)})
+    with _locked(home):
+        for grant in read_grants(home):
+            path = directory / f"{grant.principal.kind}-{quote(grant.principal.name, safe='@')}.key"
+            write_key(path, secret.key_of(grant))
+            written.append(path)
+        _write_secret(home, secret)
     return written
 
 
@@ -107,23 +123,35 @@ def add_grant(home: Path, principal: Principal, role: Role) -> Grant:
     """Give a principal a role and a new key; an earlier key of it ends.
 
     Raises:
-        ConfigError: the file is invalid, or others can read it.
+        ConfigError: the file is invalid, others can read it, or it cannot be written.
     """
-    entries = _all_grants(home)
-    newest = max((old.generation for old, _ in entries if old.principal == principal), default=0)
-    grant = Grant(principal, role, newest + 1)
-    others = [(old, revoked) for old, revoked in entries if old.principal != principal]
-    _write_grants(home, [*others, (grant, False)])
+    with _locked(home):
+        entries = _all_grants(home)
+        former = [old.generation for old, _ in entries if old.principal == principal]
+        grant = Grant(principal, role, max(former, default=0) + 1)
+        others = [(old, revoked) for old, revoked in entries if old.principal != principal]
+        _write_grants(home, [*others, (grant, False)])
     return grant
 
 
-def revoke(home: Path, principal: Principal) -> bool:
-    """End the key of a principal; False: it has none."""
-    entries = _all_grants(home)
-    if all(grant.principal != principal or gone for grant, gone in entries):
-        return False
-    _write_grants(home, [(grant, gone or grant.principal == principal) for grant, gone in entries])
-    return True
+def revoke(home: Path, principals: Collection[Principal]) -> None:
+    """End the keys of principals, of all or of none.
+
+    Raises:
+        ConfigError: one of them has no key, the file is invalid, others can read it, or it cannot
+            be written.
+    """
+    with _locked(home):
+        entries = _all_grants(home)
+        held = {grant.principal for grant, revoked in entries if not revoked}
+        unknown = [str(one) for one in principals if one not in held]
+        if unknown:
+            raise ConfigError(
+                f"no key of {', '.join(unknown)}; `rosrm key list` shows all. Nothing was revoked"
+            )
+        _write_grants(
+            home, [(grant, gone or grant.principal in principals) for grant, gone in entries]
+        )
 
 
 def grants_version(home: Path) -> tuple[int, int]:
@@ -161,6 +189,19 @@ def _fields_of(key: PrincipalKey) -> dict[str, Any]:
     return {**_row_of(key.grant), "key": _text_of(key.key), "master": _text_of(key.master)}
 
 
+def write_key(path: Path, key: PrincipalKey) -> None:
+    """Write a principal's key file; missing directories are created.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    try:
+        make_safe_directory(path.parent)
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+    _write(path, _fields_of(key))
+
+
 def read_key(path: Path) -> PrincipalKey:
     """Return the key in a principal's file.
 
@@ -188,17 +229,18 @@ def find_key(kind: str, name: str, home: Path, explicit: str = "") -> PrincipalK
     """
     if explicit:
         return read_key(Path(explicit))
-    found = [
-        key for key in _keys_in(home)
-        if key.grant.principal.kind == kind and name in ("", key.grant.principal.name)
-    ]  # fmt: skip
+    found = {
+        path: key for path in key_paths(home)
+        if (key := read_key(path)).grant.principal.kind == kind
+        and name in ("", key.grant.principal.name)
+    }  # fmt: skip
     if len(found) > 1:
-        names = ", ".join(str(key.grant.principal) for key in found)
+        names = ", ".join(f"{path.name} ({key.grant.principal})" for path, key in found.items())
         raise ConfigError(
             f"{home} has several keys for this: {names}; name the file of one in ROSRM_KEY"
         )
     if found:
-        return found[0]
+        return next(iter(found.values()))
     secret = read_secret(home)
     if secret is None:
         return None
@@ -215,10 +257,9 @@ def _user() -> str:
         return f"uid-{os.getuid()}"
 
 
-def _keys_in(home: Path) -> Iterator[PrincipalKey]:
-    for path in sorted(home.glob("*.key")):
-        if path.name != CLUSTER_FILE:
-            yield read_key(path)
+def key_paths(home: Path) -> list[Path]:
+    """Return the paths of the principals' key files in a directory."""
+    return [path for path in sorted(home.glob("*.key")) if path.name != CLUSTER_FILE]
 
 
 # --- fields ----------------------------------------------------------------------------------
@@ -266,14 +307,18 @@ def _text_of(key: bytes) -> str:
 def _read(path: Path) -> dict[str, Any] | None:
     """Return the fields of a file that only its owner can read; None: there is no file."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+        descriptor, mode = open_own(str(path), os.O_RDONLY | os.O_NONBLOCK)
     except FileNotFoundError:
         return None
     except OSError as error:
-        why = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
-        raise ConfigError(f"the key file {path} cannot be read: {why}") from None
+        raise ConfigError(f"the key file {path} cannot be used: {error.strerror}") from None
     with os.fdopen(descriptor, "rb") as file:
-        _check_private(path, os.fstat(descriptor))
+        if mode & _OTHERS:
+            raise ConfigError(
+                f"the key file {path} has mode {mode:04o}, so that others can read or change it; "
+                f"run `chmod 600 {path}`. If others may have read it, replace the key: `rosrm key "
+                f"add` again at the master"
+            )
         content = file.read(_LARGEST)
     try:
         fields = yaml.safe_load(content)
@@ -284,40 +329,34 @@ def _read(path: Path) -> dict[str, Any] | None:
     return fields
 
 
-def _check_private(path: Path, facts: os.stat_result) -> None:
-    if not stat.S_ISREG(facts.st_mode):
-        raise ConfigError(f"{path} is no regular file")
-    if facts.st_uid != os.getuid():
-        raise ConfigError(f"the key file {path} belongs to user {facts.st_uid}; make it your own")
-    if facts.st_mode & 0o077:
-        raise ConfigError(
-            f"the key file {path} has mode {stat.S_IMODE(facts.st_mode):04o}, so that others can "
-            f"read it; run `chmod 600 {path}`. If others may have read it, replace the key: `rosrm "
-            f"key add` again at the master"
-        )
-
-
 def _text(fields: Mapping[str, Any]) -> str:
     return _WARNING + yaml.safe_dump(dict(fields), sort_keys=False)
 
 
-def _write(path: Path, fields: Mapping[str, Any], *, new: bool = False) -> None:
-    """Write a file that only its owner can read, whole or not at all.
-
-    Raises:
-        FileExistsError: the file exists, and it was to be a new one.
-    """
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+def _write(path: Path, fields: Mapping[str, Any]) -> None:
+    """Write a file that only its owner can read, whole or not at all, and onto the disk."""
     try:
-        with os.fdopen(descriptor, "w") as file:
-            file.write(_text(fields))
-            file.flush()
-            os.fsync(file.fileno())
-        if new:
-            os.link(draft, path)
-        else:
-            draft.replace(path)
+        os.close(atomic_file.replace(str(path), _text(fields).encode(), os.O_SYNC))
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+
+
+@contextlib.contextmanager
+def _locked(home: Path) -> Iterator[None]:
+    """Create the directory of keys if it is missing, and keep other processes from changing it.
+
+    Otherwise two commands at a time would lose one of two grants.
+    """
+    try:
+        make_private_directory(home)
+        lock = open_private(str(home / _LOCK_FILE), os.O_RDWR | os.O_CREAT)
+    except OSError as error:
+        raise ConfigError(
+            f"the directory of keys {home} cannot be used: {error.strerror}; another one can be "
+            f"named in ROSRM_KEYS"
+        ) from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
     finally:
-        draft.unlink(missing_ok=True)
+        os.close(lock)

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import os
 import stat
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
 from rosrm.wording import counted
 
@@ -22,11 +22,12 @@ if TYPE_CHECKING:
 key = typer.Typer(no_args_is_help=True, help="Manage the keys of hosts and users.")
 
 _PRINCIPAL = typer.Argument(metavar="PRINCIPAL", help="host:NAME or user:NAME.")
+_STANDARD_OUTPUT: Final = 1
 
 
 @key.callback()
 def _group() -> None:
-    """Manage the keys of hosts and users, on the machine of the master."""
+    """Manage the keys of hosts and users: on the machine of the master, but for `check`."""
 
 
 @key.command()
@@ -40,7 +41,7 @@ def init() -> None:
     home = key_files.key_home()
     known = key_files.read_secret(home) is not None
     key_files.make_secret(home)
-    typer.echo(f"{home / key_files.CLUSTER_FILE}: {'exists already' if known else 'drawn'}")
+    echo(f"{home / key_files.CLUSTER_FILE}: {'exists already' if known else 'drawn'}")
 
 
 @key.command()
@@ -54,11 +55,19 @@ def add(
             "(everything).  [default: submitter]",
         ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE",
+            help="Key file, for example robot-1.key, mode 0600; default: the standard output.",
+        ),
+    ] = None,
 ) -> None:  # fmt: skip
-    """Make a new key for a host or user, and write its key file to the standard output.
+    """Make a new key for a host or user, and write its key file.
 
-    An earlier key of the same principal ends at once. Redirect the output to a file, for example
-    `rosrm key add host:robot-1 > robot-1.key`, and copy the file to ~/.config/rosrm/ on that host.
+    An earlier key of the same principal ends at once. Copy the file to ~/.config/rosrm/ on that
+    host. Use --out in a directory that others can read: with `> FILE` the shell creates the file
+    before its mode is 0600.
     """
     from rosrm.keys import key_files
     from rosrm.keys.roles import Role, principal_of
@@ -70,10 +79,15 @@ def add(
     if chosen not in names:
         raise ConfigError(f"{whom} cannot have the role {chosen!r}; allowed: {', '.join(names)}")
     secret = _secret()
-    _make_output_private()
+    if out is None:
+        _make_output_private()
     grant = key_files.add_grant(key_files.key_home(), whom, Role(chosen))
-    typer.echo(key_files.text_of(secret.key_of(grant)), nl=False)
-    typer.echo(
+    made = secret.key_of(grant)
+    if out is None:
+        typer.echo(key_files.text_of(made), nl=False)
+    else:
+        key_files.write_key(out, made)
+    echo(
         f"rosrm: {whom} has a new key (role {chosen}). Copy the file to ~/.config/rosrm/ of its "
         f"user, with mode 0600",
         err=True,
@@ -82,10 +96,9 @@ def add(
 
 def _make_output_private() -> None:
     """Give the file behind the standard output mode 0600, before it holds a key."""
-    descriptor = sys.stdout.fileno()
-    facts = os.fstat(descriptor)
-    if stat.S_ISREG(facts.st_mode) and facts.st_uid == os.getuid():
-        os.fchmod(descriptor, 0o600)
+    facts = os.fstat(_STANDARD_OUTPUT)
+    if stat.S_ISREG(facts.st_mode) and facts.st_uid == os.geteuid():
+        os.fchmod(_STANDARD_OUTPUT, 0o600)
 
 
 @key.command(name="list")
@@ -101,7 +114,7 @@ def list_keys() -> None:
     for grant in grants:
         rows.add_row(str(grant.principal), grant.role.value, str(grant.generation))
     console().print(rows)
-    typer.echo(
+    echo(
         f"{counted(len(grants), 'key', 'keys')}; this user of this machine has all rights by "
         f"{home / key_files.CLUSTER_FILE}"
     )
@@ -114,16 +127,8 @@ def revoke(principals: Annotated[list[str], _PRINCIPAL]) -> None:
     from rosrm.keys.roles import principal_of
 
     chosen = [principal_of(text) for text in principals]
-    home = key_files.key_home()
-    held = {grant.principal for grant in key_files.read_grants(home)}
-    unknown = [str(one) for one in chosen if one not in held]
-    if unknown:
-        raise ConfigError(
-            f"no key of {', '.join(unknown)}; `rosrm key list` shows all. Nothing was revoked"
-        )
-    for one in chosen:
-        key_files.revoke(home, one)
-    typer.echo(f"revoked: {', '.join(map(str, chosen))}")
+    key_files.revoke(key_files.key_home(), chosen)
+    echo(f"revoked: {', '.join(map(str, chosen))}")
 
 
 @key.command()
@@ -145,7 +150,40 @@ def rotate(
 
     _secret()
     written = key_files.rotate(key_files.key_home(), directory)
-    typer.echo(f"a new secret; {counted(len(written), 'key file', 'key files')} in {directory}")
+    echo(f"a new secret; {counted(len(written), 'key file', 'key files')} in {directory}")
+
+
+@key.command()
+def check(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FILE]",
+            help="A key file, for example robot-1.key; default: all keys of this user.",
+        ),
+    ] = None,
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host", metavar="HOST",
+            help="Name of the slave's host, for example robot-1; default: the machine's host name.",
+        ),
+    ] = "",
+) -> None:  # fmt: skip
+    """Show which keys this user has on this machine, and what they do not protect.
+
+    Exits with 1 if a key is missing, open to others, or not valid.
+    """
+    from rosrm.cli.output.keys import file_report, user_report
+    from rosrm.keys.key_files import key_home
+
+    report = user_report(key_home(), host) if file is None else file_report(key_home(), file)
+    for label, text in report.rows:
+        echo(f"{label:<15}{text}")
+    for fault in report.faults:
+        echo(f"{'problem':<15}{fault}")
+    if report.faults:
+        raise typer.Exit(1)
 
 
 def _secret() -> ClusterSecret:

@@ -23,9 +23,45 @@ def test_the_secret_is_drawn_once_and_is_its_owners_alone(tmp_path: Path) -> Non
     with ThreadPoolExecutor(8) as pool:
         secrets = set(pool.map(lambda _: key_files.make_secret(home).secret, range(32)))
     assert len(secrets) == 1
-    assert [path.name for path in home.iterdir()] == [key_files.CLUSTER_FILE]
-    assert stat.S_IMODE((home / key_files.CLUSTER_FILE).stat().st_mode) == 0o600
+    assert {path.name for path in home.iterdir()} == {key_files.CLUSTER_FILE, "keys.lock"}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in home.iterdir()} == {0o600}
     assert stat.S_IMODE(home.stat().st_mode) == 0o700
+
+
+def test_grants_of_commands_at_the_same_time_are_all_kept(tmp_path: Path) -> None:
+    """Each command reads and writes the whole file, one after the other."""
+    names = [Principal("host", f"robot-{number}") for number in range(16)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda one: key_files.add_grant(tmp_path, one, Role.HOST), names))
+    assert {grant.principal for grant in key_files.read_grants(tmp_path)} == set(names)
+
+
+def test_a_full_disk_keeps_the_former_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rotation that fails does not end the keys that are in use."""
+    secret = key_files.make_secret(tmp_path)
+    key_files.add_grant(tmp_path, ROBOT, Role.HOST)
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        with pytest.raises(ConfigError, match=r"robot-1\.key cannot be written: No space left"):
+            key_files.rotate(tmp_path, tmp_path / "new")
+    assert key_files.read_secret(tmp_path) == secret
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+@pytest.mark.parametrize("fault", ["a file", "a link"])
+def test_a_directory_of_keys_that_cannot_be_used_is_refused(tmp_path: Path, fault: str) -> None:
+    """The message names the variable by which another one is chosen."""
+    home = tmp_path / "keys"
+    if fault == "a file":
+        home.touch()
+    else:
+        home.symlink_to(tmp_path)
+    with pytest.raises(ConfigError, match=r"keys cannot be used: .*ROSRM_KEYS"):
+        key_files.make_secret(home)
 
 
 def test_a_key_file_opens_what_its_grant_allows_until_it_is_revoked(tmp_path: Path) -> None:
@@ -33,8 +69,7 @@ def test_a_key_file_opens_what_its_grant_allows_until_it_is_revoked(tmp_path: Pa
     secret = key_files.make_secret(tmp_path)
     first = key_files.add_grant(tmp_path, ROBOT, Role.HOST)
     path = tmp_path / "robot-1.key"
-    path.touch(mode=0o600)
-    path.write_text(key_files.text_of(secret.key_of(first)))
+    key_files.write_key(path, secret.key_of(first))
     held = key_files.read_key(path)
     known = Principals(secret, key_files.read_grants(tmp_path)).key_of(ROBOT, held.grant.generation)
     assert known == held
@@ -44,8 +79,9 @@ def test_a_key_file_opens_what_its_grant_allows_until_it_is_revoked(tmp_path: Pa
     valid = Principals(secret, key_files.read_grants(tmp_path))
     assert valid.key_of(ROBOT, first.generation) is None
     assert valid.key_of(ROBOT, second.generation) is not None
-    assert key_files.revoke(tmp_path, ROBOT)
-    assert not key_files.revoke(tmp_path, ROBOT)
+    key_files.revoke(tmp_path, [ROBOT])
+    with pytest.raises(ConfigError, match="no key of host:robot-1"):
+        key_files.revoke(tmp_path, [ROBOT])
     assert key_files.read_grants(tmp_path) == []
     assert key_files.add_grant(tmp_path, ROBOT, Role.HOST).generation == second.generation + 1
 
@@ -60,8 +96,7 @@ def test_a_process_finds_its_own_key(tmp_path: Path) -> None:
     assert Principals(secret).key_of(ROBOT, OWN) == own
     key = secret.key_of(key_files.add_grant(tmp_path, ROBOT, Role.HOST))
     path = tmp_path / "any name.key"
-    path.touch(mode=0o600)
-    path.write_text(key_files.text_of(key))
+    key_files.write_key(path, key)
     assert key_files.find_key("host", "robot-1", tmp_path) == key
     assert key_files.find_key("user", "", tmp_path, explicit=str(path)) == key
     me = key_files.find_key("user", "", tmp_path)
@@ -70,14 +105,13 @@ def test_a_process_finds_its_own_key(tmp_path: Path) -> None:
 
 
 def test_keys_of_two_users_are_not_guessed_at(tmp_path: Path) -> None:
-    """The message names both and the variable that chooses."""
+    """The message names both files and the variable that chooses."""
     secret = key_files.make_secret(tmp_path)
     for name in ("ada", "bob"):
-        path = tmp_path / f"{name}.key"
-        path.touch(mode=0o600)
         grant = key_files.add_grant(tmp_path, principal_of(f"user:{name}"), Role.VIEWER)
-        path.write_text(key_files.text_of(secret.key_of(grant)))
-    with pytest.raises(ConfigError, match=r"user:ada, user:bob; .*ROSRM_KEY"):
+        key_files.write_key(tmp_path / f"{name}.key", secret.key_of(grant))
+    named = r"ada\.key \(user:ada\), bob\.key \(user:bob\); .*ROSRM_KEY"
+    with pytest.raises(ConfigError, match=named):
         key_files.find_key("user", "", tmp_path)
 
 
@@ -98,7 +132,7 @@ def test_a_link_a_pipe_and_a_file_of_another_user_are_refused(
     key_files.make_secret(tmp_path)
     path = tmp_path / key_files.CLUSTER_FILE
     with monkeypatch.context() as patch:
-        patch.setattr(os, "getuid", lambda: path.stat().st_uid + 1)
+        patch.setattr(os, "geteuid", lambda: path.stat().st_uid + 1)
         with pytest.raises(ConfigError, match="belongs to user"):
             key_files.read_secret(tmp_path)
     moved = path.rename(tmp_path / "moved")
