@@ -24,7 +24,7 @@ _NOT_PROTECTED: Final = (
 
 @dataclass
 class KeyReport:
-    """Facts for people, and faults that they should remove.
+    """Facts, and faults that the user should remove.
 
     Attributes:
         rows: label and text of each fact.
