@@ -84,7 +84,7 @@ def add(
     grant = key_files.add_grant(key_files.key_home(), whom, Role(chosen))
     made = secret.key_of(grant)
     if out is None:
-        typer.echo(key_files.text_of(made), nl=False)
+        echo(key_files.text_of(made).rstrip())
     else:
         key_files.write_key(out, made)
     echo(
