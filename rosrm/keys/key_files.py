@@ -154,10 +154,14 @@ def revoke(home: Path, principals: Collection[Principal]) -> None:
         )
 
 
-def grants_version(home: Path) -> tuple[int, int]:
-    """Return a value that changes whenever the grants change."""
+def grants_version(home: Path) -> tuple[tuple[int, int], ...]:
+    """Return a value that changes whenever the grants or the cluster's secret change."""
+    return tuple(_version(home / name) for name in (GRANTS_FILE, CLUSTER_FILE))
+
+
+def _version(path: Path) -> tuple[int, int]:
     try:
-        facts = (home / GRANTS_FILE).stat()
+        facts = path.stat()
     except FileNotFoundError:
         return (0, 0)
     return (facts.st_mtime_ns, facts.st_ino)

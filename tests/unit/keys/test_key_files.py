@@ -36,6 +36,21 @@ def test_grants_of_commands_at_the_same_time_are_all_kept(tmp_path: Path) -> Non
     assert {grant.principal for grant in key_files.read_grants(tmp_path)} == set(names)
 
 
+def test_each_change_of_grants_or_secret_changes_their_version(tmp_path: Path) -> None:
+    """A running master looks at the version, and reads the files again after a change."""
+    changes = [
+        lambda: key_files.make_secret(tmp_path),
+        lambda: key_files.add_grant(tmp_path, ROBOT, Role.HOST),
+        lambda: key_files.rotate(tmp_path, tmp_path / "new"),
+        lambda: key_files.revoke(tmp_path, [ROBOT]),
+    ]
+    seen = {key_files.grants_version(tmp_path)}
+    for change in changes:
+        change()
+        seen.add(key_files.grants_version(tmp_path))
+    assert len(seen) == 1 + len(changes)
+
+
 def test_a_full_disk_keeps_the_former_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A rotation that fails does not end the keys that are in use."""
     secret = key_files.make_secret(tmp_path)
