@@ -68,7 +68,7 @@ class Starter:
         # Without this report the master would withdraw the assignment.
         waiting = [
             self.state.held[one.instance].status
-            for one in wanted if one not in ready and one.kept_on
+            for one in wanted if one not in ready and one.snapshot_hosts
         ]  # fmt: skip
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)

@@ -92,7 +92,7 @@ class OneOther:
     """Checkpoint policy with one replica, on the same host as long as that is up."""
 
     def choose(self, view: CheckpointView) -> CheckpointChoice:
-        there = [name for name in (*view.kept_on, *sorted(view.hosts)) if name in view.hosts]
+        there = [name for name in (*view.replica_hosts, *sorted(view.hosts)) if name in view.hosts]
         return CheckpointChoice(tuple(name for name in there if name != view.host)[:1])
 
 
@@ -182,10 +182,10 @@ class Play(RuleBasedStateMachine):
                 if self.known(machine) and self.is_in_reach(machine)
                 for kept in self.told_kept.get(machine.name, ())
                 if kept.instance.process == one.instance.process
-                and kept.instance.number >= one.kept_from
+                and kept.instance.number >= one.snapshots_from
             }
             if one.has_snapshots:
-                assert keepers <= set(one.kept_on), "assigned to begin from less than is kept"
+                assert keepers <= set(one.snapshot_hosts), "assigned without a known snapshot"
 
     def look_at_order(self, given: list[Assign]) -> None:
         """Check that no process was passed by an equal one (without backfill: by any)."""
@@ -684,7 +684,7 @@ class Play(RuleBasedStateMachine):
         if self.known(machine):
             kept = tuple(machine.kept.values())
             self.told_kept[machine.name] = kept
-            self.tell(happened.KeptStatesReceived(machine.host_id, machine.incarnation, kept))
+            self.tell(happened.SnapshotsReported(machine.host_id, machine.incarnation, kept))
 
     @rule(name=names, durable=chance)
     def master_is_killed_in_the_act(self, name: str, durable: bool) -> None:

@@ -53,13 +53,11 @@ _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
 # --- reports ----------------------------------------------------------------------------------
 
 
-def kept_states_received(
-    state: MasterState, event: happened.KeptStatesReceived, now: float
-) -> None:
+def snapshots_reported(state: MasterState, event: happened.SnapshotsReported, now: float) -> None:
     """Note all snapshots and replicas that a host reports."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is not None:
-        note_states(state, host, event.states, now)
+        note_states(state, host, event.snapshots, now)
 
 
 def note_states(
