@@ -83,8 +83,8 @@ class CheckpointContract:
             choice = self._choice(self.make(), view)
             if choice is not None:
                 for order in islice(permutations(choice.hosts), _ORDERS):
-                    kept = replace(view, age=0.1, replica_hosts=order)
-                    again = self._choice(self.make(), kept)
+                    replicated = replace(view, age=0.1, replica_hosts=order)
+                    again = self._choice(self.make(), replicated)
                     assert again is None or set(again.hosts) == set(choice.hosts), (
                         f"kept on {', '.join(order)} it chooses {', '.join(again.hosts)}"
                     )

@@ -35,13 +35,13 @@ class Starter:
     """Conversion of assignments into orders for the supervisor, after their snapshots arrived.
 
     Attributes:
-        kept: directory of the snapshots.
+        snapshots: directory of the snapshots.
         state: instances of the slave; read-only here.
         take: takes events for the core.
     """
 
     config: HostConfig
-    kept: Path
+    snapshots: Path
     state: SlaveState
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint
@@ -143,5 +143,5 @@ class Starter:
         config = self.config
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
-            self.kept, config.keep.every, config.state / EPOCH_NOTE,
+            self.snapshots, config.keep.every, config.state / EPOCH_NOTE,
         )  # fmt: skip

@@ -51,8 +51,8 @@ def reported(*states: tuple[str, int, int]) -> tuple[SnapshotReport, ...]:
 def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
     """Report all snapshots of a host: process, instance, sequence."""
     machine = cluster.machines[host]
-    kept = reported(*states)
-    cluster.tell(happened.SnapshotsReported(machine.host_id, machine.incarnation, kept))
+    snapshots = reported(*states)
+    cluster.tell(happened.SnapshotsReported(machine.host_id, machine.incarnation, snapshots))
 
 
 def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
