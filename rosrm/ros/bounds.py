@@ -47,8 +47,8 @@ _OTHER_ENTRIES: Final = {
     "Submit_Request.processes": 10_000,
     "List_Response.process_list": 1 << 20,
     "List_Response.plugin_list": 1 << 20,
-    "KeepState_Request.data": 1 << 20,
-    "ReadKept_Response.data": 1 << 20,
+    "StoreReplica_Request.data": 1 << 20,
+    "ReadSnapshot_Response.data": 1 << 20,
     "ReadLog_Response.content": 1 << 20,
 }
 

@@ -278,7 +278,7 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
         node_name=assignment.node_name, shadow=assignment.shadow,
         fence_after=float(fence.after), fence_grace=float(fence.grace),
         fence_alive=fence.alive,
-        kept_on=list(assignment.kept_on), kept_from=assignment.kept_from,
+        snapshot_hosts=list(assignment.snapshot_hosts), snapshots_from=assignment.snapshots_from,
         restored=assignment.restored,
         spec=spec_to_msg(assignment.spec),
     )  # fmt: skip
@@ -294,8 +294,8 @@ def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
         fence = values.Fence(message.fence_after, message.fence_grace, message.fence_alive)
     return values.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
-        message.node_name, message.shadow, fence, tuple(message.kept_on), message.kept_from,
-        message.restored,
+        message.node_name, message.shadow, fence, tuple(message.snapshot_hosts),
+        message.snapshots_from, message.restored,
     )  # fmt: skip
 
 
@@ -354,15 +354,15 @@ def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
     )
 
 
-def snapshot_to_msg(kept: values.SnapshotReport) -> msg.KeptState:
+def snapshot_to_msg(snapshot: values.SnapshotReport) -> msg.SnapshotReport:
     """Return the description of a snapshot on a host as a message."""
-    return msg.KeptState(
-        process=kept.instance.process, number=kept.instance.number, sequence=kept.sequence,
-        size=kept.size,
+    return msg.SnapshotReport(
+        process=snapshot.instance.process, number=snapshot.instance.number,
+        sequence=snapshot.sequence, size=snapshot.size,
     )  # fmt: skip
 
 
-def snapshot_from_msg(message: msg.KeptState) -> values.SnapshotReport:
+def snapshot_from_msg(message: msg.SnapshotReport) -> values.SnapshotReport:
     """Return the inverse of `snapshot_to_msg`; raises `Refused` for an invalid name."""
     fault = name_fault(message.process, "process")
     if fault:

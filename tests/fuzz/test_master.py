@@ -104,7 +104,7 @@ def usages(draw: Any) -> happened.UsagesReceived:
 
 GENERAL = [
     happened.HostLeft, happened.ProcessRequested, happened.StatusesReceived,
-    happened.KeptStatesReceived, happened.CancelRequested, happened.RestartRequested,
+    happened.SnapshotsReported, happened.CancelRequested, happened.RestartRequested,
     happened.CheckpointRequested, happened.RestoreRequested, happened.HostStateRequested,
     happened.PruneRequested, happened.OrderAnswered, happened.AssignmentWithdrawn,
     happened.HandoffReported, happened.PeerRefused, happened.TimePassed,

@@ -19,6 +19,7 @@ from rosrm.model.values import (
     InstanceState,
     InstanceStatus,
     ResourceDescription,
+    SnapshotReport,
 )
 from rosrm.recording.encoding import decode, encode
 from rosrm.recording.frames import FrameKind
@@ -120,8 +121,27 @@ EVENTS: list[tuple[happened.Event, str]] = [
             '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5,'
             '"hostname":"","pid":0,"software_version":"","labels":{"arm":"yes"},"resources":'
             '[{"name":"cpu","unit":"core","capacity":4.0,"scope":"machine"}],"max_processes":0,'
-            '"period":0.1,"executors":[],"absent":{}},"instances":[],"journal_seen":0,"kept":[]}'
+            '"period":0.1,"executors":[],"absent":{}},"instances":[],"journal_seen":0,"snapshots":[]}'
         ),
+    ),
+]
+SNAPSHOTS = (SnapshotReport(InstanceId("a", 7), 3, 9),)
+SNAPSHOTS_TEXT = '[{"instance":{"process":"a","number":7},"sequence":3,"size":9}]'
+RENAMED_EVENTS: list[tuple[happened.Event, str]] = [
+    (
+        happened.HostRegistered(1, HostDescription("h", 5), snapshots=SNAPSHOTS),
+        (
+            '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5},'
+            f'"kept":{SNAPSHOTS_TEXT}}}'
+        ),
+    ),
+    (
+        happened.HostLeft(1, 2, 3, (STATUS,)),
+        (f'{{"kind":"HostLeft","request":1,"host_id":2,"incarnation":3,"kept":[{STATUS_TEXT}]}}'),
+    ),
+    (
+        happened.SnapshotsReported(2, 3, SNAPSHOTS),
+        (f'{{"kind":"KeptStatesReceived","host_id":2,"incarnation":3,"states":{SNAPSHOTS_TEXT}}}'),
     ),
 ]
 
@@ -132,6 +152,14 @@ def test_events_of_a_recording(event: happened.Event, text: str) -> None:
     content = struct.pack("<dd", 1.5, 1.7e9) + text.encode()
     assert encode(event, 1.5, 1.7e9) == (FrameKind.EVENT, content)
     assert decode(FrameKind.EVENT, content).event == event
+
+
+@pytest.mark.parametrize(("event", "text"), RENAMED_EVENTS)
+def test_events_of_a_recording_of_0_1_0(event: happened.Event, text: str) -> None:
+    """Read names of that version in its recordings, and write the present ones."""
+    content = struct.pack("<dd", 1.5, 1.7e9) + text.encode()
+    assert decode(FrameKind.EVENT, content).event == event
+    assert decode(*encode(event, 1.5, 1.7e9)).event == event
 
 
 def test_the_header_of_a_recording() -> None:

@@ -51,14 +51,14 @@ class HostRegistered:
         instances: all instances on the host.
         journal_seen: sequence of the newest record that a former run of this master has reported
             to the slave; 0: none.
-        kept: all snapshots and replicas on the host.
+        snapshots: all snapshots and replicas on the host.
     """
 
     request: int
     description: HostDescription
     instances: tuple[InstanceStatus, ...] = ()
     journal_seen: int = 0
-    kept: tuple[SnapshotReport, ...] = ()
+    snapshots: tuple[SnapshotReport, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +66,14 @@ class HostLeft:
     """A slave is being stopped.
 
     Attributes:
-        kept: instances that the slave leaves running; (): the slave stops all of its instances and
-            reports their ends.
+        left_running: instances that the slave leaves running; (): the slave stops all of its
+            instances and reports their ends.
     """
 
     request: int
     host_id: int
     incarnation: int
-    kept: tuple[InstanceStatus, ...] = ()
+    left_running: tuple[InstanceStatus, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,12 +148,12 @@ class UsagesReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptStatesReceived:
+class SnapshotsReported:
     """A host reported all its snapshots and replicas, the newest of each process."""
 
     host_id: int
     incarnation: int
-    states: tuple[SnapshotReport, ...]
+    snapshots: tuple[SnapshotReport, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,7 +336,7 @@ Event = (
     | ReadingsReceived
     | StatusesReceived
     | UsagesReceived
-    | KeptStatesReceived
+    | SnapshotsReported
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported

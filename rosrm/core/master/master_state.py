@@ -412,16 +412,16 @@ class MasterState:
     ) -> Assignment:  # fmt: skip
         """Return the assignment by which a slave runs an instance of a known process."""
         fence = fence_of(spec, self.settings)
-        kept_on: tuple[str, ...] = ()
-        kept_from = 0
+        snapshot_hosts: tuple[str, ...] = ()
+        snapshots_from = 0
         if self.declared.has_snapshots(spec):
             first_instance = self.processes[spec.name].born
-            kept_from = max(1, first_instance)  # 0: no snapshots
+            snapshots_from = max(1, first_instance)  # 0: no snapshots
             if not shadow and not restored:
-                kept_on = self.replication.in_reach(spec.name, first_instance, self.hosts)
+                snapshot_hosts = self.replication.in_reach(spec.name, first_instance, self.hosts)
         return Assignment(
-            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, kept_from,
-            restored,
+            instance, spec, self.epoch, node_name or spec.name, shadow, fence, snapshot_hosts,
+            snapshots_from, restored,
         )  # fmt: skip
 
     def note_decision(

@@ -163,7 +163,7 @@ class MasterServices:
         try:
             description = convert.host_from_msg(request.host)
             statuses = tuple(convert.status_from_msg(status) for status in request.instances)
-            kept = tuple(convert.snapshot_from_msg(state) for state in request.kept)
+            snapshots = tuple(convert.snapshot_from_msg(state) for state in request.snapshots)
         except Refused as refusal:
             respond(srv.RegisterHost.Response(answer=refused(refusal.code, str(refusal))))
             return
@@ -176,14 +176,14 @@ class MasterServices:
             respond(response)
 
         token, seen = self._keep(answer), int(request.journal_seen)
-        self._handle(happened.HostRegistered(token, description, statuses, seen, kept))
+        self._handle(happened.HostRegistered(token, description, statuses, seen, snapshots))
 
     def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
-        kept = tuple(convert.status_from_msg(status) for status in request.kept)
+        running = tuple(convert.status_from_msg(status) for status in request.left_running)
         link = self._links.find(request.host_id, request.incarnation)
         if link is not None:
             self._links.left(link)
-        return happened.HostLeft(token, request.host_id, request.incarnation, kept)
+        return happened.HostLeft(token, request.host_id, request.incarnation, running)
 
     def _take_poll(self, request: srv.RequestProcess.Request, respond: _Respond) -> None:
         link = self._links.find(request.host_id, request.incarnation)

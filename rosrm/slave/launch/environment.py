@@ -35,7 +35,7 @@ class ProcessLocation:
         host: name of the host in rosrm.
         cluster: name of the master.
         state_config: topic on which the master publishes handoffs.
-        kept: directory of the snapshots of all processes; None: no snapshots.
+        snapshots: directory of the snapshots of all processes; None: no snapshots.
         keep_every: seconds by which a snapshot may be behind the state.
         epoch_file: file with the newest epoch of the master; None: there is none.
     """
@@ -43,14 +43,14 @@ class ProcessLocation:
     host: str
     cluster: str
     state_config: str
-    kept: Path | None = None
+    snapshots: Path | None = None
     keep_every: float = 1.0
     epoch_file: Path | None = None
 
 
-def snapshot_directory(kept: Path, process: str) -> Path:
+def snapshot_directory(snapshots: Path, process: str) -> Path:
     """Return the directory of the snapshots of one process."""
-    return kept / token(process)
+    return snapshots / token(process)
 
 
 def process_environment(
@@ -79,8 +79,8 @@ def process_environment(
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:
         environment[SHADOW] = "1"
-    if assignment.has_snapshots and where.kept is not None:
-        environment[KEEP] = str(snapshot_directory(where.kept, spec.name))
+    if assignment.has_snapshots and where.snapshots is not None:
+        environment[KEEP] = str(snapshot_directory(where.snapshots, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)

@@ -35,13 +35,13 @@ class Starter:
     """Conversion of assignments into orders for the supervisor, after their snapshots arrived.
 
     Attributes:
-        kept: directory of the snapshots.
+        snapshots: directory of the snapshots.
         state: instances of the slave; read-only here.
         take: takes events for the core.
     """
 
     config: HostConfig
-    kept: Path
+    snapshots: Path
     state: SlaveState
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint
@@ -68,7 +68,7 @@ class Starter:
         # Without this report the master would withdraw the assignment.
         waiting = [
             self.state.held[one.instance].status
-            for one in wanted if one not in ready and one.kept_on
+            for one in wanted if one not in ready and one.snapshot_hosts
         ]  # fmt: skip
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
@@ -143,5 +143,5 @@ class Starter:
         config = self.config
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
-            self.kept, config.keep.every, config.state / EPOCH_NOTE,
+            self.snapshots, config.keep.every, config.state / EPOCH_NOTE,
         )  # fmt: skip

@@ -337,16 +337,16 @@ class ReplicationService:
         self._store.make()  # the node creates its own directory below
         directory = self._store.directory(assignment.spec.name)
         if not assignment.shadow and any(
-            head.instance < assignment.kept_from for _, head in snapshot_files(directory)
+            head.instance < assignment.snapshots_from for _, head in snapshot_files(directory)
         ):
-            drop_snapshots(directory, assignment.kept_from - 1)
+            drop_snapshots(directory, assignment.snapshots_from - 1)
         return newest_head(directory)
 
     def _looked(
         self, assignment: Assignment, here: Head | None, done: Callable[[Assignment], None]
     ) -> None:
         """Fetch a newer snapshot from another host, if there is one."""
-        instance, hosts = assignment.instance, assignment.kept_on
+        instance, hosts = assignment.instance, assignment.snapshot_hosts
         if instance not in self._preparing:
             return
         if assignment.shadow or not hosts or hosts[0] == self._host:

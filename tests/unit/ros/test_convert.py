@@ -254,7 +254,7 @@ def test_reports_of_improper_names_are_refused(name) -> None:
             msg.ProcessStatus(state="exited", instance=msg.InstanceId(process=name))
         )
     with pytest.raises(Refused, match="cannot be the name of a process"):
-        convert.snapshot_from_msg(msg.KeptState(process=name))
+        convert.snapshot_from_msg(msg.SnapshotReport(process=name))
 
 
 def test_control_characters_in_a_reason_are_replaced() -> None:
