@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from rosrm.config.markers import NullIsEmpty, OptionsByName, PlainWord, RosSection
-from rosrm.core.master.settings import CoreSettings
+from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings
 from rosrm.errors import ConfigError
 from rosrm.extensions.units import (
     Amount,
@@ -132,6 +132,25 @@ class QueueSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class Quota:
+    """Limits on the processes of one user that have not ended, all together.
+
+    Attributes:
+        processes: most processes.
+        memory: largest sum of their memory needs, in bytes.
+        cpu: largest sum of their CPU needs, in cores.
+    """
+
+    processes: Count | None = None
+    memory: Annotated[float, Quantity("size")] | None = None
+    cpu: Annotated[float, Quantity("cores")] | None = None
+
+    def limits(self) -> Mapping[str, float]:
+        """Return the given limits by name."""
+        return {name: limit for name, limit in to_plain(self).items() if limit is not None}
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessDefaults:
     """Default demand of processes.
 
@@ -216,6 +235,8 @@ class ClusterConfig:
         scoring: policy that orders the hosts that fit.
         migration: strategies and limits of migrations.
         queue: order of the queue.
+        quotas: limits by name of a user; "default" holds for users without an entry, and for
+            limits that an entry does not give.
         defaults: default needs of processes.
         liveness: time limits for silent hosts.
         control: times of messages.
@@ -233,6 +254,7 @@ class ClusterConfig:
     scoring: ScoringChoice = field(default_factory=ScoringChoice)
     migration: MigrationSettings = field(default_factory=MigrationSettings)
     queue: QueueSettings = field(default_factory=QueueSettings)
+    quotas: Mapping[str, Quota] = field(default_factory=lambda: EMPTY)
     defaults: ProcessDefaults = field(default_factory=ProcessDefaults)
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
     control: ControlSettings = field(default_factory=ControlSettings)
@@ -265,6 +287,10 @@ class ClusterConfig:
             keep_ended=self.journal.keep_ended,
             max_hosts=self.max_hosts,
             max_processes=self.queue.max_processes,
+            quotas={
+                name if name == DEFAULT_QUOTA else f"user:{name}": quota.limits()
+                for name, quota in self.quotas.items()
+            },
         )
 
     def to_json(self) -> str:

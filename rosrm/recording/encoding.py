@@ -120,6 +120,8 @@ def decode(kind: FrameKind, content: bytes) -> Happened:
         kind_of_event = _KINDS[_rename(plain)]
         if kind_of_event is happened.OrderAnswered:
             plain["order"] = _order_id(plain["order"])
+        if isinstance(plain.get("by"), str):  # of rosrm 0.1.0, in which each client was an operator
+            plain["by"] = [plain["by"], True]
         event: happened.Event = from_plain(kind_of_event, plain)
     except (struct.error, KeyError, TypeError, AttributeError) as fault:
         raise ValueError(f"{type(fault).__name__}: {fault}") from None

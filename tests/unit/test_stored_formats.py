@@ -12,6 +12,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.slave.watches import Awaited, Memo, Watch
 from rosrm.model.plan import ReportPhase
+from rosrm.model.requester import Requester
 from rosrm.model.values import (
     Health,
     HostDescription,
@@ -85,8 +86,11 @@ STATUS_TEXT = (
 EVENTS: list[tuple[happened.Event, str]] = [
     (happened.TimePassed(), '{"kind":"TimePassed"}'),
     (
-        happened.MigrationRequested(3, "a", by="cli"),
-        '{"kind":"MigrationRequested","request":3,"name":"a","host":null,"by":"cli"}',
+        happened.MigrationRequested(3, "a", by=Requester("user:ada")),
+        (
+            '{"kind":"MigrationRequested","request":3,"name":"a","host":null,'
+            '"by":{"name":"user:ada","is_operator":false}}'
+        ),
     ),
     (
         happened.HandoffReported("a", 8, 7, ReportPhase.READY, 5, "here"),
@@ -160,6 +164,13 @@ def test_events_of_a_recording_of_0_1_0(event: happened.Event, text: str) -> Non
     content = struct.pack("<dd", 1.5, 1.7e9) + text.encode()
     assert decode(FrameKind.EVENT, content).event == event
     assert decode(*encode(event, 1.5, 1.7e9)).event == event
+
+
+def test_a_request_of_rosrm_0_1_0_was_sent_by_an_operator() -> None:
+    """Each client could do everything then, and its event has the name of the client alone."""
+    text = b'{"kind":"CancelRequested","request":3,"names":["a"],"by":"cli"}'
+    event = decode(FrameKind.EVENT, struct.pack("<dd", 1.5, 1.7e9) + text).event
+    assert event == happened.CancelRequested(3, ("a",), Requester("cli", is_operator=True))
 
 
 def test_the_header_of_a_recording() -> None:

@@ -1,6 +1,6 @@
 """Events of the master, in the past tense. Readings arrive as one batch.
 
-`by` of a request is the name of the client that sent it; "": unknown.
+`by` of a request is its sender.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rosrm.core.master.commands import OrderId
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.plan import ReportPhase
+from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.rows import PluginKind
 from rosrm.model.values import (
     EMPTY,
@@ -158,11 +159,11 @@ class SnapshotsReported:
 
 @dataclass(frozen=True, slots=True)
 class SubmissionReceived:
-    """A client submits processes: all are accepted, or none."""
+    """A client submits processes, and owns them from now on: all are accepted, or none."""
 
     request: int
     specs: tuple[ProcessSpec, ...]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,7 @@ class CancelRequested:
 
     request: int
     names: tuple[str, ...]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +181,7 @@ class RestartRequested:
 
     request: int
     names: tuple[str, ...]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +191,7 @@ class MigrationRequested:
     request: int
     name: str
     host: str | None = None
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +200,7 @@ class CheckpointRequested:
 
     request: int
     name: str
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +209,7 @@ class RestoreRequested:
 
     request: int
     name: str
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +219,7 @@ class HostStateRequested:
     request: int
     host: str
     action: Literal["cordon", "uncordon", "drain"]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +234,7 @@ class PruneRequested:
     request: int
     names: tuple[str, ...] = ()
     hosts: tuple[str, ...] = ()
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,9 @@ from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record
+from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.values import EMPTY, LARGEST_NUMBER, Assignment, InstanceId, ProcessSpec
-from rosrm.wording import one_line, sanitized
+from rosrm.wording import sanitized
 
 #: Number of the newest records of a process that `explain` shows.
 _HISTORY: Final = 12
@@ -165,14 +166,19 @@ class MasterState:
 
     def record(
         self, now: float, kind: EventKind, message: str, *, process: str = "", host: str = "",
-        facts: Mapping[str, Any] = EMPTY, by: str = "",
+        facts: Mapping[str, Any] = EMPTY, by: Requester = OPERATOR,
     ) -> None:  # fmt: skip
-        """Write a line of the event record; `by` is the client that requested it."""
-        if by:
-            message, facts = f"{message} (by {by})", {**facts, "by": by}
-        message = sanitized(one_line(message), _LONGEST_RECORD)
-        self.emit(Record(kind, process, host, message, facts))
+        """Write a line of the event record, with the owner of the process and the requester.
+
+        Details are in further lines of the message; only the owner and operators may read them.
+        """
         known = self.processes.get(process)
+        if known is not None and known.principal:
+            facts = {**facts, "owner": known.principal}
+        if by.name:
+            message, facts = f"{message} (by {by.name})", {**facts, "by": by.name}
+        message = sanitized(message, _LONGEST_RECORD, lines=True)
+        self.emit(Record(kind, process, host, message, facts))
         if known is not None:
             known.history.append((now, kind, message))
             if len(known.history) > _HISTORY:

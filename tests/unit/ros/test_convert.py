@@ -124,7 +124,23 @@ def test_a_host_row_with_a_reading_too_few_is_refused() -> None:
 def test_rows_survive() -> None:
     """Rows of `ps`, `plugins` and `events` are received whole."""
     process = ProcessRow(
-        "a", "job", "failed", "h", 2**40, 12, 3, 1, -9, -5, 0, 1.5, 0.9, 2**40, "why", True
+        "a",
+        "job",
+        "failed",
+        "h",
+        2**40,
+        12,
+        3,
+        1,
+        -9,
+        -5,
+        0,
+        1.5,
+        0.9,
+        2**40,
+        "why",
+        True,
+        "user:ada",
     )
     plugin = PluginRow("probe", "gpu", "rosrm-resources 0.1", "absent", "no driver", "h")
     event = EventRow(2**40, 1.7e9, 12.5, "assigned", "a", "h", "a goes to h", {"n": [1, {"x": 2}]})
