@@ -183,9 +183,12 @@ def write_slot(directory: Path, content: bytes) -> None:
     file = os.open(begun, os.O_WRONLY | os.O_CREAT | os.O_EXCL | OPEN, 0o600)
     try:
         _write_all(file, [content], 0)
+        begun.replace(min(ages, key=lambda path: ages[path]))
+    except OSError:
+        begun.unlink(missing_ok=True)
+        raise
     finally:
         os.close(file)
-    begun.replace(min(ages, key=lambda path: ages[path]))
 
 
 def drop_snapshots(directory: Path, up_to: int) -> bool:

@@ -177,7 +177,7 @@ class SnapshotStore:
             up_to: number of the instance that starts.
 
         Returns:
-            Why the replica is not allowed; "": it is, or there is none.
+            Why the replica is not used, as a sentence; "": it can be read, or is not needed.
         """
         directory = self.directory(process)
         path, key = directory / COPY, self.keys.of(process)
@@ -193,6 +193,8 @@ class SnapshotStore:
         except Damaged as fault:
             path.unlink(missing_ok=True)
             return str(fault)
+        except OSError as error:
+            return f"it cannot be written: {error.strerror}"
         path.unlink(missing_ok=True)
         return ""
 

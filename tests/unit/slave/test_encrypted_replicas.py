@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.model.values import Assignment, InstanceId
-from rosrm.slave.replication import fetch
+from rosrm.slave.replication import fetch, store
 from rosrm.slave.replication.encryption import encrypted
 from rosrm.slave.replication.keys import KEY
 from rosrm.snapshots import reader
@@ -179,6 +181,20 @@ def test_a_destination_of_a_handoff_has_key_and_state(net):
     assert (net.directory("b") / KEY).exists()
 
 
+def test_a_replica_that_cannot_be_written_for_the_node_stays(net, monkeypatch):
+    """The disk is full: the process starts, and the slave logs the reason."""
+    replicate(net, "b")
+
+    def full(directory: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(store, "write_slot", full)
+    start(net, "b", "b")
+    assert state_for_node(net, "b") is None
+    assert copy_of(net, "b").exists()
+    assert messages(net, "not used for p#9: it cannot be written: No space left on device")
+
+
 def test_an_own_snapshot_that_is_newer_stays(net):
     """The replica replaces at most the older one of a node's two files."""
     replicate(net, "b")
@@ -257,7 +273,7 @@ def test_an_encrypted_replica_is_refused_where_the_process_has_no_key(net, host)
 
 @pytest.mark.parametrize("why", FORGERIES)
 def test_a_host_with_the_key_stores_no_forged_replica(net, why):
-    """It would displace the true one, and the node would read a plain one at its next restart."""
+    """A forged replica would displace the true one, or be read at the next restart."""
     replicate(net)
     before = plain_snapshot(net)
     assert why in send(net, "a", FORGERIES[why]((7, 2**40)))
