@@ -280,6 +280,8 @@ class Assignment:
             state, and there are no snapshots.
         restored: True: it starts from the image of a former instance on the host, and is not
             restarted until an order to its slave allows restarts.
+        state_key: key by which slaves encrypt the replicas of the process's snapshots; b"": they
+            are not encrypted.
     """
 
     instance: InstanceId
@@ -291,6 +293,7 @@ class Assignment:
     snapshot_hosts: tuple[str, ...] = ()
     snapshots_from: int = 0
     restored: bool = False
+    state_key: bytes = field(default=b"", repr=False)
 
     @property
     def has_snapshots(self) -> bool:

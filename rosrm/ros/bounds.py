@@ -33,6 +33,7 @@ _OTHER_LETTERS: Final = {
     "Explain_Response.explanation": 1 << 24,
 }
 _OTHER_ENTRIES: Final = {
+    "Assignment.state_key": 32,
     "HostDescription.labels": 256,
     "HostDescription.resources": 16,
     "HostDescription.executors": 256,

@@ -109,6 +109,7 @@ class Starter:
     def ended(self, instance: InstanceId) -> None:
         """Stop awaiting the node of an instance."""
         self._graph_before.pop(instance, None)
+        self.replication.ended(instance)
 
     def _prepared(self, assignment: Assignment) -> None:
         held = self.state.held.get(assignment.instance)
