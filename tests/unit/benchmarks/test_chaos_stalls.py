@@ -46,6 +46,13 @@ def test_a_move_is_accepted_only_with_a_measured_stall_of_its_host():
     assert violations(STALLED, [(18.5, "host3")]) == ["touched"]
 
 
+def test_a_process_stalls_with_its_slave():
+    """Its last "active" may be as old as the begin of the stall, but hardly older."""
+    for begun, found in ((20.5, []), (21.5, ["touched"])):
+        stalls = measured(*[0.2375] * 16, begun=begun)
+        assert violations(stalls, [(begun + 3.5, "host1")]) == found
+
+
 @pytest.mark.parametrize("when", [14.9, 19.5])
 def test_a_silence_at_another_time_confirms_no_stall(when):
     assert violations(STALLED, [(when, "host1")]) == ["touched"]
