@@ -252,6 +252,25 @@ def test_a_successor_can_be_succeeded(stage, pair):
     assert third.count >= pair.counts[-1].data
 
 
+def test_the_next_handoff_may_begin_before_its_source_has_settled(stage, pair, monkeypatch):
+    """A node reports ACTIVE some rounds before it is a source; no message in between is lost."""
+    settle = []
+    monkeypatch.setattr(
+        pair.second._rosrm._destination, "_activated",
+        lambda: settle.append(pair.second._rosrm._become_source),
+    )  # fmt: skip
+    pair.conductor.hand_over()
+    stage.spin_until(lambda: settle, "the last step of the activation")
+    stage.remove(pair.first)
+    stage.instance(Counter, 3, alias="counter_1700000009", shadow=True)
+    conductor = Conductor(stage, source=2, destination=3)
+    conductor.say(C.SHADOW)
+    conductor.wait(3, R.SHADOWING)
+    goes_on(stage, pair.counts)
+    settle.pop()()
+    conductor.wait(3, R.READY)
+
+
 def shadowing(stage, pair, text):
     """Check that the shadow reports its unmet condition, and not READY."""
     pair.conductor.say(C.SHADOW)

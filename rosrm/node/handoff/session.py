@@ -48,6 +48,7 @@ class HandoffSession:
         self._parts: list[StateTopic] = []
         self._source: HandoffSource | None = None
         self._destination: Destination | None = None
+        self._before_source: deque[StateConfig] = deque(maxlen=_MOST_EARLY)
         self._refused: set[str] = set()
         self._early: deque[tuple[StateConfig, float]] = deque(maxlen=_MOST_EARLY)
         self._early_timer: Any = None
@@ -77,6 +78,8 @@ class HandoffSession:
     def _become_source(self) -> None:
         self._snapshot = None
         self._source = HandoffSource(self.entities, self._parts, self._own(_MARK))
+        while self._before_source:
+            self._configured(self._before_source.popleft())
 
     def keep_state(
         self, topic: str, message_type: Any, save: Callable[[], Any], restore: Callable[[Any], None]
@@ -111,6 +114,9 @@ class HandoffSession:
         self._epoch = config.epoch
         role = self._destination if own.instance == config.destination else self._source
         if role is None:
+            # A node reports ACTIVE before it is a source; the next handoff may begin in between.
+            if own.instance == config.source:
+                self._before_source.append(config)
             return
         with self.entities.turn:
             try:
