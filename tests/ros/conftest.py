@@ -8,7 +8,7 @@ import pytest
 
 from rosrm.testing.loopback import enter_private_network
 from tests.ros.clusters import STEADY, clusters
-from tests.ros.nodes import Stage
+from tests.ros.nodes import KEYS, Stage
 from tests.ros.portable_kit import Listener
 
 
@@ -42,6 +42,6 @@ def listener(cluster):
 @pytest.fixture
 def stage():
     """Yield a ROS context in its own domain, for nodes that run as if started by a slave."""
-    stage = Stage()
+    stage = Stage(keys=KEYS)
     yield stage
     stage.close()
