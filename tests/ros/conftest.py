@@ -40,8 +40,11 @@ def listener(cluster):
 
 
 @pytest.fixture
-def stage():
-    """Yield a ROS context in its own domain, for nodes that run as if started by a slave."""
-    stage = Stage(keys=KEYS)
+def stage(request):
+    """Yield a ROS context in its own domain, for nodes that run as if started by a slave.
+
+    Its cluster has keys; the parameter None makes one without security.
+    """
+    stage = Stage(keys=getattr(request, "param", KEYS))
     yield stage
     stage.close()

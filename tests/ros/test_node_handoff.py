@@ -24,6 +24,7 @@ from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark, StatePart
 from tests.ros.nodes import (
     ALIAS,
     EPOCH,
+    KEYS,
     PATIENCE,
     RELIABLE,
     Conductor,
@@ -34,6 +35,8 @@ from tests.ros.nodes import (
 )
 
 R, C = HandoffReport, StateConfig
+#: Runs a test in a cluster with keys, and in one without security.
+both = pytest.mark.parametrize("stage", [KEYS, None], indirect=True, ids=["keys", "open"])
 
 
 @pytest.fixture
@@ -64,6 +67,7 @@ def goes_on(stage, heard, more=5):
 # --- without faults ---------------------------------------------------------------------------
 
 
+@both
 def test_the_successor_goes_on_where_the_source_stopped(stage, pair):
     """The successor continues the count in order, without a gap or a repetition."""
     pair.conductor.hand_over()
@@ -238,6 +242,7 @@ def test_timers_go_on_in_step(stage):
     assert pair.second.timer.timer_period_ns == 2_000_000_000
 
 
+@both
 def test_a_successor_can_be_succeeded(stage, pair):
     """A second handoff under another alias continues the count."""
     pair.conductor.hand_over()
@@ -394,6 +399,7 @@ def test_inputs_are_served_between_two_services_that_open(stage):
 # --- aborted ----------------------------------------------------------------------------------
 
 
+@both
 def test_a_source_that_resumes_has_lost_nothing(stage, pair):
     """A resumed source processes its buffered inputs; its timers and services continue."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
@@ -438,6 +444,7 @@ def test_a_source_falls_silent_only_when_master_and_destination_both_want_it(sta
     assert R.SILENT not in pair.conductor.of(1)
 
 
+@both
 def test_the_last_state_is_enough_when_the_source_is_lost(stage, pair):
     """With the source gone, only the master's TAKE_OVER activates the destination."""
     pair.conductor.prepare()
@@ -448,6 +455,7 @@ def test_the_last_state_is_enough_when_the_source_is_lost(stage, pair):
     assert is_gapless(pair.counts)
 
 
+@both
 def test_what_an_earlier_handoff_ended_with_is_not_taken_for_the_end_of_this_one(stage, pair):
     """The last mark of an earlier handoff, or its key, is worth nothing to a later shadow."""
     pair.conductor.silence(pair.second)
@@ -465,6 +473,7 @@ def test_what_an_earlier_handoff_ended_with_is_not_taken_for_the_end_of_this_one
     assert is_gapless(pair.counts)
 
 
+@both
 def test_a_part_that_did_not_change_goes_on_from_successor_to_successor(stage):
     """A restored part that `save` reports as unchanged (None) still reaches the next successor."""
 
@@ -740,6 +749,7 @@ def forge_silence(stage, destination=99):
     return forged
 
 
+@both
 def test_a_silent_source_asks_the_master_until_it_may_resume(stage, monkeypatch):
     """The answer is RESUME and DONE; inputs that came during the silence are served."""
     monkeypatch.setattr(stranded, "ASK_EVERY", 0.3)
