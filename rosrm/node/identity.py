@@ -88,10 +88,16 @@ def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
 
 
 def _key(text: str) -> bytes | None:
-    key = base64.b64decode(text, validate=True)
-    if len(key) not in (0, _KEY_BYTES):
+    """Return the key of the instance; None: the cluster has no security."""
+    if not text:
+        return None
+    try:
+        key = base64.b64decode(text, validate=True)
+    except ValueError:
+        key = b""
+    if len(key) != _KEY_BYTES:
         raise ValueError(f"ROSRM_INSTANCE_KEY must have {_KEY_BYTES} bytes in base64")
-    return key or None
+    return key
 
 
 def _seconds(text: str) -> float:
