@@ -40,7 +40,7 @@ def test_the_key_of_the_instance_is_not_shown():
 
 @pytest.mark.parametrize("key", ["c2hvcnQ=", "no base64", "A" * 64])
 def test_a_node_with_a_damaged_key_does_not_start(key):
-    """It would believe messages of everyone."""
+    """Without a key the node would accept every message."""
     with pytest.raises(ValueError, match="base64"):
         identity_from({**FULL, "ROSRM_INSTANCE_KEY": key})
 
