@@ -17,37 +17,25 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.keys.links import SealedMessage
-from rosrm.keys.sealing import FORMAT, RUN_BYTES, channel_of
+from rosrm.keys.sealing import FORMAT, channel_of
 from rosrm.keys.security import Peer, Security
 from rosrm.ros import qos
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
+from rosrm.ros.sealed_topic import UNKNOWN_RUN, topic_channel, type_name
 from rosrm_msgs import msg, srv
 
 #: Refusal of a request that was meant for another run of the receiver.
 _OTHER_RUN: Final = "the request is for another run of the receiver; nothing was done"
-#: Run of a receiver that is not known yet.
-UNKNOWN_RUN: Final = bytes(RUN_BYTES)
-
-
-def _type_name(kind: Any, part: str = "") -> str:
-    """Return "rosrm_msgs/srv/Submit_Request" for the request type of `Submit`."""
-    package, folder = kind.__module__.split(".")[:2]
-    return f"{package}/{folder}/{kind.__name__}{part}"
 
 
 def request_channel(service_type: Any, name: str) -> bytes:
     """Return the channel of the requests of a service."""
-    return channel_of(name, _type_name(service_type, "_Request"))
+    return channel_of(name, type_name(service_type, "_Request"))
 
 
 def answer_channel(service_type: Any, name: str) -> bytes:
     """Return the channel of the answers of a service."""
-    return channel_of(name, _type_name(service_type, "_Response"))
-
-
-def topic_channel(message_type: Any, name: str) -> bytes:
-    """Return the channel of a topic."""
-    return channel_of(name, _type_name(message_type))
+    return channel_of(name, type_name(service_type, "_Response"))
 
 
 def sealed(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from rosrm.keys.names import instance_name
 from rosrm.node.handoff.destination import Destination
 from rosrm.node.handoff.source import HandoffSource
 from rosrm.node.handoff.state_parts import ParametersPart, StateTopic
@@ -15,8 +16,12 @@ from rosrm.node.managed_node import NodeEntities
 from rosrm.node.snapshots.restore import SnapshotRestore, newest_snapshot
 from rosrm.node.steady_timer import steady_timer
 from rosrm.ros.qos import STATE_CONFIG
+from rosrm.ros.sealed_codec import decode
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import StateConfig
+from rosrm_msgs.msg import Sealed, StateConfig
+
+if TYPE_CHECKING:
+    from rosrm.node.handoff.links import NodeLinks
 
 _MARK: Final = "_rosrm/mark"
 _PARAMETERS: Final = "_rosrm/parameters"
@@ -53,6 +58,8 @@ class HandoffSession:
         self._early: deque[tuple[StateConfig, float]] = deque(maxlen=_MOST_EARLY)
         self._early_timer: Any = None
         self._subscription: Any = None
+        self._name = instance_name(identity.process, identity.instance)
+        self._links: NodeLinks | None = None
 
     def begin(self) -> None:
         """Take the first role; called by `Node`'s constructor, before the author's continues."""
@@ -69,7 +76,7 @@ class HandoffSession:
         else:
             self._become_source()
         self._subscription = self.entities.plain.create_subscription(
-            StateConfig, self.identity.state_config, self._configured, STATE_CONFIG
+            Sealed, self.identity.state_config, self._received, STATE_CONFIG, raw=True
         )
 
     def _own(self, path: str) -> str:
@@ -98,6 +105,23 @@ class HandoffSession:
 
     # --- state_config ----------------------------------------------------------------------
 
+    def _received(self, data: bytes) -> None:
+        envelope = decode(data)
+        if envelope is None or envelope.principal != self._name:
+            return
+        config = self._opened_links().configs.read(data)
+        if config is None:
+            self._refuse("it is not of this node's master, or it is a repetition")
+        else:
+            self._configured(config)
+
+    def _opened_links(self) -> NodeLinks:
+        if self._links is None:
+            from rosrm.node.handoff.links import NodeLinks  # noqa: PLC0415 - see there
+
+            self._links = NodeLinks(self.identity)
+        return self._links
+
     def _configured(self, config: StateConfig) -> None:
         own = self.identity
         if config.process != own.process or own.instance not in (config.source, config.destination):
@@ -120,7 +144,7 @@ class HandoffSession:
             return
         with self.entities.turn:
             try:
-                role.configure(config)
+                role.configure(config, self._opened_links())
             except Exception as error:  # noqa: BLE001 - no message of the master may end the node
                 what = f"{type(error).__name__}: {error}"
                 self.entities.node.get_logger().error(
