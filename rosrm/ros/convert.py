@@ -301,8 +301,8 @@ def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
         fence = values.Fence(message.fence_after, message.fence_grace, message.fence_alive)
     return values.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
-        message.node_name, message.shadow, fence, tuple(message.snapshot_hosts), message.snapshots_from,
-        message.restored, bytes(message.state_key),
+        message.node_name, message.shadow, fence, tuple(message.snapshot_hosts),
+        message.snapshots_from, message.restored, bytes(message.state_key),
     )  # fmt: skip
 
 

@@ -382,7 +382,7 @@ def test_only_a_node_that_takes_part_in_handoffs_gets_a_key():
     """The key is of its instance; a process that the node starts as a slave inherits none."""
     here = replace(HERE, instance_key=lambda instance: str(instance).encode().ljust(32))
     key = "dGFsa2VyIzcgICAgICAgICAgICAgICAgICAgICAgICA="
-    stateful = replace(assignment(command=("x",)), kept_from=1)
+    stateful = replace(assignment(command=("x",)), snapshots_from=1)
     made = process_environment(stateful, {}, here)
     assert made["ROSRM_INSTANCE_KEY"] == key
     assert identity_from(made).key == b"talker#7".ljust(32)
