@@ -31,6 +31,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rclpy.serialization import deserialize_message
 from std_msgs.msg import Int64MultiArray
 
 from benchmarks.handoff import Observer, Output
@@ -46,8 +47,10 @@ from rosrm.model.values import (
     StopPolicy,
 )
 from rosrm.ros.names import token
+from rosrm.ros.sealed_codec import decode
 from rosrm.snapshots import reader
 from rosrm.testing.local_cluster import LocalCluster
+from rosrm_msgs.msg import Sealed
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HOSTS = ("h0", "h1", "h2", "h3")
@@ -95,7 +98,7 @@ class Continuation:
 
 
 class Witness(Observer):
-    """Observer of the states as well as of the outputs."""
+    """Observer of the states, in a cluster without security, as well as of the outputs."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
@@ -106,13 +109,16 @@ class Witness(Observer):
     def find_states(self) -> None:
         """Subscribe to the topics of states that exist by now."""
         for topic, types in self._node.get_topic_names_and_types():
-            is_state = topic.endswith("/state") and "std_msgs/msg/Int64MultiArray" in types
+            is_state = topic.endswith("/state") and "rosrm_msgs/msg/Sealed" in types
             if is_state and topic not in self._topics:
                 self._topics.add(topic)
-                self._node.create_subscription(Int64MultiArray, topic, self._note, QOS)
+                self._node.create_subscription(Sealed, topic, self._note, QOS, raw=True)
 
-    def _note(self, message: Int64MultiArray) -> None:
-        number, sequence = message.data
+    def _note(self, data: bytes) -> None:
+        envelope = decode(data)
+        if envelope is None:
+            return
+        number, sequence = deserialize_message(bytes(envelope.body), Int64MultiArray).data
         self.states[number] = max(sequence, self.states.get(number, 0))
 
     def continuation_of(self, former: int, after: Output) -> Continuation:

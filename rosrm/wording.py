@@ -112,17 +112,21 @@ def sendable(text: str) -> str:
     return text.encode(errors="replace").decode()
 
 
-def sanitized(text: str, most: int = 4096) -> str:
+def sanitized(text: str, most: int = 4096, *, lines: bool = False) -> str:
     """Return a sender's text as one line of bounded length, without unprintable characters.
 
     Args:
         text: by any sender.
         most: letters.
+        lines: True: newlines stay.
     """
     cut = text if len(text) <= most else f"{text[: most - 1]}…"
     if cut.isprintable():
         return cut
-    return "".join(one if one.isprintable() else " " if one.isspace() else "?" for one in cut)
+    return "".join(
+        one if one.isprintable() or (lines and one == "\n") else " " if one.isspace() else "?"
+        for one in cut
+    )
 
 
 def words(name: str) -> str:

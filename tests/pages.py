@@ -65,6 +65,7 @@ RUN: Final[Mapping[str, Page]] = {
         hosts=("robot",), cluster="migration: {strategies: [criu]}"
     ),
     "docs/how-to/simulate.md": Page(),
+    "docs/how-to/keys.md": Page(),
 }
 #: The pages that are run on virtual hosts, where root is.
 RUN_IN_LAB: Final = "docs/how-to/lab.md"
@@ -76,6 +77,7 @@ NOT_RUN: Final[Mapping[str, str]] = {
     "docs/tutorials/your-own-migration-strategy.md": "tests/integration/plugins/test_tutorial.py",
     "docs/how-to/criu.md": "CRIU and what it needs come from the network; tests/integration/criu",
     "docs/how-to/two-machines.md": "two machines",
+    "docs/how-to/wireguard.md": "two machines",
     "docs/how-to/docker-or-cgroup.md": "docker",
     "docs/how-to/many-hosts-discovery.md": "a server at an address of its own network",
     "docs/how-to/security.md": "a ROS 2 with DDS security, which the wheels lack",

@@ -21,6 +21,7 @@ from benchmarks.chaos.client_load import ClientLoad
 from benchmarks.chaos.cluster import HOSTS, LEASE_S, Cluster
 from benchmarks.chaos.event_log import EventLog
 from benchmarks.chaos.faults import Round, draw
+from benchmarks.chaos.stalls import StallWatch
 from benchmarks.chaos.trial import Stuck, Tally, Trial
 from benchmarks.machine import parser, percentile, print_report, say
 from benchmarks.stopping import run
@@ -83,8 +84,12 @@ def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> 
                     options.lab, folder, lambda text: event_log.add(text, aloud=True)
                 ) as cluster,
                 ClientLoad(cluster.lab, folder / "desk.log", event_log.add) as client_load,
+                StallWatch(cluster.slaves(), LEASE_S) as stall_watch,
             ):
-                trial = Trial(cluster, client_load, lines, out, event_log, tally)
+                trial = Trial(
+                    cluster, client_load, lines, out, event_log, tally,
+                    stall_watch=stall_watch,
+                )  # fmt: skip
                 trial.begin()
                 say(f"no deviations: {len(names)} services on {len(HOSTS)} hosts")
                 for drawn in _while(rounds, options.faults, deadline, tally):

@@ -34,6 +34,8 @@ _YOUNG: Final = 6.0
 MOVES: Final = ("move", "overlap")
 #: Kind of the disturbance by other programs on the machine.
 OVERLOAD: Final = "overload"
+#: Seconds before an overload is measured at its slave in which a process may have stalled already.
+_STALLING: Final = 1.0
 #: Cycles a second.
 _RATE: Final = 10.0
 
@@ -109,8 +111,14 @@ def _is_parted(guarantees: Guarantees, run: Run, disturbances: Sequence[Disturba
     """Return True if the silence was long enough for its host or the master to end it."""
     if not (guarantees.elsewhere or guarantees.isolated):
         return False
-    until = run.last + _ENDING
     here = [disturbance for disturbance in disturbances if disturbance.concerns(run.host)]
+    # A process stalls with its slave: its last "active" is older than its end.
+    stalled = [
+        disturbance.ended
+        for disturbance in here
+        if disturbance.kind == OVERLOAD and disturbance.begun <= run.last + _STALLING
+    ]
+    until = max([run.last + _ENDING, *stalled])
     hidden = _silence([disturbance for disturbance in here if disturbance.hides], until)
     deaf = _silence([disturbance for disturbance in here if disturbance.deafens], until)
     # In a cut, a host stops a process that is not isolated only if it cannot reach its slave.

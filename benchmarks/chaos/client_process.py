@@ -1,8 +1,8 @@
 """A client of the master, on its host, driven by lines: `{"do": ...}` in, one line out for each.
 
 `submit` takes the path of a work file, `cancel` names, `migrate` a process and a host. `look`
-returns the states of hosts and processes, for the log of a violation; no judgement uses them. The
-client ends when its input ends.
+returns the states of hosts and processes, for the log of a violation, and the silent hosts by the
+master's events, which confirm a measured stall. The client ends when its input ends.
 """
 
 from __future__ import annotations
@@ -49,6 +49,11 @@ def _answer(client: Client, request: dict[str, Any]) -> dict[str, Any]:
             row.name: f"{row.state} {row.host} #{row.number} {row.reason}".strip()
             for row in view.processes
         },
+        "silent": [
+            [one.wall_time, one.host]
+            for one in view.events
+            if one.kind in ("host_suspect", "host_lost")
+        ],
         "events": [f"{one.elapsed:.2f} {one.kind}: {one.message}" for one in view.events],
     }
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final
@@ -146,6 +147,10 @@ class Cluster:
                 self._tell(f"{name} ended with {part.process.returncode}: {_last_line(part.log)}")
             elif now >= part.ended + _AGAIN:
                 self.start(name)
+
+    def slaves(self) -> dict[str, Callable[[], int]]:
+        """Return by host the function that returns the pid of its slave on this machine, or 0."""
+        return {host: partial(getattr, self.parts[host], "pid") for host in HOSTS}
 
     def supervisor(self, host: str) -> int:
         """Return the pid of a host's supervisor on this machine; 0: there is none."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.chaos import work
-from benchmarks.chaos.allowances import MOVES, OVERLOAD, Disturbance, Guarantees
+from benchmarks.chaos.allowances import MOVES, Disturbance, Guarantees
 from benchmarks.chaos.client_load import ClientLoad, ClientRequest
 from benchmarks.chaos.cluster import HOSTS, Cluster
 from benchmarks.chaos.event_log import EventLog
@@ -20,6 +20,7 @@ from benchmarks.chaos.fault_injector import FaultInjector
 from benchmarks.chaos.faults import Fault, Move, Round
 from benchmarks.chaos.oracle import AcceptedRequests, Deviation, Oracle
 from benchmarks.chaos.rules import Violation
+from benchmarks.chaos.stalls import StallWatch, confirmed
 from benchmarks.machine import say
 
 #: Seconds after the last fault was undone within which all must be well.
@@ -33,8 +34,6 @@ _LOOK_AT_ALL: Final = 0.3
 _STEADY: Final = 2
 #: Seconds within which a requested migration has ended.
 _MOVE: Final = 30.0
-#: Load average for each core from which on the machine keeps no deadlines.
-_OVERLOAD: Final = 3.0
 #: Seconds of a canary: a job that only shows that its host accepts work.
 _CANARY: Final = 0.1
 
@@ -58,7 +57,7 @@ class Tally:
         whole: the same, from the first fault on.
         loads: load average of the machine at the end of each round.
         counts: live processes at each look, from the first round on.
-        overloaded: rounds with so much load by other programs that hosts may have been lost.
+        overloaded: rounds in which a slave got no processor for its lease, and its host was silent.
     """
 
     by_kind: Counter[str] = field(default_factory=Counter)
@@ -87,12 +86,13 @@ class Trial:
         lines: folder for the lines of the workload, empty.
         out: folder for violations.
         tally: counted in.
+        stall_watch: of the slaves of the cluster.
     """
 
     def __init__(
         self, cluster: Cluster, client_load: ClientLoad, lines: Path, out: Path,
         event_log: EventLog,
-        tally: Tally,
+        tally: Tally, *, stall_watch: StallWatch,
     ) -> None:  # fmt: skip
         self._cluster = cluster
         self._client_load = client_load
@@ -100,6 +100,7 @@ class Trial:
         self._out = out
         self._event_log = event_log
         self._tally = tally
+        self._stall_watch = stall_watch
         self._accepted = AcceptedRequests()
         self._fault_injector = FaultInjector(cluster)
         self._oracle = Oracle(cluster.lab.name, lines, self._accepted)
@@ -116,6 +117,7 @@ class Trial:
         self._submit(entries, lambda _: self._accepted.services.update(guarantees))
         self._await_well(0, "the beginning", _BEGIN_S)
         self._oracle.history([])
+        self._stall_watch.take()
         self._oracle.counts = self._tally.counts
 
     def end(self) -> None:
@@ -147,7 +149,7 @@ class Trial:
         healed = time.monotonic()
         well = self._await_well(number, f"fault {number} was undone", SETTLE_S)
         self._disturbances += self._fault_injector.take_done()
-        self._note_load(begun)
+        self._note_stalls()
         judged = self._oracle.history(self._disturbances)
         # A migration may outlast its round.
         recent = time.monotonic() - _MOVE
@@ -167,16 +169,21 @@ class Trial:
             took = well - healed
             say(f"{self._tally.faults} faults; {', '.join(kinds)}: recovered after {took:.1f} s")
 
-    def _note_load(self, begun: float) -> None:
-        """Record the load; an overload by other programs counts as a disturbance, like a cut."""
-        load = os.getloadavg()[0]
-        self._tally.loads.append(load)
-        if load > _OVERLOAD * len(os.sched_getaffinity(0)):
-            self._tally.overloaded += 1
-            times, everywhere = (begun, time.monotonic()), frozenset({"*"})
-            self._disturbances.append(
-                Disturbance(OVERLOAD, *times, everywhere, hides=True, deafens=True)
-            )
+    def _note_stalls(self) -> None:
+        """Record the load, and as disturbances the stalls that made a host silent."""
+        self._tally.loads.append(os.getloadavg()[0])
+        measured = self._stall_watch.take()
+        if not measured:
+            return
+        since_boot = time.time() - time.monotonic()
+        silent = self._ask_master().get("silent", [])
+        stalls = confirmed(measured, [(wall_time - since_boot, host) for wall_time, host in silent])
+        self._tally.overloaded += bool(stalls)
+        self._disturbances += stalls
+        for stall in measured:
+            seconds, host = stall.ended - stall.begun, ", ".join(stall.hosts)
+            remark = "" if stall in stalls else ", but its host was not silent"
+            self._event_log.add(f"the slave of {host} waited {seconds:.1f} s for a core{remark}")
 
     def _do(self, drawn: Round, begun: float) -> list[Fault]:
         """Do everything of a round at its time; return the faults that were done."""
@@ -345,7 +352,7 @@ class Trial:
         say(f"logs: {folder}")
 
     def _ask_master(self) -> dict[str, Any]:
-        """Return the master's view, for the log alone."""
+        """Return the master's view, for the log and to confirm stalls."""
         answers: list[ClientRequest] = []
         self._client_load.send(ClientRequest({"do": "look"}, persistent=False, done=answers.append))
         deadline = time.monotonic() + 20.0

@@ -14,6 +14,7 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.wording import no_such
 
 if TYPE_CHECKING:
+    from rosrm.config.settings import ClusterConfig, SecurityMode
     from rosrm.ros.master_connection import MasterClient
     from rosrm.ros.participant import Participant
 
@@ -32,12 +33,34 @@ def ros_settings(
         domain: replaces the domain of the file and ROS_DOMAIN_ID.
         cluster: a cluster.yaml, whose `ros` section is read; None: that of ROSRM_CLUSTER.
     """
-    settings = RosSettings()
-    if path := cluster or os.environ.get(CLUSTER_VARIABLE):
-        from rosrm.config.cluster import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
-
-        settings = load_cluster(os.fspath(path)).ros
+    config = _cluster_file(cluster)
+    settings = RosSettings() if config is None else config.ros
     return settings if domain is None else replace(settings, domain=domain)
+
+
+def security_mode(cluster: str | os.PathLike[str] | None = None) -> SecurityMode:
+    """Return the security of a client: that of the file, or else ROSRM_SECURITY, or else "keys".
+
+    Args:
+        cluster: a cluster.yaml; None: that of ROSRM_CLUSTER.
+
+    Raises:
+        ConfigError: the file is invalid, or the variable has a value that is not allowed.
+    """
+    from rosrm.config.settings import default_security  # noqa: PLC0415 - as `load_cluster`
+
+    config = _cluster_file(cluster)
+    return default_security() if config is None else config.security
+
+
+def _cluster_file(cluster: str | os.PathLike[str] | None) -> ClusterConfig | None:
+    """Return the settings in a cluster.yaml; None: neither an argument nor a variable names one."""
+    path = cluster or os.environ.get(CLUSTER_VARIABLE)
+    if not path:
+        return None
+    from rosrm.config.cluster import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
+
+    return load_cluster(os.fspath(path))
 
 
 def connect(

@@ -13,7 +13,9 @@ from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
+from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
+from rosrm.keys.roles import principal_of
 from rosrm.model.rows import PluginKind
 
 #: Sections that `_check_times` reads.
@@ -58,6 +60,7 @@ def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> 
 def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -> None:
     check_name(root.get("name"), "cluster", problems)
     check_amounts(root.get("defaults", "needs"), "defaults.needs", problems)
+    _check_users(root.get("quotas"), problems)
     if config is not None:
         _check_times(root, config, problems)
     options = root.get("checkpoint", "options")
@@ -66,6 +69,16 @@ def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -
         problems.add(
             options.place, "checkpoint.options: options of no policy; name one in `policy`"
         )
+
+
+def _check_users(quotas: Node | None, problems: Problems) -> None:
+    """Note each quota whose key is no name of a user."""
+    for name, quota in (quotas.items if quotas else {}).items():
+        try:
+            principal_of(f"user:{name}")
+        except ConfigError:
+            fault = f"quotas: {name!r} names no user; for user:ada write ada"
+            problems.add(quota.key_place or quota.place, fault)
 
 
 def _check_times(root: Node, config: ClusterConfig, problems: Problems) -> None:

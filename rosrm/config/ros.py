@@ -13,6 +13,7 @@ from rosrm.model.ros_settings import HIGHEST_DOMAIN, NAMESPACE, RosSettings
 
 _DEFAULT: Final = RosSettings()
 _SERVER: Final = re.compile(r"[^\s:;]+:\d{1,5}(;[^\s:;]*(:\d{1,5})?)*|[^\s:;]+")
+_INTERFACE: Final = re.compile(r"[^\s/:]{1,15}")
 _TRANSPORTS: Final = ("DEFAULT", "DEFAULTv6", "SHM", "UDPv4", "UDPv6", "LARGE_DATA", "P2P")
 
 
@@ -25,6 +26,12 @@ def _server(given: str) -> str:
 def _namespace(given: str) -> str:
     if not NAMESPACE.fullmatch(given):
         raise ValueError(f'{given!r} is not an absolute ROS namespace such as "/rosrm"')
+    return given
+
+
+def _interface(given: str) -> str:
+    if given and not _INTERFACE.fullmatch(given):
+        raise ValueError(f'{given!r} is no name or IPv4 address of an interface such as "wg0"')
     return given
 
 
@@ -50,6 +57,7 @@ class RosInFile:
     discovery: DiscoveryInFile = field(default_factory=DiscoveryInFile)
     transports: Annotated[str, AfterValidator(_transports)] = _DEFAULT.transports
     namespace: Annotated[str, AfterValidator(_namespace)] = _DEFAULT.namespace
+    interface: Annotated[str, AfterValidator(_interface)] = _DEFAULT.interface
 
     def settings(self) -> RosSettings:
         """Return the section as settings."""
@@ -59,4 +67,5 @@ class RosInFile:
             discovery_server=self.discovery.server,
             transports=self.transports,
             namespace=self.namespace,
+            interface=self.interface,
         )

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from rosrm.config.markers import NullIsEmpty, OptionsByName, PlainWord, RosSection
-from rosrm.core.master.settings import CoreSettings
+from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings
 from rosrm.errors import ConfigError
 from rosrm.extensions.units import (
     Amount,
@@ -39,6 +39,7 @@ _CORE: Final = CoreSettings()
 Options = Annotated[Mapping[str, Any], NullIsEmpty()]
 Ros = Annotated[RosSettings, RosSection()]
 Scope = Literal["machine", "cgroup", "slice"]
+SecurityMode = Literal["keys", "none"]
 
 
 def default_state(name: str, role: str) -> Path:
@@ -58,6 +59,19 @@ def default_scope() -> Scope:
     if word not in scopes:
         raise ConfigError(f"ROSRM_SCOPE={word!r}; allowed: machine, cgroup")
     return scopes[word]
+
+
+def default_security() -> SecurityMode:
+    """Return the default security of a part: ROSRM_SECURITY, or "keys".
+
+    Raises:
+        ConfigError: the variable has a value that is not allowed.
+    """
+    modes: Mapping[str, SecurityMode] = {"": "keys", "keys": "keys", "none": "none"}
+    word = os.environ.get("ROSRM_SECURITY", "")
+    if word not in modes:
+        raise ConfigError(f"ROSRM_SECURITY={word!r}; allowed: keys, none")
+    return modes[word]
 
 
 # --- cluster.yaml -----------------------------------------------------------------------------
@@ -115,6 +129,25 @@ class QueueSettings:
 
     backfill: bool = _CORE.backfill
     max_processes: PositiveCount = _CORE.max_processes
+
+
+@dataclass(frozen=True, slots=True)
+class Quota:
+    """Limits on the processes of one user that have not ended, all together.
+
+    Attributes:
+        processes: most processes.
+        memory: largest sum of their memory needs, in bytes.
+        cpu: largest sum of their CPU needs, in cores.
+    """
+
+    processes: Count | None = None
+    memory: Annotated[float, Quantity("size")] | None = None
+    cpu: Annotated[float, Quantity("cores")] | None = None
+
+    def limits(self) -> Mapping[str, float]:
+        """Return the given limits by name."""
+        return {name: limit for name, limit in to_plain(self).items() if limit is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,10 +230,13 @@ class ClusterConfig:
     Attributes:
         name: name of the cluster and its master.
         ros: domain, discovery and transports.
+        security: "keys": only holders of keys are heard; "none": every participant is.
         state: state directory of the master; by default under XDG_STATE_HOME.
         scoring: policy that orders the hosts that fit.
         migration: strategies and limits of migrations.
         queue: order of the queue.
+        quotas: limits by name of a user; "default" holds for users without an entry, and for
+            limits that an entry does not give.
         defaults: default needs of processes.
         liveness: time limits for silent hosts.
         control: times of messages.
@@ -213,10 +249,12 @@ class ClusterConfig:
 
     name: str = "rosrm"
     ros: Ros = field(default_factory=RosSettings)
+    security: SecurityMode = field(default_factory=default_security)
     state: Path = Path()
     scoring: ScoringChoice = field(default_factory=ScoringChoice)
     migration: MigrationSettings = field(default_factory=MigrationSettings)
     queue: QueueSettings = field(default_factory=QueueSettings)
+    quotas: Mapping[str, Quota] = field(default_factory=lambda: EMPTY)
     defaults: ProcessDefaults = field(default_factory=ProcessDefaults)
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
     control: ControlSettings = field(default_factory=ControlSettings)
@@ -249,6 +287,10 @@ class ClusterConfig:
             keep_ended=self.journal.keep_ended,
             max_hosts=self.max_hosts,
             max_processes=self.queue.max_processes,
+            quotas={
+                name if name == DEFAULT_QUOTA else f"user:{name}": quota.limits()
+                for name, quota in self.quotas.items()
+            },
         )
 
     def to_json(self) -> str:
@@ -314,6 +356,7 @@ class HostConfig:
     Attributes:
         host: name of the host; each name has at most one live slave.
         ros: domain, discovery and transports.
+        security: "keys" or "none", as the master's.
         state: state directory of the slave; by default under XDG_STATE_HOME.
         labels: labels that processes may require, prefer or avoid.
         scope: scope of the probes: the machine, the cgroup of the slave, or the process trees of
@@ -334,6 +377,7 @@ class HostConfig:
 
     host: str = field(default_factory=socket.gethostname)
     ros: Ros = field(default_factory=RosSettings)
+    security: SecurityMode = field(default_factory=default_security)
     state: Path = Path()
     labels: Mapping[str, Annotated[str, PlainWord()]] = field(default_factory=lambda: EMPTY)
     scope: Scope = field(default_factory=default_scope)

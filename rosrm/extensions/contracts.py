@@ -445,7 +445,7 @@ class CheckpointView:
         host: host of the process, which always has the process's own snapshot.
         age: seconds since another host got a newer replica; None: no other host has one.
         size: size of its newest snapshot in bytes.
-        kept_on: other hosts with a replica now, the newest first.
+        replica_hosts: other hosts with a replica now, the newest first.
         hosts: name of each host that is up, including the host of the process, to its labels.
     """
 
@@ -453,7 +453,7 @@ class CheckpointView:
     host: str
     age: float | None
     size: int
-    kept_on: tuple[str, ...]
+    replica_hosts: tuple[str, ...]
     hosts: Mapping[str, Mapping[str, str]]
 
 

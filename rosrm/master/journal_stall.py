@@ -55,7 +55,7 @@ class JournalStall:
                 note_readings(state, event, self.core_now)
             elif isinstance(event, happened.HostRegistered | happened.ClientRequest):
                 reply(Reply(event.request, False, "journal", self.refusal))
-            elif isinstance(event, happened.ProcessRequested | happened.KeptStatesReceived):
+            elif isinstance(event, happened.ProcessRequested | happened.SnapshotsReported):
                 self._newest[type(event), event.host_id] = event  # replaces older ones
             elif not isinstance(event, _DROPPED):
                 self._keep(event)

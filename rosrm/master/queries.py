@@ -11,9 +11,12 @@ from rosrm.core.master import listing
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.master.disclosure import disclosed
 from rosrm.model.records import StoredRecord
-from rosrm.model.rows import EventRow, Listing, PluginRow
+from rosrm.model.requester import Requester
+from rosrm.model.rows import EventRow, Listing, PluginRow, ProcessRow
 from rosrm.model.values import LARGEST_NUMBER
+from rosrm.wording import first_line
 
 #: Events in an answer, if the request names no number, and at most.
 _DEFAULT_EVENTS: Final = 1000
@@ -45,8 +48,8 @@ class MasterQueries:
         self._core_now = core_now
         self._trouble = trouble
 
-    def snapshot(self, request: Any) -> Listing:
-        """Return the requested listings."""
+    def snapshot(self, request: Any, by: Requester) -> Listing:
+        """Return the requested listings, as far as the requester may read them."""
         now = self._core_now()
         state = self._state
         return Listing(
@@ -55,23 +58,28 @@ class MasterQueries:
             last_sequence=self._journal.last_sequence,
             trouble=self._trouble(),
             hosts=listing.host_rows(state, now) if request.hosts else (),
-            processes=self._processes(request.process, now) if request.processes else (),
+            processes=self._processes(request.process, now, by) if request.processes else (),
             plugins=self._plugin_rows(request) if request.plugins else (),
-            events=self._events(request) if request.events else (),
+            events=self._events(request, by) if request.events else (),
         )
 
-    def _processes(self, name: str, now: float) -> Sequence[Any]:
+    def _processes(self, name: str, now: float, by: Requester) -> list[ProcessRow]:
+        rows = []
         if not name:
-            return listing.process_rows(self._state, now)
-        process = self._state.processes.get(name)
-        return [listing.process_row(self._state, process, now)] if process is not None else []
+            rows = listing.process_rows(self._state, now)
+        elif name in self._state.processes:
+            rows = [listing.process_row(self._state, self._state.processes[name], now)]
+        return [
+            row if by.may_act_on(row.owner) else replace(row, reason=first_line(row.reason))
+            for row in rows
+        ]
 
-    def _events(self, request: Any) -> list[EventRow]:
+    def _events(self, request: Any, by: Requester) -> list[EventRow]:
         stored = self._journal.records(
             after=min(request.after_sequence, LARGEST_NUMBER), process=request.process,
             host=request.host, newest=min(request.max_events or _DEFAULT_EVENTS, _MOST_EVENTS),
         )  # fmt: skip
-        return [_event_row(one) for one in stored]
+        return [_event_row(one, by) for one in stored]
 
     def _plugin_rows(self, request: Any) -> list[PluginRow]:
         if not request.failing:
@@ -104,10 +112,15 @@ class MasterQueries:
             ]
         return rows
 
-    def explain(self, name: str) -> str | None:
+    def explain(self, name: str, by: Requester) -> str | None:
         """Return the explanation of a process as JSON; None if the process is unknown."""
         explanation = listing.explanation(self._state, name, self._core_now())
-        return None if explanation is None else json.dumps(explanation, default=dict)
+        if explanation is None:
+            return None
+        details, reason = by.may_act_on(explanation["owner"]), explanation["reason"]
+        plain = json.loads(json.dumps(explanation, default=dict))
+        shown = disclosed(plain, details=details)
+        return json.dumps({**shown, "reason": reason if details else first_line(reason)})
 
 
 def _failing_rows(host: Host) -> list[PluginRow]:
@@ -118,9 +131,11 @@ def _failing_rows(host: Host) -> list[PluginRow]:
     ]
 
 
-def _event_row(stored: StoredRecord) -> EventRow:
+def _event_row(stored: StoredRecord, by: Requester) -> EventRow:
     record = stored.record
+    details = by.may_act_on(record.facts.get("owner", ""))
     return EventRow(
         stored.sequence, stored.wall_time, stored.elapsed, record.kind, record.process,
-        record.host, record.message, record.facts,
+        record.host, disclosed(record.message, details=details),
+        disclosed(record.facts, details=details),
     )  # fmt: skip

@@ -50,7 +50,7 @@ from rosrm.ros.participant import Participant
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.version import __version__
-from rosrm.wording import counted, listed
+from rosrm.wording import counted, listed, one_line
 
 _log = logging.getLogger("rosrm.master")
 
@@ -375,7 +375,7 @@ class MasterRuntime:
             if not reply.host_id:
                 self._endpoint.services.reply(reply)
         for one in stored:
-            _log.info("%s", one.record.message)
+            _log.info("%s", one_line(one.record.message))
 
     def _act(self, commands: Sequence[Command], now: float) -> None:
         links = self._endpoint.links

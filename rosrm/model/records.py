@@ -17,7 +17,8 @@ class Record:
     Attributes:
         process: name of the process; "" for none.
         host: name of the host; "" for none.
-        message: one sentence for logs and listings.
+        message: one sentence for logs and listings; details in further lines, which only the owner
+            of the process and operators may read.
         facts: details by name, valid JSON.
     """
 

@@ -1,4 +1,4 @@
-"""ROS settings: domain, discovery and transports. This module does not import ROS."""
+"""ROS settings: domain, discovery, transports, interface. This module does not import ROS."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from rosrm.errors import ConfigError
 HIGHEST_DOMAIN: Final = 232
 #: An absolute ROS namespace.
 NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+#: Environment variable with the network interface of rosrm's own participants.
+INTERFACE_VARIABLE: Final = "ROSRM_INTERFACE"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +28,8 @@ class RosSettings:
         discovery_server: "host:port" of a Fast DDS discovery server, instead of multicast.
         transports: FASTDDS_BUILTIN_TRANSPORTS, for example "UDPv4".
         namespace: namespace of rosrm's topics and services.
+        interface: ROSRM_INTERFACE, name or IPv4 address of the only network interface of rosrm's
+            own participants; those of the processes use all interfaces.
     """
 
     domain: int | None = None
@@ -33,6 +37,7 @@ class RosSettings:
     discovery_server: str = ""
     transports: str = ""
     namespace: str = "/rosrm"
+    interface: str = ""
 
     def environment(self) -> Mapping[str, str]:
         """Return the environment variables with these settings, for this process and children."""
@@ -43,6 +48,7 @@ class RosSettings:
             # A plain client gets only its own topics from the server and sees no other nodes.
             "ROS_SUPER_CLIENT": "TRUE" if self.discovery_server else "",
             "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
+            INTERFACE_VARIABLE: self.interface,
         }
         return {name: value for name, value in variables.items() if value}
 
@@ -52,6 +58,7 @@ class RosSettings:
         Otherwise DDS would print an error without a remedy or end the process, or rclpy would raise
         a traceback.
         """
+        self._check_interface()
         if not NAMESPACE.fullmatch(self.namespace):
             raise ConfigError(
                 f'{self.namespace!r} is not an absolute ROS namespace such as "/rosrm"'
@@ -72,14 +79,41 @@ class RosSettings:
                 f"the variable to one, or give --domain N"
             )
 
+    def _check_interface(self) -> None:
+        """Raise `ConfigError` for an interface beside a setting by which Fast DDS ignores it."""
+        joined = self._in_force()
+        interface = self.interface_in_force()
+        conflict = ""
+        if joined.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST":
+            conflict = "discovery.range: localhost (or ROS_AUTOMATIC_DISCOVERY_RANGE)"
+        elif joined.get("ROS_LOCALHOST_ONLY") == "1":
+            conflict = "ROS_LOCALHOST_ONLY=1"
+        elif joined.get("FASTDDS_BUILTIN_TRANSPORTS", "") not in ("", "UDPv4"):
+            conflict = "transports other than UDPv4 (or FASTDDS_BUILTIN_TRANSPORTS)"
+        elif "fastrtps" not in (joined.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"):
+            conflict = f"RMW_IMPLEMENTATION={joined['RMW_IMPLEMENTATION']}"
+        if interface and conflict:
+            raise ConfigError(
+                f"the interface {interface!r} (ros.interface or {INTERFACE_VARIABLE}) cannot be "
+                f"combined with {conflict}; leave one of them out"
+            )
+
+    def interface_in_force(self) -> str:
+        """Return the interface of these settings or of ROSRM_INTERFACE; "": all interfaces."""
+        return self._in_force().get(INTERFACE_VARIABLE, "")
+
+    def _in_force(self) -> Mapping[str, str]:
+        return {**os.environ, **self.environment()}
+
     def describe(self) -> str:
-        """Return a text on the domain, RMW and discovery in force."""
-        joined = {**os.environ, **self.environment()}
+        """Return a text on the domain, RMW, discovery and interface in force."""
+        joined = self._in_force()
         discovery = joined.get("ROS_DISCOVERY_SERVER") or joined.get(
             "ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET"
         )
+        interface = self.interface_in_force()
         return (
             f"domain {joined.get('ROS_DOMAIN_ID', '0')}, "
             f"RMW {joined.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')}, "
-            f"discovery {discovery}"
+            f"discovery {discovery}" + (f", interface {interface}" if interface else "")
         )

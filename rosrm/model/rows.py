@@ -73,6 +73,7 @@ class ProcessRow:
         memory: memory usage in bytes.
         reason: why it waits, failed, ...
         stale: `cpu` and `memory` are old, because its host is silent or lost.
+        owner: principal that submitted it, "user:ada"; "": unknown.
     """
 
     name: str
@@ -91,6 +92,7 @@ class ProcessRow:
     memory: int
     reason: str
     stale: bool = False
+    owner: str = ""
 
 
 @dataclass(frozen=True, slots=True)

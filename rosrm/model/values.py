@@ -275,11 +275,13 @@ class Assignment:
         shadow: True for the destination of a handoff: it starts silent, and is not restarted until
             an order to its slave allows restarts.
         fence: deadline at which its host stops it without contact to the master; None: never.
-        kept_on: hosts with a snapshot of the process, the newest first.
-        kept_from: lowest number of an instance with a valid snapshot; 0: the node publishes no
+        snapshot_hosts: hosts with a snapshot of the process, the newest first.
+        snapshots_from: lowest number of an instance with a valid snapshot; 0: the node publishes no
             state, and there are no snapshots.
         restored: True: it starts from the image of a former instance on the host, and is not
             restarted until an order to its slave allows restarts.
+        state_key: key by which slaves encrypt the replicas of the process's snapshots; b"": they
+            are not encrypted.
     """
 
     instance: InstanceId
@@ -288,14 +290,15 @@ class Assignment:
     node_name: str
     shadow: bool = False
     fence: Fence | None = None
-    kept_on: tuple[str, ...] = ()
-    kept_from: int = 0
+    snapshot_hosts: tuple[str, ...] = ()
+    snapshots_from: int = 0
     restored: bool = False
+    state_key: bytes = field(default=b"", repr=False)
 
     @property
     def has_snapshots(self) -> bool:
         """Return True if its node publishes state that is stored in snapshots."""
-        return self.kept_from > 0
+        return self.snapshots_from > 0
 
     @property
     def on_trial(self) -> bool:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Final
 
 #: Default bound in seconds on the age of a snapshot.
 KEEP_EVERY: Final = 1.0
+#: Bytes of the key of an instance.
+_KEY_BYTES: Final = 32
 #: Most digits of an epoch.
 _EPOCH_DIGITS: Final = 20
 
@@ -25,10 +28,11 @@ class NodeIdentity:
         state_config: topic of the master's messages.
         cluster: name of the master that started it.
         epoch: of that master.
-        epoch_file: where the slave writes the newest epoch of the master; "": nowhere.
         shadow: it starts as the destination of a handoff.
         keep: directory of its snapshots; "" if none are written.
         keep_every: greatest age of a snapshot, seconds.
+        epoch_file: where the slave writes the newest epoch of the master; "": nowhere.
+        key: secret that the node shares with its master; None: the cluster has no security.
     """
 
     process: str
@@ -41,6 +45,7 @@ class NodeIdentity:
     keep: str = ""
     keep_every: float = KEEP_EVERY
     epoch_file: str = ""
+    key: bytes | None = field(default=None, repr=False)
 
     @property
     def namespace(self) -> str:
@@ -57,7 +62,11 @@ class NodeIdentity:
 
 
 def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
-    """Return the identity set by a slave; None if rosrm did not start this process."""
+    """Return the identity set by a slave; None if rosrm did not start this process.
+
+    Raises:
+        ValueError: the key of the instance is damaged; without it the node would believe everyone.
+    """
     process, _, number = environment.get("ROSRM_INSTANCE", "").rpartition("#")
     topic = environment.get("ROSRM_STATE_CONFIG", "")
     if not process or not number.isdecimal() or not topic:
@@ -74,7 +83,21 @@ def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
         keep=environment.get("ROSRM_KEEP", ""),
         keep_every=_seconds(environment.get("ROSRM_KEEP_EVERY", "")),
         epoch_file=environment.get("ROSRM_EPOCH_FILE", ""),
+        key=_key(environment.get("ROSRM_INSTANCE_KEY", "")),
     )
+
+
+def _key(text: str) -> bytes | None:
+    """Return the key of the instance; None: the cluster has no security."""
+    if not text:
+        return None
+    try:
+        key = base64.b64decode(text, validate=True)
+    except ValueError:
+        key = b""
+    if len(key) != _KEY_BYTES:
+        raise ValueError(f"ROSRM_INSTANCE_KEY must have {_KEY_BYTES} bytes in base64")
+    return key
 
 
 def _seconds(text: str) -> float:

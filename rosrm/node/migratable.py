@@ -31,7 +31,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     callback, no cost. Under rosrm
 
     - each callback of a timer, an input or a service is a *cycle*, and cycles never overlap;
-    - after a cycle the state is saved and published, if it has a follower;
+    - after a cycle the state is saved and published, if it has a successor;
     - a node started as the destination of a handoff is a shadow until it is active: inputs are
       buffered, timers stopped, services absent, and published messages dropped.
 
@@ -74,7 +74,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """Name one topic of this node's state; several calls make a state of several parts.
 
         Args:
-            topic: the state is published on it after each cycle, if it has subscribers.
+            topic: the state is published on it during a handoff; only the successor can read it.
             message_type: message class of the topic.
             save: returns the state as a message, or None: unchanged since the last time.
             restore: takes the message, and overwrites the node's state. A shadow calls it for every

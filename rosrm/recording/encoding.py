@@ -63,6 +63,15 @@ _ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
 )
 #: Bits of an order's number to its series, in recordings of rosrm 0.1.0.
 _SERIES_OF_0_1_0: Final = MappingProxyType({41: "replication", 42: "capability", 43: "periodic"})
+#: Events with other names in recordings of rosrm 0.1.0: by former name the name, the field, and its
+#: former name.
+_RENAMED: Final = MappingProxyType(
+    {
+        "HostRegistered": ("HostRegistered", "snapshots", "kept"),
+        "HostLeft": ("HostLeft", "left_running", "kept"),
+        "KeptStatesReceived": ("SnapshotsReported", "snapshots", "states"),
+    }
+)
 _KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {kind.__name__: kind for kind in get_args(happened.Event)}
 )
@@ -108,13 +117,25 @@ def decode(kind: FrameKind, content: bytes) -> Happened:
         if kind is FrameKind.USAGES:
             return Happened(now, wall, _decoded_usages(rest))
         plain = json.loads(rest)
-        kind_of_event = _KINDS[plain.pop("kind")]
+        kind_of_event = _KINDS[_rename(plain)]
         if kind_of_event is happened.OrderAnswered:
             plain["order"] = _order_id(plain["order"])
+        if isinstance(plain.get("by"), str):  # of rosrm 0.1.0, in which each client was an operator
+            plain["by"] = [plain["by"], True]
         event: happened.Event = from_plain(kind_of_event, plain)
     except (struct.error, KeyError, TypeError, AttributeError) as fault:
         raise ValueError(f"{type(fault).__name__}: {fault}") from None
     return Happened(now, wall, event)
+
+
+def _rename(plain: dict[str, Any]) -> str:
+    """Remove and return the name of an event; rename its field if rosrm 0.1.0 wrote it."""
+    name: str = plain.pop("kind")
+    if name in _RENAMED:
+        name, field, former = _RENAMED[name]
+        if former in plain:
+            plain[field] = plain.pop(former)
+    return name
 
 
 def _order_id(plain: Any) -> Any:

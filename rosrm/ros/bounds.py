@@ -23,6 +23,7 @@ LARGEST_MESSAGE: Final = 1 << 26
 LARGEST_SPEC: Final = 1 << 20
 
 _OTHER_LETTERS: Final = {
+    "Sealed.principal": 160,
     "KeyValue.value": 1 << 20,
     "ProcessSpec.command": 1 << 17,
     "ProcessSpec.arguments": 1 << 17,
@@ -32,6 +33,7 @@ _OTHER_LETTERS: Final = {
     "Explain_Response.explanation": 1 << 24,
 }
 _OTHER_ENTRIES: Final = {
+    "Assignment.state_key": 32,
     "HostDescription.labels": 256,
     "HostDescription.resources": 16,
     "HostDescription.executors": 256,
@@ -42,11 +44,12 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.avoided_labels": 256,
     "StandbyPolicy.apart_by": 256,
     "ProcessStatusBatch.failing": 1000,
+    "Sealed.body": 1 << 24,
     "Submit_Request.processes": 10_000,
     "List_Response.process_list": 1 << 20,
     "List_Response.plugin_list": 1 << 20,
-    "KeepState_Request.data": 1 << 20,
-    "ReadKept_Response.data": 1 << 20,
+    "StoreReplica_Request.data": 1 << 20,
+    "ReadSnapshot_Response.data": 1 << 20,
     "ReadLog_Response.content": 1 << 20,
 }
 

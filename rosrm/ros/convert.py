@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from array import array
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import is_dataclass, replace
 from functools import cache, partial
@@ -10,6 +11,7 @@ from operator import attrgetter
 from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 from rosrm.errors import Refused
+from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
 from rosrm.model.description_checks import (
     description_fault,
@@ -278,8 +280,8 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
         node_name=assignment.node_name, shadow=assignment.shadow,
         fence_after=float(fence.after), fence_grace=float(fence.grace),
         fence_alive=fence.alive,
-        kept_on=list(assignment.kept_on), kept_from=assignment.kept_from,
-        restored=assignment.restored,
+        snapshot_hosts=list(assignment.snapshot_hosts), snapshots_from=assignment.snapshots_from,
+        restored=assignment.restored, state_key=array("B", assignment.state_key),
         spec=spec_to_msg(assignment.spec),
     )  # fmt: skip
 
@@ -289,13 +291,18 @@ def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
     for name in ("fence_after", "fence_grace"):  # a lease and a delay, each at most this long
         if not 0.0 <= getattr(message, name) <= 2.0 * LONGEST:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
+    if len(message.state_key) not in (0, KEY_BYTES):
+        raise Refused(
+            f"{message.instance.process}: state_key has {len(message.state_key)} bytes; allowed: 0 "
+            f"or {KEY_BYTES}"
+        )
     fence = None
     if message.fence_after:
         fence = values.Fence(message.fence_after, message.fence_grace, message.fence_alive)
     return values.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
-        message.node_name, message.shadow, fence, tuple(message.kept_on), message.kept_from,
-        message.restored,
+        message.node_name, message.shadow, fence, tuple(message.snapshot_hosts),
+        message.snapshots_from, message.restored, bytes(message.state_key),
     )  # fmt: skip
 
 
@@ -354,15 +361,15 @@ def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
     )
 
 
-def snapshot_to_msg(kept: values.SnapshotReport) -> msg.KeptState:
+def snapshot_to_msg(snapshot: values.SnapshotReport) -> msg.SnapshotReport:
     """Return the description of a snapshot on a host as a message."""
-    return msg.KeptState(
-        process=kept.instance.process, number=kept.instance.number, sequence=kept.sequence,
-        size=kept.size,
+    return msg.SnapshotReport(
+        process=snapshot.instance.process, number=snapshot.instance.number,
+        sequence=snapshot.sequence, size=snapshot.size,
     )  # fmt: skip
 
 
-def snapshot_from_msg(message: msg.KeptState) -> values.SnapshotReport:
+def snapshot_from_msg(message: msg.SnapshotReport) -> values.SnapshotReport:
     """Return the inverse of `snapshot_to_msg`; raises `Refused` for an invalid name."""
     fault = name_fault(message.process, "process")
     if fault:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
 from typing import Final, Literal
+from xml.sax.saxutils import escape
 
 #: The first is the one that Fast DDS 2.14 (Jazzy) reads. A value set by the user is not changed.
 _VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
@@ -13,6 +15,19 @@ _PROFILES: Final = Path(__file__).parent / "profiles"
 
 _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
 _UDP: Final = "UDPv4"
+
+#: Parts of a profile that replace the builtin transports by one with a single interface.
+_TRANSPORT: Final = """\
+  <transport_descriptors><transport_descriptor>
+    <transport_id>rosrm_interface</transport_id>
+    <type>UDPv4</type>
+    <interfaceWhiteList><address>{interface}</address></interfaceWhiteList>
+  </transport_descriptor></transport_descriptors>
+"""
+_ONLY_TRANSPORT: Final = """\
+      <userTransports><transport_id>rosrm_interface</transport_id></userTransports>
+      <useBuiltinTransports>false</useBuiltinTransports>
+"""
 
 Pace = Literal["eager", "steady"]
 
@@ -40,10 +55,45 @@ def announcing(environment: MutableMapping[str, str], pace: Pace, *, udp: bool) 
 
     The environment is restored afterwards, for the processes that this one starts.
     """
-    added = announcements(environment, pace, udp=udp)
+    with _changed(environment, announcements(environment, pace, udp=udp)):
+        yield
+
+
+@contextlib.contextmanager
+def bound(environment: MutableMapping[str, str], pace: Pace, interface: str) -> Iterator[None]:
+    """Bind a participant to one network interface, as `announcing` for UDP alone.
+
+    Fast DDS reads one profile in the life of a process: the first participant decides. A profile of
+    the user does not apply to the participant.
+
+    Args:
+        environment: of this process.
+        pace: frequency of the announcements.
+        interface: its name or IPv4 address.
+    """
+    with tempfile.NamedTemporaryFile("w", prefix="rosrm-", suffix=".xml") as file:
+        file.write(_bound_profile(pace, interface))
+        file.flush()
+        with _changed(environment, {_VARIABLES[0]: file.name, _TRANSPORTS: _UDP}):
+            yield
+
+
+def _bound_profile(pace: Pace, interface: str) -> str:
+    """Return the profile of a pace, with one UDP transport on one interface."""
+    profile = (_PROFILES / f"{pace}.xml").read_text(encoding="utf-8")
+    transport = _TRANSPORT.format(interface=escape(interface))
+    return profile.replace("  <participant ", f"{transport}  <participant ", 1).replace(
+        "    <rtps>\n", f"    <rtps>\n{_ONLY_TRANSPORT}", 1
+    )
+
+
+@contextlib.contextmanager
+def _changed(environment: MutableMapping[str, str], added: Mapping[str, str]) -> Iterator[None]:
+    former = {name: environment[name] for name in added if name in environment}
     environment.update(added)
     try:
         yield
     finally:
         for variable in added:
             del environment[variable]
+        environment.update(former)

@@ -34,8 +34,8 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
     ReportInstances: _Request.REPORT,
     SetRestartPolicy: _Request.SET_RESTART,
     FenceInstance: _Request.FENCE,
-    ReplicateSnapshot: _Request.KEEP,
-    DropReplica: _Request.DROP_KEPT,
+    ReplicateSnapshot: _Request.REPLICATE,
+    DropReplica: _Request.DROP_REPLICA,
 }
 #: Orders by an instance alone.
 _OF_INSTANCE: Final[Mapping[int, Callable[[InstanceId], Order]]] = {
@@ -58,7 +58,7 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
         case SetRestartPolicy(_, restart):
             request.restart = convert.restart_to_msg(restart)
         case ReplicateSnapshot(_, hosts, every):
-            request.keep_on, request.keep_every = list(hosts), float(every)
+            request.replicate_to, request.replicate_every = list(hosts), float(every)
     request.instance = convert.instance_to_msg(order.instance)
     return request
 
@@ -79,8 +79,8 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
             return ReportInstances()
         case _Request.SET_RESTART:
             return SetRestartPolicy(instance, convert.restart_from_msg(request.restart))
-        case _Request.KEEP:
-            return ReplicateSnapshot(instance, tuple(request.keep_on), request.keep_every)
+        case _Request.REPLICATE:
+            return ReplicateSnapshot(instance, tuple(request.replicate_to), request.replicate_every)
     if request.action not in _OF_INSTANCE:
         raise Refused(f"unknown action {request.action}")
     return _OF_INSTANCE[request.action](instance)
@@ -88,9 +88,9 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
 
 def _fault(request: srv.ControlHost.Request) -> str:
     """Return an impossible name or time in an order; "" for none. Unused fields are empty."""
-    for seconds in (request.timeout, request.keep_every):
+    for seconds in (request.timeout, request.replicate_every):
         if not 0.0 <= seconds <= LONGEST:
             return f"a time of {seconds} s; allowed: 0 to {LONGEST:g}"
     process = request.instance.process
-    faults = [name_fault(host, "host") for host in request.keep_on]
+    faults = [name_fault(host, "host") for host in request.replicate_to]
     return next(filter(None, faults), "") or (process and name_fault(process, "process"))

@@ -23,7 +23,8 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.callback_guard import CallbackGuard
-from rosrm.ros.fast_dds import Pace, announcing
+from rosrm.ros.fast_dds import Pace, announcing, bound
+from rosrm.ros.network_interface import check_interface
 from rosrm.version import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
@@ -65,7 +66,13 @@ class Participant:
         os.environ.update(settings.environment())
         self.settings = settings
         self.context = rclpy.Context()
-        with announcing(os.environ, pace, udp=True):
+        interface = settings.interface_in_force()
+        if interface:
+            check_interface(interface)
+            profile = bound(os.environ, pace, interface)
+        else:
+            profile = announcing(os.environ, pace, udp=True)
+        with profile:
             rclpy.init(
                 context=self.context,
                 domain_id=settings.domain,
@@ -174,14 +181,14 @@ def _call_bounded(callback: Callable[..., None], *arguments: Any) -> None:
     callback(*arguments)
 
 
-def failed_response(service_type: Any, reason: str) -> Any:
-    """Return the response to a request whose handler raised."""
+def failed_response(service_type: Any, reason: str, code: str = "failed") -> Any:
+    """Return the response to a request whose handler raised, or that cannot be handled."""
     response = service_type.Response()
     answer = getattr(response, "answer", response)  # a handshake's response is itself the answer
     answer.protocol_version, answer.accepted = PROTOCOL_VERSION, False
-    answer.message = f"an error of the receiver: {reason}"
+    answer.message = f"an error of the receiver: {reason}" if code == "failed" else reason
     if hasattr(answer, "code"):
-        answer.code = "failed"
+        answer.code = code
     return response
 
 

@@ -31,7 +31,7 @@ BEAT: Final = latched(depth=1)
 BEAT_IN: Final = best_effort(depth=1)
 #: For observers of the master's load.
 LOAD: Final = reliable(depth=5)
-#: The master's newest messages about every handoff.
-STATE_CONFIG: Final = latched(depth=100)
+#: The master's newest messages about every handoff: two for each phase, one for each node.
+STATE_CONFIG: Final = latched(depth=200)
 #: One handoff: a restarted master receives the reports that it has missed.
 HANDOFF: Final = latched(depth=20)

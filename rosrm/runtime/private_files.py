@@ -89,16 +89,9 @@ def open_private(path: str, flags: int) -> int:
     Raises:
         OSError: it cannot be opened, is a link, or belongs to another user.
     """
+    file, mode = open_own(path, flags & ~os.O_TRUNC)
     try:
-        file = os.open(path, flags & ~os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise _refusal(path, "it is a symbolic link") from None
-        raise
-    try:
-        state = os.fstat(file)
-        _check_file(path, state)
-        if state.st_mode & _OTHERS:
+        if mode & _OTHERS:
             os.fchmod(file, 0o600)
         if flags & os.O_TRUNC:
             os.ftruncate(file, 0)
@@ -106,6 +99,30 @@ def open_private(path: str, flags: int) -> int:
         os.close(file)
         raise
     return file
+
+
+def open_own(path: str, flags: int) -> tuple[int, int]:
+    """Open a regular file of this user as it is; never follow a link.
+
+    Returns:
+        The descriptor, and the mode of the file, which others may be allowed to read.
+
+    Raises:
+        OSError: it cannot be opened, is a link, or belongs to another user.
+    """
+    try:
+        file = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _refusal(path, "it is a symbolic link") from None
+        raise
+    try:
+        state = os.fstat(file)
+        _check_file(path, state)
+    except OSError:
+        os.close(file)
+        raise
+    return file, stat.S_IMODE(state.st_mode)
 
 
 def make_private_file(path: str) -> None:

@@ -126,7 +126,7 @@ class SlaveRuntime:
             self._note_broken(offered.broken)
             self._serve_master(max_age)
             self._starter = Starter(
-                config, self._kept, self._state, self._supervisor, self._endpoint,
+                config, self._snapshots, self._state, self._supervisor, self._endpoint,
                 self._replication, graph, sessions, launchers, take=self._take,
             )  # fmt: skip
             self._ending = Shutdown(
@@ -185,7 +185,7 @@ class SlaveRuntime:
         config = self._config
         self._epoch_note = EpochNote(config.state / EPOCH_NOTE)
         self._replication = ReplicationService(
-            self._kept, config.host, config.keep,
+            self._snapshots, config.host, config.keep,
             ReplicationEndpoint(self._participant, config.host),
             post=self._post, publish=self._endpoint.publish_snapshots,
         )  # fmt: skip
@@ -196,7 +196,7 @@ class SlaveRuntime:
         SlaveServices(self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
     @property
-    def _kept(self) -> Path:
+    def _snapshots(self) -> Path:
         """Return the directory of the snapshots."""
         return self._config.state / "kept"
 

@@ -132,13 +132,13 @@ class Shutdown:
         _log.info("%s of %s ended; %s", part, self.config.host, count)
         return code
 
-    def _inform_master(self, kept: Sequence[InstanceStatus] = ()) -> None:
+    def _inform_master(self, running: Sequence[InstanceStatus] = ()) -> None:
         """Report the end of this slave, and wait for the master's acknowledgement or a time-out."""
 
         def informed() -> None:
             self._is_informed = True
 
-        self.endpoint.leave(informed, kept)
+        self.endpoint.leave(informed, running)
         deadline = time.monotonic() + _LEAVE_PATIENCE
         self.serve(lambda: not self._is_informed and time.monotonic() < deadline)
 

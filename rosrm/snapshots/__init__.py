@@ -2,5 +2,6 @@
 
 A directory belongs to one process. Its node writes `state.0` and `state.1` in turn, so that one of
 them is complete even after a kill. Its slave writes `copy`, a replica from another host. The newest
-complete file counts. docs/reference/handoff-protocol.md has the format.
+complete file counts. A replica may be encrypted; the slave decrypts it before the node starts.
+docs/reference/handoff-protocol.md has the format.
 """

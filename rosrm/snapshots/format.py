@@ -12,11 +12,15 @@ from typing import Final, NamedTuple
 
 #: Most bytes of a file, and most blocks; a larger file is no snapshot.
 LARGEST: Final = 2 << 30
+#: Most bytes of a replica: encryption adds a header, a nonce and a tag.
+LARGEST_REPLICA: Final = LARGEST + 4096
 _MOST_BLOCKS: Final = 1000
 #: Numbers of instances and cycles are smaller; greater ones would overflow when they grow.
 MOST_CYCLES: Final = 1 << 62
 
 _MAGIC: Final = b"rosrmKS1"
+#: Magic of an encrypted replica: its one block is an encrypted snapshot.
+_ENCRYPTED: Final = b"rosrmKE1"
 #: Magic, instance, sequence, bytes of the name, blocks.
 _FIXED: Final = struct.Struct("<8sQQII")
 #: Bytes and CRC-32 of one block.
@@ -45,6 +49,7 @@ class Head:
         sequence: cycles that the snapshot covers.
         blocks: bytes and CRC-32 of each.
         size: bytes of the whole file, header included.
+        encrypted: True: an encrypted replica, which no node can read.
     """
 
     process: str
@@ -52,6 +57,7 @@ class Head:
     sequence: int
     blocks: tuple[tuple[int, int], ...]
     size: int
+    encrypted: bool = False
 
     @property
     def age(self) -> tuple[int, int]:
@@ -64,7 +70,8 @@ class Listing:
     """A complete snapshot.
 
     Attributes:
-        blocks: the mark, then each part of the state, serialised.
+        blocks: the mark, then each part of the state, serialised; in an encrypted replica the nonce
+            and the encrypted snapshot.
         path: file that the snapshot was read from.
     """
 
@@ -102,12 +109,15 @@ class TransferPart(NamedTuple):
         return self.offset + len(self.data) >= self.total
 
 
-def encoded_head(process: str, instance: int, sequence: int, blocks: Sequence[Block]) -> bytes:
+def encoded_head(
+    process: str, instance: int, sequence: int, blocks: Sequence[Block], *, encrypted: bool = False
+) -> bytes:
     """Return the header of a file."""
     name = process.encode()
+    magic = _ENCRYPTED if encrypted else _MAGIC
     head = b"".join(
         [
-            _FIXED.pack(_MAGIC, instance, sequence, len(name), len(blocks)),
+            _FIXED.pack(magic, instance, sequence, len(name), len(blocks)),
             name,
             *(_BLOCK.pack(len(block.data), block.digest) for block in blocks),
         ]
@@ -124,7 +134,7 @@ def decoded_head(data: bytes | mmap) -> tuple[Head, int]:
     try:
         magic, instance, sequence, name_size, count = _FIXED.unpack_from(data)
         end = _FIXED.size + name_size + count * _BLOCK.size
-        if magic != _MAGIC or count > _MOST_BLOCKS or end + _CRC.size > len(data):
+        if magic not in (_MAGIC, _ENCRYPTED) or count > _MOST_BLOCKS or end + _CRC.size > len(data):
             raise Damaged("it is no snapshot")
         if max(instance, sequence) >= MOST_CYCLES:
             raise Damaged("no instance has such a number, or so many cycles")
@@ -137,9 +147,10 @@ def decoded_head(data: bytes | mmap) -> tuple[Head, int]:
     blocks = tuple(_BLOCK.iter_unpack(table))
     start = end + _CRC.size
     size = start + sum(size for size, _ in blocks)
-    if size > LARGEST:
+    encrypted = magic == _ENCRYPTED
+    if size > (LARGEST_REPLICA if encrypted else LARGEST):
         raise Damaged("it claims to be larger than a state can be")
-    return Head(name, instance, sequence, blocks, size), start
+    return Head(name, instance, sequence, blocks, size, encrypted), start
 
 
 def checked(data: bytes | mmap) -> tuple[Head, int]:

@@ -10,7 +10,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from rosrm.snapshots.format import LARGEST, Damaged, Head, Listing, checked, decoded, decoded_head
+from rosrm.snapshots.format import (
+    LARGEST_REPLICA,
+    Damaged,
+    Head,
+    Listing,
+    checked,
+    decoded,
+    decoded_head,
+)
 
 #: Written by the node, in turn.
 SLOTS: Final = ("state.0", "state.1")
@@ -89,7 +97,7 @@ def content_of(path: Path) -> bytes:
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
         with os.fdopen(descriptor, "rb") as file:
-            return file.read(min(os.fstat(descriptor).st_size, LARGEST))
+            return file.read(min(os.fstat(descriptor).st_size, LARGEST_REPLICA))
     except OSError as error:
         raise Damaged(f"it cannot be read: {error.strerror}") from None
 
@@ -104,7 +112,7 @@ def newest(directory: Path, up_to: int) -> tuple[Listing | None, list[str]]:
         if path not in sound and path.is_file() and path.stat().st_size
     ]
     for path, head in found:
-        if head.instance > up_to:
+        if head.instance > up_to or head.encrypted:
             continue
         try:
             return read(path), faults

@@ -20,6 +20,9 @@ from rosrm.snapshots.reader import (
     peek,
 )
 
+#: A snapshot that is being written for a node before its start.
+_BEGUN: Final = "state.new"
+
 
 class SlotWriter:
     """Writer of a node's snapshots into its two slots in turn, never over the newest one.
@@ -115,6 +118,10 @@ class CopyWriter:
     Args:
         directory: of the process; created where it does not exist.
 
+    Attributes:
+        path: of the unfinished replica.
+        size: bytes so far.
+
     Raises:
         OSError: the file cannot be opened.
     """
@@ -122,9 +129,9 @@ class CopyWriter:
     def __init__(self, directory: Path) -> None:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._directory = directory
-        self._begun = directory / f"{COPY}.new"
+        self.path = directory / f"{COPY}.new"
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | OPEN
-        self._file = os.open(self._begun, flags, 0o600)
+        self._file = os.open(self.path, flags, 0o600)
         self.size = 0
 
     def append(self, data: bytes) -> None:
@@ -132,26 +139,27 @@ class CopyWriter:
         _write_all(self._file, [data], self.size)
         self.size += len(data)
 
-    def finish(self, process: str, age: tuple[int, int]) -> None:
-        """Check the replica, and replace the earlier one by it.
+    def check(self, process: str, age: tuple[int, int]) -> Head:
+        """Return the header of the complete replica.
 
         Raises:
-            Damaged: the replica is not complete, or of another process or age; it is deleted.
-            OSError: the replica cannot be stored.
+            Damaged: the replica is not complete, or of another process or age.
+            OSError: the replica cannot be read.
         """
-        try:
-            _check_origin(checked_replica(self._begun), process, age)
-            self._begun.replace(self._directory / COPY)
-        except (Damaged, OSError):
-            self.abandon()
-            raise
+        head = checked_replica(self.path)
+        check_origin(head, process, age)
+        return head
+
+    def finish(self) -> None:
+        """Replace the earlier replica by this one; raises `OSError`."""
+        self.path.replace(self._directory / COPY)
         self._close()
 
     def abandon(self) -> None:
         """Delete the unfinished replica."""
         self._close()
         with contextlib.suppress(OSError):
-            self._begun.unlink(missing_ok=True)
+            self.path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self._directory.rmdir()  # fails, as intended, if the directory holds other files
 
@@ -161,9 +169,26 @@ class CopyWriter:
             self._file = -1
 
 
-def _check_origin(head: Head, process: str, age: tuple[int, int]) -> None:
+def check_origin(head: Head, process: str, age: tuple[int, int]) -> None:
+    """Raise `Damaged` if a snapshot is of another process or age."""
     if (head.process, head.age) != (process, age):
         raise Damaged(f"it is a state of {head.process}#{head.instance}")
+
+
+def write_slot(directory: Path, content: bytes) -> None:
+    """Replace the older one of a node's two snapshots by this content; raises `OSError`."""
+    ages = {directory / name: _age_if_whole(directory / name) for name in SLOTS}
+    begun = directory / _BEGUN
+    begun.unlink(missing_ok=True)
+    file = os.open(begun, os.O_WRONLY | os.O_CREAT | os.O_EXCL | OPEN, 0o600)
+    try:
+        _write_all(file, [content], 0)
+        begun.replace(min(ages, key=lambda path: ages[path]))
+    except OSError:
+        begun.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(file)
 
 
 def drop_snapshots(directory: Path, up_to: int) -> bool:
@@ -179,5 +204,6 @@ def drop_snapshots(directory: Path, up_to: int) -> bool:
     if not left:
         with contextlib.suppress(OSError):
             (directory / f"{COPY}.new").unlink(missing_ok=True)
+            (directory / _BEGUN).unlink(missing_ok=True)
             directory.rmdir()
     return not left

@@ -9,7 +9,6 @@
     process_tree.py       process trees of the instances: signals, reaping
     procfs.py             lookup in /proc of the processes of an instance
     instance_record.py    the record that survives the supervisor's own death: instances.jsonl
-    atomic_file.py        replacement of a whole file, or of nothing
     paths.py              the files in the supervisor's directory
     lease_file.py         the last contact with the master, for a restart
     logs.py, log_index.py the processes' log files: rotated, bounded, indexed by time

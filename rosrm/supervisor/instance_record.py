@@ -33,8 +33,9 @@ from rosrm.core.supervisor.instance import (
 )
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
+from rosrm.runtime import atomic_file
 from rosrm.runtime.private_files import open_private
-from rosrm.supervisor import atomic_file, json_lines, messages, paths, procfs
+from rosrm.supervisor import json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
 
 VERSION: Final = 1

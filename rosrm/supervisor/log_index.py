@@ -17,8 +17,8 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from rosrm.runtime import atomic_file
 from rosrm.runtime.private_files import open_private
-from rosrm.supervisor import atomic_file
 
 if TYPE_CHECKING:
     from typing_extensions import Self

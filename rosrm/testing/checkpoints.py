@@ -56,8 +56,8 @@ class CheckpointContract:
         fresh = CheckpointView(self.spec, "h0", None, 1000, (), hosts)
         return [
             fresh,
-            replace(fresh, age=0.5, kept_on=("h3",)),
-            replace(fresh, age=3600.0, kept_on=("h4", "h1", "gone"), size=1 << 30),
+            replace(fresh, age=0.5, replica_hosts=("h3",)),
+            replace(fresh, age=3600.0, replica_hosts=("h4", "h1", "gone"), size=1 << 30),
             replace(fresh, hosts={"h0": hosts["h0"]}),
         ]
 
@@ -83,8 +83,8 @@ class CheckpointContract:
             choice = self._choice(self.make(), view)
             if choice is not None:
                 for order in islice(permutations(choice.hosts), _ORDERS):
-                    kept = replace(view, age=0.1, kept_on=order)
-                    again = self._choice(self.make(), kept)
+                    replicated = replace(view, age=0.1, replica_hosts=order)
+                    again = self._choice(self.make(), replicated)
                     assert again is None or set(again.hosts) == set(choice.hosts), (
                         f"kept on {', '.join(order)} it chooses {', '.join(again.hosts)}"
                     )

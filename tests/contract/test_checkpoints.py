@@ -56,7 +56,7 @@ def test_apart_comes_first():
 
 def test_a_replica_moves_to_a_host_that_is_apart():
     """A host with another label replaces the host with the same label, once it is up."""
-    choice = choose(view(kept_on=("h2",)), apart_by="rack")
+    choice = choose(view(replica_hosts=("h2",)), apart_by="rack")
     assert HOSTS[choice.hosts[0]]["rack"] == "1"
 
 
@@ -79,12 +79,12 @@ def test_a_process_that_stood_still_for_long_runs_for_longer():
 
 
 def test_a_policy_that_follows_the_order_of_the_copies_is_caught():
-    """`kept_on` changes its order by the second, so the copies would travel to and fro."""
+    """`replica_hosts` changes its order by the second, so the copies would travel to and fro."""
 
     class Follows:
         def choose(self, process):
             others = [name for name in process.hosts if name != process.host]
-            first = [name for name in process.kept_on if name in others][:1]
+            first = [name for name in process.replica_hosts if name in others][:1]
             rest = [name for name in others if name not in first]
             at = (others.index(first[0]) + 1) % len(rest) if first else 0
             return CheckpointChoice((*first, *rest[at : at + 2 - len(first)]))

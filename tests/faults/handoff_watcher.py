@@ -14,12 +14,18 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64, Int64MultiArray
 
 from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
+from rosrm.keys.handoffs import HandoffKeys, new_link
+from rosrm.keys.names import handoff_name, named_instance
+from rosrm.keys.sealing import Direction
 from rosrm.ros import qos
 from rosrm.ros.qos import HANDOFF, STATE_CONFIG
+from rosrm.ros.sealed_codec import decode
+from rosrm.ros.sealed_topic import SealedTopic
 from rosrm.supervisor.procfs import read_environment
-from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
+from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, Sealed, StateConfig
 from tests.ros.clusters import Cluster, pids_of, zombie
 
+STATE_CONFIG_TOPIC = "/rosrm/state_config"
 #: Handoff phases by the names that the tests use.
 SAID = {
     getattr(StateConfig, name): name
@@ -61,9 +67,12 @@ class Watcher:
     Args:
         domain: ROS domain.
         inputs: inputs per second to publish, numbered from 1; 0: none.
+        keys: of the cluster; None: it has no security.
     """
 
-    def __init__(self, domain: int, inputs: float = 0.0) -> None:
+    def __init__(self, domain: int, inputs: float = 0.0, keys: HandoffKeys | None = None) -> None:
+        self._keys = keys
+        self._configs: dict[str, SealedTopic] = {}
         self.outputs: list[Output] = []
         self.heard: list[str] = []
         self.injected = threading.Event()
@@ -79,7 +88,7 @@ class Watcher:
         )
         self._node = node = rclpy.node.Node("watcher", context=self._context)
         node.create_subscription(Int64MultiArray, OUTPUT, self._output, QOS)
-        node.create_subscription(StateConfig, "/rosrm/state_config", self._said, STATE_CONFIG)
+        node.create_subscription(Sealed, STATE_CONFIG_TOPIC, self._said, STATE_CONFIG, raw=True)
         node.create_subscription(
             ProcessStatusBatch, "/rosrm/process_status", self._told, qos.STATUSES
         )
@@ -106,12 +115,25 @@ class Watcher:
     def _output(self, message: Int64MultiArray) -> None:
         self.outputs.append(Output(*message.data))
 
-    def _said(self, config: StateConfig) -> None:
+    def _said(self, data: bytes) -> None:
+        name = decode(data).principal
+        process, number = named_instance(name)
+        if name not in self._configs:
+            key = None if self._keys is None else self._keys.of_instance(process, number)
+            link = new_link(key, Direction.TO_MASTER, Direction.FROM_MASTER)
+            self._configs[name] = SealedTopic(link, name, StateConfig, STATE_CONFIG_TOPIC)
+        config = self._configs[name].read(data)
         if config.channel not in self._channels:
             self._channels.add(config.channel)
-            self._node.create_subscription(HandoffReport, config.channel, self._reported, HANDOFF)
-        if config.source == self._source:
+            self._listen_to(config)
+        if config.source == self._source == number:  # not the copy for the destination
             self._hear(f"says {SAID[config.phase]}")
+
+    def _listen_to(self, config: StateConfig) -> None:
+        link = new_link(bytes(config.key) or None, Direction.TO_PEER, Direction.TO_PEER)
+        name = handoff_name(config.process, config.destination)
+        reports = SealedTopic(link, name, HandoffReport, config.channel)
+        reports.subscription(self._node, HANDOFF, lambda data: self._reported(reports.read(data)))
 
     def _reported(self, report: HandoffReport) -> None:
         if report.instance >= self._source:

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
 from rosrm.errors import CriuError, RecordError, TransferError
+from rosrm.model.requester import Requester
 from rosrm.node.arrays import arrays_message, arrays_of
 from rosrm.recording.encoding import encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
@@ -98,7 +99,8 @@ def recording() -> bytes:
         1, 7, np.array([1], np.uint64), np.array([0.5]), np.array([1.0])
     )
     parts = [opening(), frame(FrameKind.HEADER, Header("0", "m", {}, 1, 0.0, {}).encoded())]
-    for number, event in enumerate((readings, usages, happened.TimePassed())):
+    request = happened.CancelRequested(1, ("p",), Requester("user:ada"))
+    for number, event in enumerate((readings, usages, request, happened.TimePassed())):
         parts.append(frame(*encode(event, float(number), 1.0)))
     parts.append(frame(FrameKind.DECISIONS, encode_decisions(["assign p#1 to host 1"])))
     return b"".join([*parts, frame(FrameKind.END, b"stopped")])
@@ -117,7 +119,8 @@ def test_a_recording_is_read_or_refused(data, cut):
 @fuzzed(150)
 @given(
     kind=st.sampled_from(list(FrameKind)),
-    content=st.sampled_from([RECORDING[30:400], b"[]", b"{}", b'{"kind":"TimePassed"}'])
+    content=st.sampled_from([RECORDING[30:400], b"[]", b"{}", b'{"kind":"TimePassed"}',
+                             bytes(16) + b'{"kind":"RestoreRequested","name":"p","by":""}'])
     .flatmap(damaged_bytes) | st.just(b"[").map(lambda one: one * 50_000),
 )  # fmt: skip
 def test_a_frame_whose_checksum_fits_is_read_or_refused(kind, content):

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.config.settings import ClusterConfig, HostConfig, Quota
 from rosrm.core.master.state.migration import End
 from rosrm.core.master.state.process import Image, LeftBehind
 from rosrm.core.slave.watches import Awaited, Memo, Watch
@@ -49,7 +49,8 @@ PLAN = Plan(
 STORED = [
     PLAN, ProcessSpec("p", command=("run",), needs={"memory": 1.0}), LeftBehind, Image, End,
     Memo(Awaited("/n", 5.0), Watch(Health())), InstanceStatus(P1, InstanceState.READY),
-    ClusterConfig(), HostConfig(), OwnCriuOptions(), HandoffOptions(), MANIFEST,
+    ClusterConfig(quotas={"ada": Quota(1, 1e9, 0.5)}), HostConfig(), OwnCriuOptions(),
+    HandoffOptions(), MANIFEST,
 ]  # fmt: skip
 
 

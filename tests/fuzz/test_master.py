@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
+from rosrm.model.requester import Requester
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
@@ -48,7 +49,9 @@ instances |= st.builds(InstanceId, names, numbers)
 KNOWN: Mapping[Any, Any] = {
     int: uint64s | st.integers(-2, 3), float: floats, InstanceId: instances,
     "request": st.just(0), "host_id": host_ids, "incarnation": incarnations, "process": names,
-    "host": hosts, "hosts": st.lists(hosts, max_size=2).map(tuple), "by": texts,
+    "host": hosts, "hosts": st.lists(hosts, max_size=2).map(tuple),
+    Requester: st.builds(Requester, st.sampled_from(["user:ada", "user:bob"] * 3 + [""]) | texts,
+                         st.booleans()),
     "names": st.lists(names, max_size=3).map(tuple), "destination": numbers, "instance": instances,
     "order": st.integers(0, 6) | st.tuples(st.sampled_from(["replication", "capability", "periodic",
                                                             "images", "x"]), st.integers(0, 4)),
@@ -60,9 +63,13 @@ DESCRIPTIONS = values_of(
         values_of(ResourceDescription, {**KNOWN, "name": RESOURCES}), max_size=4
     ).map(tuple)},
 )  # fmt: skip
+#: None as long as a pause of `PAUSES`: messages of a `Cluster` take no time, so a process whose
+#: fence has passed would be assigned and refused without end.
+FENCES = st.sampled_from([0.0, 1e308, math.inf, math.nan, -1.0, -math.inf])
 SPECS = values_of(
     ProcessSpec,
     {**KNOWN, "name": names, "needs": st.dictionaries(RESOURCES, floats, max_size=2),
+     "isolation": values_of(IsolationPolicy, {**KNOWN, "after": FENCES}),
      "migration": values_of(MigrationPolicy, {
          **KNOWN, "strategy": st.sampled_from([None, "relaunch", "handoff", "criu", "none"]),
          "options": st.dictionaries(st.sampled_from(["ready_timeout", "x"]), texts | floats,
@@ -104,7 +111,7 @@ def usages(draw: Any) -> happened.UsagesReceived:
 
 GENERAL = [
     happened.HostLeft, happened.ProcessRequested, happened.StatusesReceived,
-    happened.KeptStatesReceived, happened.CancelRequested, happened.RestartRequested,
+    happened.SnapshotsReported, happened.CancelRequested, happened.RestartRequested,
     happened.CheckpointRequested, happened.RestoreRequested, happened.HostStateRequested,
     happened.PruneRequested, happened.OrderAnswered, happened.AssignmentWithdrawn,
     happened.HandoffReported, happened.PeerRefused, happened.TimePassed,
@@ -137,11 +144,14 @@ STREAMS = st.lists(
 )
 
 
+QUOTAS = {"default": {"processes": 3, "memory": 1e9}, "user:ada": {"cpu": 1.0}}
+
+
 class Besieged(Cluster):
     """A cluster with three honest hosts, and with strangers that the master may have let in."""
 
     def __init__(self) -> None:
-        super().__init__(*HOSTS, settle=3.0, suspect=1.0, lease=5.0, order_retry=1.0)
+        super().__init__(*HOSTS, settle=3.0, suspect=1.0, lease=5.0, order_retry=1.0, quotas=QUOTAS)
         self.strangers: dict[str, Machine] = {}
         self.with_processes(
             job("job", memory=100), process("service", memory=100), node("node", memory=100),
@@ -230,7 +240,7 @@ def test_an_instance_gets_no_number_that_a_host_has_claimed():
         invariants.the_books_balance(cluster.state)
 
 
-@pytest.mark.parametrize("after", [-1.0, -math.inf])
+@pytest.mark.parametrize("after", [-1.0, -math.inf, math.nan])
 def test_a_process_whose_fence_has_always_passed_is_not_assigned_without_end(after):
     """Each assignment is a line of the journal."""
     cluster = Besieged()

@@ -67,7 +67,7 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "assignment": (msg.Assignment, convert.assignment_from_msg),
     "host": (msg.HostDescription, convert.host_from_msg),
     "status": (msg.ProcessStatus, convert.status_from_msg),
-    "snapshot": (msg.KeptState, convert.snapshot_from_msg),
+    "snapshot": (msg.SnapshotReport, convert.snapshot_from_msg),
     "restart": (msg.RestartPolicy, convert.restart_from_msg),
     "order": (srv.ControlHost.Request, order_from_msg),
     "submit": (srv.Submit.Request, lambda one: services._submitted(one, 1)),

@@ -8,7 +8,7 @@ import pytest
 
 from rosrm.testing.loopback import enter_private_network
 from tests.ros.clusters import STEADY, clusters
-from tests.ros.nodes import Stage
+from tests.ros.nodes import KEYS, Stage
 from tests.ros.portable_kit import Listener
 
 
@@ -40,8 +40,11 @@ def listener(cluster):
 
 
 @pytest.fixture
-def stage():
-    """Yield a ROS context in its own domain, for nodes that run as if started by a slave."""
-    stage = Stage()
+def stage(request):
+    """Yield a ROS context in its own domain, for nodes that run as if started by a slave.
+
+    Its cluster has keys; the parameter None makes one without security.
+    """
+    stage = Stage(keys=getattr(request, "param", KEYS))
     yield stage
     stage.close()

@@ -6,6 +6,8 @@ can send, or omit, each message at any moment.
 
 from __future__ import annotations
 
+import base64
+from array import array
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -14,18 +16,26 @@ import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
+from rosrm.keys.handoffs import HandoffKeys, new_link
+from rosrm.keys.names import handoff_name, instance_name
+from rosrm.keys.sealing import Direction
 from rosrm.node import Node
 from rosrm.ros.qos import HANDOFF, STATE_CONFIG
+from rosrm.ros.sealed_topic import SealedTopic
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import HandoffReport, StateConfig
+from rosrm_msgs.msg import HandoffReport, Sealed, StateConfig
 from tests.waiting import PATIENCE, wait_until
 
 TOPIC = "/rosrm/state_config"
+STRANDED = "/rosrm/handoff/stranded"
+#: Keys of a cluster whose instances all run on one host.
+KEYS = HandoffKeys(b"secret of the cluster".ljust(32), lambda _process, _number: bytes(range(32)))
 #: Name of a destination.
 ALIAS = "counter_1700000000"
 CLUSTER = "rosrm"
@@ -86,9 +96,14 @@ class Stage:
         beside: another stage, whose domain and spinning this one shares, as a separate
             DDS participant.
         domain: domain of an existing cluster.
+        keys: of the cluster; None: it has no security.
     """
 
-    def __init__(self, beside: Stage | None = None, domain: int | None = None) -> None:
+    def __init__(
+        self, beside: Stage | None = None, domain: int | None = None,
+        keys: HandoffKeys | None = None,
+    ) -> None:  # fmt: skip
+        self.keys = beside.keys if beside is not None else keys
         self._claim = None
         self._beside: list[Stage] = []
         if beside is not None:
@@ -118,7 +133,9 @@ class Stage:
         shadow: bool = False, keep: Any = "", **named: Any,
     ) -> Any:  # fmt: skip
         """Create a node in the environment that a slave would give the instance."""
+        key = b"" if self.keys is None else self.keys.of_instance(name, number)
         variables = {
+            "ROSRM_INSTANCE_KEY": base64.b64encode(key).decode(),
             "ROSRM_INSTANCE": f"{name}#{number}", "ROSRM_PROCESS": name, "ROSRM_NODE": f"/{name}",
             "ROSRM_STATE_CONFIG": TOPIC, "ROSRM_MASTER": CLUSTER, "ROSRM_EPOCH": str(EPOCH),
             "ROSRM_SHADOW": "1" if shadow else "", "ROSRM_KEEP": str(keep),
@@ -152,6 +169,18 @@ class Stage:
         self.plain.create_subscription(message_type, topic, heard.append, qos)
         return heard
 
+    def listen_to(self, topic: SealedTopic, qos: Any) -> list[Any]:
+        """Return a list that collects all messages of a sealed topic that open."""
+        heard: list[Any] = []
+
+        def take(data: bytes) -> None:
+            message = topic.read(data)
+            if message is not None:
+                heard.append(message)
+
+        topic.subscription(self.plain, qos, take)
+        return heard
+
     def remove(self, node: Any) -> None:
         self.nodes.remove(node)
         self.executor.remove_node(node)
@@ -175,24 +204,63 @@ class Conductor:
         self, stage: Stage, *, source: int, destination: int, name: str = "counter"
     ) -> None:
         self._stage = stage
+        self._configs: dict[tuple[str, int], SealedTopic] = {}
+        self._reports: Any = None
+        key = None if stage.keys is None else stage.keys.of_handoff(name, destination)
         self.config = StateConfig(
             protocol_version=PROTOCOL_VERSION, cluster=CLUSTER, epoch=EPOCH, process=name,
             source=source, destination=destination, source_node=f"/{name}",
             destination_node=f"/{name}_{destination}",
-            channel=f"/rosrm/handoff/{name}_{destination}",
+            channel=f"/rosrm/handoff/{name}_{destination}", key=array("B", key or b""),
         )  # fmt: skip
-        self.reports: list[HandoffReport] = []
-        self._publisher = stage.plain.create_publisher(StateConfig, TOPIC, STATE_CONFIG)
-        stage.plain.create_subscription(
-            HandoffReport, self.config.channel, self.reports.append, HANDOFF
+        self._publisher = stage.plain.create_publisher(Sealed, TOPIC, STATE_CONFIG)
+        self.reports: list[HandoffReport] = stage.listen_to(
+            self.topic(HandoffReport, self.config.channel), HANDOFF
         )
 
+    def topic(self, message_type: Any, name: str) -> SealedTopic:
+        """Return a topic of the handoff for one more party that has its key."""
+        link = new_link(bytes(self.config.key) or None, Direction.TO_PEER, Direction.TO_PEER)
+        principal = handoff_name(self.config.process, self.config.destination)
+        return SealedTopic(link, principal, message_type, name)
+
     def say(self, phase: int, **other: Any) -> None:
-        """Publish a phase; `other` overrides fields of the correct message."""
+        """Publish a phase to both nodes; `other` overrides fields of the correct message."""
         right = {
             field: getattr(self.config, field) for field in self.config.get_fields_and_field_types()
         }
-        self._publisher.publish(StateConfig(**{**right, "phase": phase, **other}))
+        config = StateConfig(**{**right, "phase": phase, **other})
+        plain = serialize_message(config)
+        for number in (config.source, config.destination):
+            self._publisher.publish(self._config_of(config.process, number).seal(plain))
+
+    def _config_of(self, process: str, number: int) -> SealedTopic:
+        known = self._configs.get((process, number))
+        if known is None:
+            known = _of_instance(self._stage.keys, process, number, StateConfig, TOPIC)
+            self._configs[process, number] = known
+        return known
+
+    def questions(self) -> list[HandoffReport]:
+        """Return a list that collects the questions of the silent source."""
+        config = self.config
+        topic = _of_instance(
+            self._stage.keys, config.process, config.source, HandoffReport, STRANDED
+        )
+        return self._stage.listen_to(topic, HANDOFF)
+
+    def report_as(self, instance: int, *phases: int, destination: int | None = None) -> None:
+        """Publish reports with the handoff's key, but of any instance."""
+        if self._reports is None:
+            topic = self.topic(HandoffReport, self.config.channel)
+            self._reports = topic.publisher(self._stage.plain, HANDOFF)
+        for phase in phases:
+            self._reports.publish(
+                HandoffReport(
+                    protocol_version=PROTOCOL_VERSION, instance=instance, phase=phase,
+                    destination=self.config.destination if destination is None else destination,
+                )
+            )  # fmt: skip
 
     def of(self, number: int) -> list[int]:
         """Return the phases that an instance reported."""
@@ -236,6 +304,15 @@ class Conductor:
         self.wait(self.config.destination, HandoffReport.ABORTED)
         self.say(StateConfig.RESUME)
         self.wait(self.config.source, HandoffReport.RESUMED)
+
+
+def _of_instance(
+    keys: HandoffKeys | None, process: str, number: int, message_type: Any, topic: str
+) -> SealedTopic:
+    """Return a topic between the master and an instance, at the master's side."""
+    key = None if keys is None else keys.of_instance(process, number)
+    link = new_link(key, Direction.FROM_MASTER, Direction.TO_MASTER)
+    return SealedTopic(link, instance_name(process, number), message_type, topic)
 
 
 def pair_of(stage: Stage, make: Callable[..., Any], **named: Any) -> SimpleNamespace:

@@ -9,11 +9,9 @@ import pytest
 from std_msgs.msg import Int64
 
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
-from rosrm.ros.qos import STATE_CONFIG
-from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
 from tests.ros.clusters import CALM, NODE, alive, host
-from tests.ros.nodes import Stage
+from tests.ros.nodes import Conductor, Stage
 from tests.waiting import PATIENCE, wait_until
 
 #: A counter with a fault: `{fault}` is the end of its constructor.
@@ -150,15 +148,9 @@ def test_a_foreign_state_config_moves_nothing(cluster) -> None:
     try:
         counts = stage.listen(Int64, "/steady/count")
         stage.spin_until(lambda: len(counts) > 5, "counts")
-        stranger = stage.plain.create_publisher(StateConfig, "/rosrm/state_config", STATE_CONFIG)
-        stage.spin_until(lambda: stranger.get_subscription_count() > 0, "the node's ear")
+        stranger = Conductor(stage, source=row.number, destination=999, name="steady")
         for phase in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.TAKE_OVER):
-            stranger.publish(
-                StateConfig(
-                    protocol_version=PROTOCOL_VERSION, cluster="another", epoch=99, phase=phase,
-                    process="steady", source=row.number, destination=999, channel="/strange",
-                )
-            )  # fmt: skip
+            stranger.say(phase, cluster="another", epoch=99, channel="/strange")
         cluster.wait_for_log("steady", "it is of 'another', and 'rosrm' started this node")
         before = len(counts)
         stage.spin_until(lambda: len(counts) > before + 20, "more counts")

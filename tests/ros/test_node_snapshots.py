@@ -13,13 +13,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
-from rosrm.node.handoff.channel import MARK
 from rosrm.node.handoff.state_parts import StateError
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, encoded_head
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateMark
-from tests.ros.nodes import RELIABLE, Conductor, Counter
+from tests.ros.nodes import ALIAS, RELIABLE, Conductor, Counter
 
 LATCHED = QoSProfile(
     depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -260,9 +259,9 @@ def test_a_constructor_that_spins_is_waited_for(stage, tmp_path):
 
 def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_path):
     """A snapshot also has the unchanged parts that were published before, e.g. parameters."""
-    marks = stage.listen(StateMark, "/counter/_rosrm/mark", MARK)
     first = stage.instance(Counter, 1, keep=tmp_path)
-    stage.spin_until(lambda: marks and first.count >= 5, "five counts and a follower of the state")
+    stage.instance(Counter, 2, alias=ALIAS, shadow=True)
+    Conductor(stage, source=1, destination=2).prepare()
     at = first._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, at), "a kept state")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import signal
 import sys
@@ -24,6 +25,7 @@ from rosrm.snapshots.format import Block
 from rosrm.snapshots.writer import SlotWriter
 from rosrm_msgs.msg import StateMark
 from tests.ros.clusters import CALM, STEADY, Cluster, host
+from tests.ros.programs.keyed_master import state_key
 from tests.waiting import PATIENCE, wait_until
 
 pytestmark = pytest.mark.timeout(120)
@@ -349,3 +351,61 @@ def test_a_restarted_master_knows_the_hosts_of_replicas(three):
     assert process.lose_host().host == process.keeper
     assert wait_for_count(three, "known", before)[0][0] > before
     process.end()
+
+
+# --- encrypted --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def keyed(make_cluster, monkeypatch):
+    """Yield a cluster of three hosts, lost after 3 s of silence, whose processes have keys."""
+    start = Cluster._start
+    masters = {"rosrm.master": "tests.ros.programs.keyed_master"}
+    monkeypatch.setattr(
+        Cluster, "_start",
+        lambda self, name, module, settings: start(
+            self, name, masters.get(module, module), settings
+        ),
+    )  # fmt: skip
+    hosts = [host(f"h{n}") for n in range(3)]
+    return make_cluster(*hosts, liveness=LivenessSettings(suspect=1.0, lease=3.0))
+
+
+@pytest.mark.parametrize("fetched", [False, True], ids=["on the replica's host", "on a third host"])
+def test_a_successor_of_a_lost_host_decrypts_the_replica(keyed, fetched):
+    """The host that stores the replica has neither the state nor the key.
+
+    Master and slave of the source were restarted: the slave has the key on its disk, and the master
+    derives it again from its secret.
+    """
+    process = Replicated(keyed, "secret", 1_000_000)
+    keyed.restart_master()
+    keyed.start_slave_again(process.source)
+    at = copies(keyed, "secret")[process.keeper]
+    wait_for_copy(keyed, "secret", at + 50)
+    stored = snapshot_directory(keyed, process.keeper, "secret")
+    assert [path.name for path in stored.iterdir() if path.name != "copy.new"] == ["copy"]
+    plain = snapshot_directory(keyed, process.source, "secret") / "state.0"
+    ballast = plain.read_bytes()[-1000:-100]
+    assert ballast == bytes(900)
+    assert ballast not in (stored / "copy").read_bytes()
+    before = copies(keyed, "secret")[process.keeper]
+    if fetched:
+        keyed.client.set_host_state(process.keeper, "cordon")
+    after = process.lose_host().host
+    assert (after == process.keeper) is not fetched
+    assert wait_for_count(keyed, "secret", before)[0][0] > before
+    keyed.wait_for_log("secret", "continues from the snapshot of secret#")
+    assert_no_key(keyed, state_key("secret"))
+    keyed.cancel("secret")
+    there = snapshot_directory(keyed, after, "secret")
+    wait_until(lambda: not there.exists(), "the key is deleted with the snapshots")
+
+
+def assert_no_key(cluster: Cluster, key: bytes) -> None:
+    """Check that no file of the cluster has the key, but those for it."""
+    forms = [key, key.hex().encode(), base64.b64encode(key), str(list(key))[1:-1].encode()]
+    files = [path for path in cluster.directory.rglob("*") if path.is_file()]
+    found = {path for path in files if any(form in path.read_bytes() for form in forms)}
+    assert found
+    assert {path.name for path in found} == {"key"}, found

@@ -12,6 +12,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.slave.watches import Awaited, Memo, Watch
 from rosrm.model.plan import ReportPhase
+from rosrm.model.requester import Requester
 from rosrm.model.values import (
     Health,
     HostDescription,
@@ -19,6 +20,7 @@ from rosrm.model.values import (
     InstanceState,
     InstanceStatus,
     ResourceDescription,
+    SnapshotReport,
 )
 from rosrm.recording.encoding import decode, encode
 from rosrm.recording.frames import FrameKind
@@ -84,8 +86,11 @@ STATUS_TEXT = (
 EVENTS: list[tuple[happened.Event, str]] = [
     (happened.TimePassed(), '{"kind":"TimePassed"}'),
     (
-        happened.MigrationRequested(3, "a", by="cli"),
-        '{"kind":"MigrationRequested","request":3,"name":"a","host":null,"by":"cli"}',
+        happened.MigrationRequested(3, "a", by=Requester("user:ada")),
+        (
+            '{"kind":"MigrationRequested","request":3,"name":"a","host":null,'
+            '"by":{"name":"user:ada","is_operator":false}}'
+        ),
     ),
     (
         happened.HandoffReported("a", 8, 7, ReportPhase.READY, 5, "here"),
@@ -120,8 +125,27 @@ EVENTS: list[tuple[happened.Event, str]] = [
             '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5,'
             '"hostname":"","pid":0,"software_version":"","labels":{"arm":"yes"},"resources":'
             '[{"name":"cpu","unit":"core","capacity":4.0,"scope":"machine"}],"max_processes":0,'
-            '"period":0.1,"executors":[],"absent":{}},"instances":[],"journal_seen":0,"kept":[]}'
+            '"period":0.1,"executors":[],"absent":{}},"instances":[],"journal_seen":0,"snapshots":[]}'
         ),
+    ),
+]
+SNAPSHOTS = (SnapshotReport(InstanceId("a", 7), 3, 9),)
+SNAPSHOTS_TEXT = '[{"instance":{"process":"a","number":7},"sequence":3,"size":9}]'
+RENAMED_EVENTS: list[tuple[happened.Event, str]] = [
+    (
+        happened.HostRegistered(1, HostDescription("h", 5), snapshots=SNAPSHOTS),
+        (
+            '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5},'
+            f'"kept":{SNAPSHOTS_TEXT}}}'
+        ),
+    ),
+    (
+        happened.HostLeft(1, 2, 3, (STATUS,)),
+        (f'{{"kind":"HostLeft","request":1,"host_id":2,"incarnation":3,"kept":[{STATUS_TEXT}]}}'),
+    ),
+    (
+        happened.SnapshotsReported(2, 3, SNAPSHOTS),
+        (f'{{"kind":"KeptStatesReceived","host_id":2,"incarnation":3,"states":{SNAPSHOTS_TEXT}}}'),
     ),
 ]
 
@@ -132,6 +156,21 @@ def test_events_of_a_recording(event: happened.Event, text: str) -> None:
     content = struct.pack("<dd", 1.5, 1.7e9) + text.encode()
     assert encode(event, 1.5, 1.7e9) == (FrameKind.EVENT, content)
     assert decode(FrameKind.EVENT, content).event == event
+
+
+@pytest.mark.parametrize(("event", "text"), RENAMED_EVENTS)
+def test_events_of_a_recording_of_0_1_0(event: happened.Event, text: str) -> None:
+    """Read names of that version in its recordings, and write the present ones."""
+    content = struct.pack("<dd", 1.5, 1.7e9) + text.encode()
+    assert decode(FrameKind.EVENT, content).event == event
+    assert decode(*encode(event, 1.5, 1.7e9)).event == event
+
+
+def test_a_request_of_rosrm_0_1_0_was_sent_by_an_operator() -> None:
+    """Each client could do everything then, and its event has the name of the client alone."""
+    text = b'{"kind":"CancelRequested","request":3,"names":["a"],"by":"cli"}'
+    event = decode(FrameKind.EVENT, struct.pack("<dd", 1.5, 1.7e9) + text).event
+    assert event == happened.CancelRequested(3, ("a",), Requester("cli", is_operator=True))
 
 
 def test_the_header_of_a_recording() -> None:

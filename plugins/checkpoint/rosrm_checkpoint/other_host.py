@@ -62,8 +62,8 @@ class OtherHost:
 
     def _rank(self, name: str, process: CheckpointView) -> tuple[bool, int, int]:
         """Return the sort key of a host; the lowest key is chosen first."""
-        near, kept_on = self._is_near(name, process), process.kept_on
-        place = kept_on.index(name) if name in kept_on else len(kept_on)
+        near, replica_hosts = self._is_near(name, process), process.replica_hosts
+        place = replica_hosts.index(name) if name in replica_hosts else len(replica_hosts)
         return near, place, zlib.crc32(f"{process.spec.name}\n{name}".encode())
 
     def _is_near(self, name: str, process: CheckpointView) -> bool:

@@ -129,9 +129,13 @@ def _without_this_folder() -> list[str]:
 
 
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
+    from rosrm.ros.network_interface import check_interface
+
     chosen = ctx.ensure_object(CommonOptions).domain if domain is None else domain
     settings = settings if chosen is None else replace(settings, domain=chosen)
     settings.check()
+    if interface := settings.interface_in_force():
+        check_interface(interface)
     return settings
 
 

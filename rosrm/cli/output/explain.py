@@ -62,6 +62,8 @@ def _headline(explanation: Mapping[str, Any]) -> Text:
         text.append(f" on {explanation['host']}")
     if explanation.get("reason"):
         text.append(f": {explanation['reason']}")
+    if explanation.get("owner"):
+        text.append(f"\nOwner: {explanation['owner']}")
     return text
 
 

@@ -18,7 +18,7 @@ from rosrm.model.values import Assignment, InstanceId
 #: (`PendingOrders`).
 OrderId = int | tuple[str, int]
 #: Code of a refused request.
-RefusalCode = Literal["invalid", "journal", "name_taken", "unknown"]
+RefusalCode = Literal["denied", "invalid", "journal", "name_taken", "quota", "unknown"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Events of the master, in the past tense. Readings arrive as one batch.
 
-`by` of a request is the name of the client that sent it; "": unknown.
+`by` of a request is its sender.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rosrm.core.master.commands import OrderId
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.plan import ReportPhase
+from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.rows import PluginKind
 from rosrm.model.values import (
     EMPTY,
@@ -51,14 +52,14 @@ class HostRegistered:
         instances: all instances on the host.
         journal_seen: sequence of the newest record that a former run of this master has reported
             to the slave; 0: none.
-        kept: all snapshots and replicas on the host.
+        snapshots: all snapshots and replicas on the host.
     """
 
     request: int
     description: HostDescription
     instances: tuple[InstanceStatus, ...] = ()
     journal_seen: int = 0
-    kept: tuple[SnapshotReport, ...] = ()
+    snapshots: tuple[SnapshotReport, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +67,14 @@ class HostLeft:
     """A slave is being stopped.
 
     Attributes:
-        kept: instances that the slave leaves running; (): the slave stops all of its instances and
-            reports their ends.
+        left_running: instances that the slave leaves running; (): the slave stops all of its
+            instances and reports their ends.
     """
 
     request: int
     host_id: int
     incarnation: int
-    kept: tuple[InstanceStatus, ...] = ()
+    left_running: tuple[InstanceStatus, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,21 +149,21 @@ class UsagesReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptStatesReceived:
+class SnapshotsReported:
     """A host reported all its snapshots and replicas, the newest of each process."""
 
     host_id: int
     incarnation: int
-    states: tuple[SnapshotReport, ...]
+    snapshots: tuple[SnapshotReport, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SubmissionReceived:
-    """A client submits processes: all are accepted, or none."""
+    """A client submits processes, and owns them from now on: all are accepted, or none."""
 
     request: int
     specs: tuple[ProcessSpec, ...]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,7 @@ class CancelRequested:
 
     request: int
     names: tuple[str, ...]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +181,7 @@ class RestartRequested:
 
     request: int
     names: tuple[str, ...]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +191,7 @@ class MigrationRequested:
     request: int
     name: str
     host: str | None = None
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +200,7 @@ class CheckpointRequested:
 
     request: int
     name: str
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +209,7 @@ class RestoreRequested:
 
     request: int
     name: str
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +219,7 @@ class HostStateRequested:
     request: int
     host: str
     action: Literal["cordon", "uncordon", "drain"]
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +234,7 @@ class PruneRequested:
     request: int
     names: tuple[str, ...] = ()
     hosts: tuple[str, ...] = ()
-    by: str = ""
+    by: Requester = OPERATOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,7 +337,7 @@ Event = (
     | ReadingsReceived
     | StatusesReceived
     | UsagesReceived
-    | KeptStatesReceived
+    | SnapshotsReported
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported

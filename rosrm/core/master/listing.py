@@ -84,7 +84,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         exit_code=process.exit_code, priority=process.spec.priority,
         queue_position=state.queue.position(process.name), since=now - process.since,
         cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
-        stale=bool(silence),
+        stale=bool(silence), owner=process.principal,
     )  # fmt: skip
 
 
@@ -145,7 +145,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         decision, age = current, 0.0
     reasons = (_reason(state, process, row), _advice(state, process))
     return {
-        "process": name, "state": row.state, "host": row.host,
+        "process": name, "state": row.state, "host": row.host, "owner": row.owner,
         "reason": "; ".join(filter(None, reasons)),
         "decision": None if decision is None else {**decision, "elapsed": age},
         "kept": _replicas(state, process, now),

@@ -34,8 +34,9 @@ from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record
+from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.values import EMPTY, LARGEST_NUMBER, Assignment, InstanceId, ProcessSpec
-from rosrm.wording import one_line, sanitized
+from rosrm.wording import sanitized
 
 #: Number of the newest records of a process that `explain` shows.
 _HISTORY: Final = 12
@@ -165,14 +166,19 @@ class MasterState:
 
     def record(
         self, now: float, kind: EventKind, message: str, *, process: str = "", host: str = "",
-        facts: Mapping[str, Any] = EMPTY, by: str = "",
+        facts: Mapping[str, Any] = EMPTY, by: Requester = OPERATOR,
     ) -> None:  # fmt: skip
-        """Write a line of the event record; `by` is the client that requested it."""
-        if by:
-            message, facts = f"{message} (by {by})", {**facts, "by": by}
-        message = sanitized(one_line(message), _LONGEST_RECORD)
-        self.emit(Record(kind, process, host, message, facts))
+        """Write a line of the event record, with the owner of the process and the requester.
+
+        Details are in further lines of the message; only the owner and operators may read them.
+        """
         known = self.processes.get(process)
+        if known is not None and known.principal:
+            facts = {**facts, "owner": known.principal}
+        if by.name:
+            message, facts = f"{message} (by {by.name})", {**facts, "by": by.name}
+        message = sanitized(message, _LONGEST_RECORD, lines=True)
+        self.emit(Record(kind, process, host, message, facts))
         if known is not None:
             known.history.append((now, kind, message))
             if len(known.history) > _HISTORY:
@@ -412,16 +418,16 @@ class MasterState:
     ) -> Assignment:  # fmt: skip
         """Return the assignment by which a slave runs an instance of a known process."""
         fence = fence_of(spec, self.settings)
-        kept_on: tuple[str, ...] = ()
-        kept_from = 0
+        snapshot_hosts: tuple[str, ...] = ()
+        snapshots_from = 0
         if self.declared.has_snapshots(spec):
             first_instance = self.processes[spec.name].born
-            kept_from = max(1, first_instance)  # 0: no snapshots
+            snapshots_from = max(1, first_instance)  # 0: no snapshots
             if not shadow and not restored:
-                kept_on = self.replication.in_reach(spec.name, first_instance, self.hosts)
+                snapshot_hosts = self.replication.in_reach(spec.name, first_instance, self.hosts)
         return Assignment(
-            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, kept_from,
-            restored,
+            instance, spec, self.epoch, node_name or spec.name, shadow, fence, snapshot_hosts,
+            snapshots_from, restored,
         )  # fmt: skip
 
     def note_decision(

@@ -15,6 +15,7 @@ from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent
+from rosrm.model.requester import Requester
 from rosrm.wording import counted, listed
 
 _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
@@ -26,7 +27,8 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         processes, hosts = _named(state, event, now)
     else:
         ended = [state.processes[name] for name in state.terminal]
-        processes = [process for process in ended if not _why_not_pruned(state, process)]
+        own = [process for process in ended if event.by.may_act_on(process.principal)]
+        processes = [process for process in own if not _why_not_pruned(state, process)]
         left = [
             host
             for host in state.hosts.listed()
@@ -48,7 +50,7 @@ def _named(
     state: MasterState, event: happened.PruneRequested, now: float
 ) -> tuple[list[Process], list[Host]]:
     """Return the processes and hosts that a request names; refuse it if one cannot be removed."""
-    processes = known_processes(state, event.names)
+    processes = known_processes(state, event.names, event.by)
     hosts = [known_host(state, name) for name in dict.fromkeys(event.hosts)]
     faults = [_why_not_pruned(state, process) for process in processes]
     faults += [_why_not_pruned_host(state, host, now) for host in hosts]
@@ -96,7 +98,7 @@ def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:
     return ""
 
 
-def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
+def _prune_host(state: MasterState, host: Host, by: Requester, now: float) -> str:
     """Remove a host, and give up its instances; they are stopped if the host returns.
 
     Returns:

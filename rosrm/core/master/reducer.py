@@ -10,7 +10,7 @@ ProcessRequested        notes the open request of the host; places queued proces
 ReadingsReceived        stores readings; places queued processes
 StatusesReceived        moves processes through their phases; drives migrations
 UsagesReceived          lowers reservations by the usage that readings now show
-KeptStatesReceived      replaces the known snapshots and replicas of a host
+SnapshotsReported       replaces the known snapshots and replicas of a host
 SubmissionReceived      queues all submitted processes, or refuses all; places queued processes
 CancelRequested         removes processes from the queue, or stops them
 RestartRequested        restarts running processes in place, or queues ended ones again
@@ -54,7 +54,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.ProcessRequested: registration.process_requested,
         happened.ReadingsReceived: registration.readings_received,
         happened.UsagesReceived: registration.usages_received,
-        happened.KeptStatesReceived: replication.kept_states_received,
+        happened.SnapshotsReported: replication.snapshots_reported,
         happened.PeerRefused: registration.peer_refused,
         happened.StatusesReceived: lifecycle.statuses_received,
         happened.AssignmentWithdrawn: lifecycle.assignment_withdrawn,

@@ -17,6 +17,8 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
 from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
+from rosrm.core.master.quotas import check_quota
+from rosrm.core.master.rights import check_rights
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -25,6 +27,7 @@ from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RestartInstance
+from rosrm.model.requester import Requester
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import counted, listed, no_such
 
@@ -41,15 +44,18 @@ _HOST_EVENTS: Final = {
 
 def submission_received(state: MasterState, event: happened.SubmissionReceived, now: float) -> None:
     """Queue all of the processes, or refuse all."""
+    named = [state.processes[spec.name] for spec in event.specs if spec.name in state.processes]
+    check_rights(named, event.by)
     taken = _taken(state, event)
     if taken:
         raise RequestRefused(taken, "name_taken")
     fault = _submission_fault(state, event)
     if fault:
         raise RequestRefused(fault)
+    check_quota(state, event.specs, event.by)
     wall, born, first = state.wall, state.next_instance, state.next_order
     processes = [
-        Process(spec, order, ProcessPhase.QUEUED, now, wall=wall, born=born)
+        Process(spec, order, ProcessPhase.QUEUED, now, event.by.name, wall=wall, born=born)
         for order, spec in enumerate(event.specs, first)
     ]
     nodes = {process.node for process in processes}
@@ -166,17 +172,19 @@ def count(number: int) -> str:
 # --- cancel, restart --------------------------------------------------------------------------
 
 
-def known_processes(state: MasterState, names: Iterable[str]) -> list[Process]:
-    """Return the processes of these names; refuse the request for an unknown name."""
+def known_processes(state: MasterState, names: Iterable[str], by: Requester) -> list[Process]:
+    """Return the processes of these names; refuse unknown names, and processes of others."""
     unknown = [name for name in names if name not in state.processes]
     if unknown:
         raise RequestRefused(no_such("process", unknown, reversed(state.processes)), "unknown")
-    return [state.processes[name] for name in dict.fromkeys(names)]
+    processes = [state.processes[name] for name in dict.fromkeys(names)]
+    check_rights(processes, by)
+    return processes
 
 
 def cancel_requested(state: MasterState, event: happened.CancelRequested, now: float) -> None:
     """Remove processes from the queue, or stop them."""
-    processes = known_processes(state, event.names)
+    processes = known_processes(state, event.names, event.by)
     terminal = [process.name for process in processes if process.phase.is_terminal]
     for process in processes:
         if not process.phase.is_terminal:
@@ -202,7 +210,7 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
     return "; ".join(phrases)
 
 
-def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
+def _cancel(state: MasterState, process: Process, now: float, by: Requester) -> None:
     process.wanted, process.left_behind = DesiredState.CANCEL, None
     state.record(
         now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
@@ -229,11 +237,15 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
 
 def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:
     """Restart running processes in place; queue ended ones again."""
-    processes = known_processes(state, event.names)
+    processes = known_processes(state, event.names, event.by)
     for process in processes:
         fault = _restart_fault(state, process)
         if fault:
             raise RequestRefused(f"{fault}. Nothing was restarted")
+    ended = (
+        one.spec for one in processes if one.phase.is_terminal and one.principal == event.by.name
+    )
+    check_quota(state, ended, event.by)
     for process in processes:
         _restart(state, process, now, event.by)
     state.emit(Reply(event.request, message=f"{count(len(processes))} restarted"))
@@ -255,7 +267,7 @@ def _restart_fault(state: MasterState, process: Process) -> str:
     return ""
 
 
-def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
+def _restart(state: MasterState, process: Process, now: float, by: Requester) -> None:
     state.record(
         now, EventKind.RESTART_REQUESTED, f"a restart of {process.name} was requested",
         process=process.name, by=by,
@@ -281,7 +293,7 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
 
 def migration_requested(state: MasterState, event: happened.MigrationRequested, now: float) -> None:
     """Begin the migration of a process."""
-    (process,) = known_processes(state, [event.name])
+    (process,) = known_processes(state, [event.name], event.by)
     host = None if event.host is None else known_host(state, event.host)
     rejected = try_move(state, process, _cause(event.by), now, host=host)
     if rejected is not None:
@@ -316,7 +328,7 @@ def _begin(
     begin: Callable[[MasterState, Process, str, float], Rejected | None],
     now: float,
 ) -> None:
-    (process,) = known_processes(state, [event.name])
+    (process,) = known_processes(state, [event.name], event.by)
     rejected = begin(state, process, _cause(event.by), now)
     if rejected is not None:
         raise RequestRefused(rejected.reason)
@@ -325,9 +337,9 @@ def _begin(
     state.emit(Reply(event.request, message=message, host=migration.source_host.name))
 
 
-def _cause(by: str) -> str:
+def _cause(by: Requester) -> str:
     """Return the cause of a client's change, for records."""
-    return f"requested by {by}" if by else "requested"
+    return f"requested by {by.name}" if by.name else "requested"
 
 
 def known_host(state: MasterState, name: str) -> Host:

@@ -5,6 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Final
+
+from rosrm.model.values import EMPTY
+
+#: Key of the quota of each user without an entry of its own.
+DEFAULT_QUOTA: Final = "default"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +33,8 @@ class CoreSettings:
         keep_ended: number of the newest terminal processes that are not garbage-collected.
         max_hosts: most hosts, also of those that left or are lost.
         max_processes: most processes that have not ended.
+        quotas: principal, or `DEFAULT_QUOTA`, to its limits: "processes", and base units of
+            "memory" and "cpu". A missing limit is that of the default.
     """
 
     backfill: bool = False
@@ -46,3 +54,4 @@ class CoreSettings:
     keep_ended: int = 10_000
     max_hosts: int = 2_000
     max_processes: int = 10_000
+    quotas: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: EMPTY)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.qos import QoSProfile
 
 from rosrm.ros.qos import HANDOFF, latched
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import HandoffReport
+from rosrm_msgs.msg import HandoffReport, StateConfig
+
+if TYPE_CHECKING:
+    from rosrm.node.handoff.links import NodeLinks
+    from rosrm.ros.sealed_topic import SealedTopic, SealedWriter
 
 STATE: Final = latched(depth=1)
 #: For a follower of a state of several parts: a newer message of one part must not replace the one
@@ -25,40 +30,56 @@ NO_PUBLISHER_EVENTS: Final = PublisherEventCallbacks(use_default_callbacks=False
 
 
 class Channel:
-    """Topic on which source, destination and master report the progress of a handoff.
+    """The topics of one handoff: reports of its progress to each other and the master, the state.
 
     Args:
         plain: gives access to rclpy's own methods of the node.
-        topic: name given by the master.
-        destination: instance number that names the handoff.
+        links: of this node.
+        config: the master's message that names the handoff.
         instance: this node's own number.
         peer: instance number of the other side.
         take_report: receives each report of the other side.
 
     Attributes:
-        topic: as given.
-        destination: as given.
+        links: as given.
+        name: topic of the reports.
+        destination: instance number that names the handoff.
+        topic: makes a topic under the key of the handoff, from message type and name.
     """
 
     def __init__(
-        self, plain: Any, topic: str, destination: int, instance: int, peer: int,
+        self, plain: Any, links: NodeLinks, config: StateConfig, *, instance: int, peer: int,
         take_report: Callable[[HandoffReport], None],
     ) -> None:  # fmt: skip
         self._plain = plain
-        self.destination = destination
+        self.links = links
+        self.name: str = config.channel
+        self.destination: int = config.destination
+        self.topic: Callable[[Any, str], SealedTopic] = links.of_handoff(config)
         self._instance = instance
         self._peer = peer
         self._take_report = take_report
         self._last: HandoffReport | None = None
-        self.topic = topic
-        self._publisher = plain.create_publisher(
-            HandoffReport, topic, HANDOFF, event_callbacks=NO_PUBLISHER_EVENTS
-        )
-        self._subscription = plain.create_subscription(
-            HandoffReport, topic, self._take, HANDOFF, event_callbacks=NO_SUBSCRIPTION_EVENTS
+        self._publishers: list[Any] = []
+        self._reports = self.topic(HandoffReport, self.name)
+        self._publisher = self._publisher_of(self._reports, HANDOFF)
+        self._subscription = self._reports.subscription(
+            plain, HANDOFF, self._take, event_callbacks=NO_SUBSCRIPTION_EVENTS
         )
 
-    def _take(self, report: HandoffReport) -> None:
+    def publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> SealedWriter:
+        """Return a publisher of a part of the state, or of its marks, for this handoff alone."""
+        return self._publisher_of(self.topic(message_type, topic), profile)
+
+    def _publisher_of(self, topic: SealedTopic, profile: QoSProfile) -> SealedWriter:
+        made = topic.publisher(self._plain, profile, event_callbacks=NO_PUBLISHER_EVENTS)
+        self._publishers.append(made.entity)
+        return made
+
+    def _take(self, data: bytes) -> None:
+        report = self._reports.read(data)
+        if report is None:
+            return
         theirs = report.instance == self._peer and report.destination == self.destination
         if theirs and report.protocol_version == PROTOCOL_VERSION:
             self._take_report(report)
@@ -80,6 +101,7 @@ class Channel:
             self._publisher.publish(self._last)
 
     def close(self) -> None:
-        """Destroy publisher and subscription of the channel."""
+        """Destroy the publishers of the handoff, and the subscription of its reports."""
         self._plain.destroy_subscription(self._subscription)
-        self._plain.destroy_publisher(self._publisher)
+        for publisher in self._publishers:
+            self._plain.destroy_publisher(publisher)

@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable
 from functools import partial
 from math import inf
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+from rclpy.qos import QoSProfile
 
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
@@ -24,6 +26,10 @@ from rosrm.ros.polling import waiting
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
+if TYPE_CHECKING:
+    from rosrm.node.handoff.links import NodeLinks
+    from rosrm.ros.sealed_topic import SealedTopic
+
 #: Seconds without a message after which an input counts as idle.
 _IDLE: Final = 1.0
 #: Seconds without a part or mark after which an ended source counts as drained.
@@ -35,6 +41,8 @@ _QUIET: Final = 0.2
 _MATCHED: Final = 1.5
 #: Seconds between two checks of the conditions that a shadow waits for.
 _REVIEW: Final = 0.1
+#: Most bytes of a message on the source's topics: a part of the state, sealed.
+_LARGEST_MESSAGE: Final = LARGEST_PART + 1024
 
 
 class Destination:
@@ -50,7 +58,7 @@ class Destination:
         self._activated = activated
         self._channel: Channel | None = None
         self._assembler: CutAssembler | None = None
-        self._followed: list[tuple[Any, Callable[[Any], None]]] = []
+        self._followed: list[tuple[Any, Callable[[bytes], bool]]] = []
         self._timer: Any = None
         self._cut: Cut | None = None
         self._run = 0
@@ -68,11 +76,11 @@ class Destination:
 
     # --- messages of the master ------------------------------------------------------------
 
-    def configure(self, config: StateConfig) -> None:
+    def configure(self, config: StateConfig, links: NodeLinks) -> None:
         """Handle a message of the master about the handoff to this node."""
         channel = self._channel
         if channel is None:
-            channel = self._open(config)
+            channel = self._open(config, links)
         else:
             channel.repeat()  # the request may come from a new master, after the first was lost
         if config.phase == StateConfig.DONE:
@@ -89,18 +97,19 @@ class Destination:
         elif config.phase in (StateConfig.ABORT, StateConfig.RESUME):
             self._end(HandoffReport.ABORTED, "the master called it off")
 
-    def _open(self, config: StateConfig) -> Channel:
+    def _open(self, config: StateConfig, links: NodeLinks) -> Channel:
         entities = self._entities
         channel = self._channel = Channel(
-            entities.plain, config.channel, config.destination, entities.identity.instance,
-            config.source, self._take_report,
+            entities.plain, links, config, instance=entities.identity.instance,
+            peer=config.source, take_report=self._take_report,
         )  # fmt: skip
         if self._ended:
             channel.report(HandoffReport.FAILED, 0, self._fault)
             return channel
         self._assembler = CutAssembler()
         # Marks first, also in `_catch_up`, because they name the parts to store.
-        self._follow(StateMark, self._mark_topic, self._take_mark, topics.MARK)
+        marks = channel.topic(StateMark, self._mark_topic)
+        self._follow(marks, topics.MARK, marks.read, self._take_mark)
         for part in self._parts:
             self.follow_part(part)
         if not self._ended:
@@ -110,27 +119,35 @@ class Destination:
 
     def follow_part(self, part: StateTopic) -> None:
         """Subscribe to a part of the state; the author may name parts later."""
-        if self._assembler is not None:
+        if self._assembler is not None and self._channel is not None:
+            states = self._channel.topic(part.message_type, part.topic)
             take = partial(self._take_part, part.topic)
             self._assembler.expect(part.topic)
-            self._follow(part.message_type, part.topic, take, topics.STATE_FOLLOWED, raw=True)
+            self._follow(states, topics.STATE_FOLLOWED, states.open, take)
 
     def _follow(
-        self, message_type: Any, topic: str, take: Callable[[Any], None], qos: Any, *,
-        raw: bool = False,
+        self, topic: SealedTopic, profile: QoSProfile, opened: Callable[[bytes], Any],
+        take: Callable[[Any], None],
     ) -> None:  # fmt: skip
+        """Subscribe to a topic of the source; `opened` returns None for a message of a stranger."""
         if self._ended:
             return
-        subscribe = self._entities.plain.create_subscription
+
+        def take_genuine(data: bytes) -> bool:
+            message = opened(data) if len(data) <= _LARGEST_MESSAGE else None
+            if message is not None:
+                take(message)
+            return message is not None
+
         try:
-            subscription = subscribe(
-                message_type, topic, partial(self._came, take), qos, raw=raw,
+            subscription = topic.subscription(
+                self._entities.plain, profile, partial(self._came, take_genuine),
                 event_callbacks=topics.NO_SUBSCRIPTION_EVENTS,
             )  # fmt: skip
-            self._followed.append((subscription, take))
+            self._followed.append((subscription, take_genuine))
         except Exception as error:  # noqa: BLE001 - rclpy passes on any error of the middleware
             # An entity of the author may have another type on that topic.
-            self._end(HandoffReport.FAILED, f"{topic} cannot be followed: {error}")
+            self._end(HandoffReport.FAILED, f"{topic.name} cannot be followed: {error}")
 
     # --- messages of the source ------------------------------------------------------------
 
@@ -146,25 +163,30 @@ class Destination:
                 self._end(HandoffReport.FAILED, f"the source failed: {report.message}")
             self._go_on()
 
-    def _came(self, take: Callable[[Any], None], message: Any) -> None:
+    def _came(self, take: Callable[[bytes], bool], data: bytes) -> None:
         with self._entities.turn:
             if self._ended:
                 return
-            take(message)
-            self._catch_up()
-            self._last_report = time.monotonic()
-            self._go_on()
+            is_genuine = take(data)
+            if self._catch_up() or is_genuine:
+                self._last_report = time.monotonic()
+                self._go_on()
 
-    def _catch_up(self) -> None:
-        """Take all received messages: with one a round, a shadow would lag behind a fast source."""
+    def _catch_up(self) -> bool:
+        """Take all received messages: with one a round, a shadow would lag behind a fast source.
+
+        Return True if one of them was the source's.
+        """
+        any_genuine = False
         for subscription, take in self._followed:
-            for message, _ in waiting(subscription):
+            for data, _ in waiting(subscription):
                 if self._ended:
-                    return
-                take(message)
+                    return any_genuine
+                any_genuine = take(data) or any_genuine
+        return any_genuine
 
     def _take_part(self, topic: str, data: bytes) -> None:
-        if self._assembler is not None and len(data) <= LARGEST_PART:
+        if self._assembler is not None:
             self._assembler.add_part(topic, data)
 
     def _take_mark(self, mark: StateMark) -> None:

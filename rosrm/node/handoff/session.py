@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from rosrm.keys.names import instance_name
 from rosrm.node.handoff.destination import Destination
 from rosrm.node.handoff.source import HandoffSource
 from rosrm.node.handoff.state_parts import ParametersPart, StateTopic
@@ -15,8 +16,12 @@ from rosrm.node.managed_node import NodeEntities
 from rosrm.node.snapshots.restore import SnapshotRestore, newest_snapshot
 from rosrm.node.steady_timer import steady_timer
 from rosrm.ros.qos import STATE_CONFIG
+from rosrm.ros.sealed_codec import decode
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import StateConfig
+from rosrm_msgs.msg import Sealed, StateConfig
+
+if TYPE_CHECKING:
+    from rosrm.node.handoff.links import NodeLinks
 
 _MARK: Final = "_rosrm/mark"
 _PARAMETERS: Final = "_rosrm/parameters"
@@ -48,10 +53,13 @@ class HandoffSession:
         self._parts: list[StateTopic] = []
         self._source: HandoffSource | None = None
         self._destination: Destination | None = None
+        self._before_source: deque[StateConfig] = deque(maxlen=_MOST_EARLY)
         self._refused: set[str] = set()
         self._early: deque[tuple[StateConfig, float]] = deque(maxlen=_MOST_EARLY)
         self._early_timer: Any = None
         self._subscription: Any = None
+        self._name = instance_name(identity.process, identity.instance)
+        self._links: NodeLinks | None = None
 
     def begin(self) -> None:
         """Take the first role; called by `Node`'s constructor, before the author's continues."""
@@ -68,7 +76,7 @@ class HandoffSession:
         else:
             self._become_source()
         self._subscription = self.entities.plain.create_subscription(
-            StateConfig, self.identity.state_config, self._configured, STATE_CONFIG
+            Sealed, self.identity.state_config, self._received, STATE_CONFIG, raw=True
         )
 
     def _own(self, path: str) -> str:
@@ -77,6 +85,8 @@ class HandoffSession:
     def _become_source(self) -> None:
         self._snapshot = None
         self._source = HandoffSource(self.entities, self._parts, self._own(_MARK))
+        while self._before_source:
+            self._configured(self._before_source.popleft())
 
     def keep_state(
         self, topic: str, message_type: Any, save: Callable[[], Any], restore: Callable[[Any], None]
@@ -95,6 +105,23 @@ class HandoffSession:
 
     # --- state_config ----------------------------------------------------------------------
 
+    def _received(self, data: bytes) -> None:
+        envelope = decode(data)
+        if envelope is None or envelope.principal != self._name:
+            return
+        config = self._opened_links().configs.read(data)
+        if config is None:
+            self._refuse("it is not of this node's master, or it is a repetition")
+        else:
+            self._configured(config)
+
+    def _opened_links(self) -> NodeLinks:
+        if self._links is None:
+            from rosrm.node.handoff.links import NodeLinks  # noqa: PLC0415 - see there
+
+            self._links = NodeLinks(self.identity)
+        return self._links
+
     def _configured(self, config: StateConfig) -> None:
         own = self.identity
         if config.process != own.process or own.instance not in (config.source, config.destination):
@@ -111,10 +138,13 @@ class HandoffSession:
         self._epoch = config.epoch
         role = self._destination if own.instance == config.destination else self._source
         if role is None:
+            # A node reports ACTIVE before it is a source; the next handoff may begin in between.
+            if own.instance == config.source:
+                self._before_source.append(config)
             return
         with self.entities.turn:
             try:
-                role.configure(config)
+                role.configure(config, self._opened_links())
             except Exception as error:  # noqa: BLE001 - no message of the master may end the node
                 what = f"{type(error).__name__}: {error}"
                 self.entities.node.get_logger().error(

@@ -6,7 +6,7 @@ import random
 import time
 from array import array
 from collections.abc import Callable
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rclpy.duration import Duration
 
@@ -19,6 +19,10 @@ from rosrm.node.snapshots.writer import SnapshotSaver
 from rosrm.node.steady_timer import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, MatchedOutput, StateConfig, StateMark
+
+if TYPE_CHECKING:
+    from rosrm.node.handoff.links import NodeLinks
+    from rosrm.ros.sealed_topic import SealedWriter
 
 #: Seconds that a silent source waits until its last outputs are acknowledged; by default Fast DDS
 #: sends its readers a heartbeat every 3 s.
@@ -45,35 +49,31 @@ class HandoffSource:
         self._silent_since = 0.0
         self._release_timer: Any = None
         self._stranded: StrandedSource | None = None
-        plain = entities.plain
-        self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
-        for part in parts:
-            part.publisher = plain.create_publisher(part.message_type, part.topic, topics.STATE)
-            part.retained = bool(entities.identity.keep)
+        self._mark_topic = mark_topic
+        self._marks: SealedWriter | None = None
         self._keeper = SnapshotSaver(entities, parts, self._run) if entities.identity.keep else None
         entities.on_cycle = self._after_cycle
         entities.on_overflow = self._overflowed
 
     def add_part(self, part: StateTopic) -> None:
         """Add another part of the state that the author names."""
-        part.publisher = self._entities.plain.create_publisher(
-            part.message_type, part.topic, topics.STATE
-        )
-        part.retained = self._keeper is not None
+        if self._channel is not None:
+            self._show_part(self._channel, part)
+
+    def _show_part(self, channel: Channel, part: StateTopic) -> None:
+        try:
+            part.show_to(channel.publisher(part.message_type, part.topic, topics.STATE).publish)
+        except Exception as error:  # noqa: BLE001 - rclpy passes on any error of the middleware
+            # An entity of the author may have another type on that topic.
+            self._failed(f"{part.topic} cannot be published: {error}")
 
     # --- the state -------------------------------------------------------------------------
 
     def _after_cycle(self) -> None:
-        if not self._fault:
-            self._show_to_followers()
+        if self._attached and not self._fault:
+            self._show()
         if self._keeper is not None:
             self._keeper.after_cycle()
-
-    def _show_to_followers(self) -> None:
-        if self._attached or self._marks.get_subscription_count():
-            self._show()
-        else:
-            self._show_single_parts()
 
     def _show(self, *, last: bool = False) -> bool:
         """Publish the state between two cycles, and the mark that lists the covered inputs.
@@ -86,16 +86,9 @@ class HandoffSource:
         except StateError as error:
             self._failed(str(error))
             return False
-        self._marks.publish(self._mark(last=last))
+        if self._marks is not None:
+            self._marks.publish(self._mark(last=last))
         return True
-
-    def _show_single_parts(self) -> None:
-        for part in self._parts:
-            if part.has_reader():
-                try:
-                    part.publish()
-                except StateError as error:
-                    self._entities.node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
     def _failed(self, fault: str) -> None:
         """Report that the state cannot be published; the handoff fails, the node stays active."""
@@ -128,12 +121,12 @@ class HandoffSource:
 
     # --- a handoff -------------------------------------------------------------------------
 
-    def configure(self, config: StateConfig) -> None:
+    def configure(self, config: StateConfig, links: NodeLinks) -> None:
         """Handle a message of the master about a handoff away from this node."""
-        if self._channel is None or self._channel.topic != config.channel:
+        if self._channel is None or self._channel.name != config.channel:
             if config.phase not in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.RESUME):
                 return
-            self._open(config)
+            self._open(config, links)
         else:
             self._channel.repeat()
         if config.phase == StateConfig.SWITCH:
@@ -144,13 +137,15 @@ class HandoffSource:
         elif config.phase == StateConfig.DONE:
             self.close()
 
-    def _open(self, config: StateConfig) -> None:
+    def _open(self, config: StateConfig, links: NodeLinks) -> None:
         self.close()
-        self._fault = ""
-        self._channel = Channel(
-            self._entities.plain, config.channel, config.destination,
-            self._entities.identity.instance, config.destination, self._take_report,
+        channel = self._channel = Channel(
+            self._entities.plain, links, config, instance=self._entities.identity.instance,
+            peer=config.destination, take_report=self._take_report,
         )  # fmt: skip
+        self._marks = channel.publisher(StateMark, self._mark_topic, topics.MARK)
+        for part in self._parts:
+            self._show_part(channel, part)
 
     def _take_report(self, report: HandoffReport) -> None:
         with self._entities.turn:
@@ -163,7 +158,9 @@ class HandoffSource:
                 self._entities.close_services()
 
     def _attach(self) -> None:
-        if self._channel is None or self._attached or self._entities.mode is not Mode.ACTIVE:
+        if self._channel is None or self._attached or self._fault:
+            return
+        if self._entities.mode is not Mode.ACTIVE:
             return
         self._attached = True
         if self._show():
@@ -187,7 +184,7 @@ class HandoffSource:
         if not self._show(last=True):
             self._reactivate(lambda: None)  # the failure has been reported
             return
-        self._stranded = StrandedSource(entities, self._channel.destination)
+        self._stranded = StrandedSource(entities, self._channel)
         self._channel.report(HandoffReport.SILENT, entities.sequence)
         self._release_timer = steady_timer(entities.plain, _LOOK, self._release)
 
@@ -215,8 +212,6 @@ class HandoffSource:
     def _resume(self) -> None:
         self._call_off()
         if self._entities.mode is Mode.SILENT:
-            # Otherwise the shadow of a later handoff would take the last mark for its own.
-            self._marks.publish(self._mark(last=False))
             self._reactivate(self._report_resumed)
         else:
             self._report_resumed()
@@ -246,7 +241,7 @@ class HandoffSource:
         self._call_off()
         if self._channel is not None:
             self._channel.close()
-            self._channel = None
+            self._channel = self._marks = None
 
     def end(self) -> None:
         """Store the last snapshot, because the node is destroyed."""

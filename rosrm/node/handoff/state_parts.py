@@ -24,8 +24,7 @@ class StateError(Exception):
 class StateTopic:
     """One topic of a node's state; the arguments are those of `Migratable.keep_state`.
 
-    Attributes:
-        retained: the saved message stays in memory after publishing, because snapshots store it.
+    The saved message stays in memory, because a later handoff seals it under another key.
     """
 
     def __init__(
@@ -41,12 +40,11 @@ class StateTopic:
         self._published: PartKey | None = None
         self._restored: PartKey | None = None
         self._refused = ""
-        self.retained = False
-        self.publisher: Any = None
+        self._publish: Callable[[bytes], None] = lambda _: None
 
-    def has_reader(self) -> bool:
-        """Return True if the topic has a subscriber."""
-        return self.publisher is not None and self.publisher.get_subscription_count() > 0
+    def show_to(self, publish: Callable[[bytes], None]) -> None:
+        """Let `publish` send the part from now on: to another successor, which has nothing yet."""
+        self._publish, self._published = publish, None
 
     def publish(self) -> None:
         """Publish the part, if it has changed.
@@ -55,11 +53,9 @@ class StateTopic:
             StateError: the part cannot be saved, or is too large.
         """
         self.refresh()
-        if self._key != self._published:
-            self.publisher.publish(self._data)
+        if self._data is not None and self._key != self._published:
+            self._publish(self._data)
             self._published = self._key
-        if not self.retained:
-            self._data = None
 
     def refresh(self) -> None:
         """Save the part, if it has changed; raises the errors of `publish`."""
@@ -72,7 +68,7 @@ class StateTopic:
         if data is not None:
             self._refused = ""
             key = part_key(data)
-            if key != self._key or self._data is None:
+            if key != self._key:
                 self._key, self._data = key, data
 
     def _saved(self) -> bytes | None:
@@ -107,7 +103,7 @@ class StateTopic:
             )
 
     def block(self) -> Block:
-        """Return the part's block of a snapshot; the part must be refreshed and retained."""
+        """Return the part's block of a snapshot; the part must be refreshed."""
         if self._data is None or self._key is None:
             raise StateError(f"the state on {self.topic} was not saved")
         return Block(self._data, self._key.digest)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from rosrm.node.handoff.channel import NO_PUBLISHER_EVENTS
+from rosrm.node.handoff.channel import NO_PUBLISHER_EVENTS, Channel
 from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.steady_timer import steady_timer
-from rosrm.ros.names import Names
 from rosrm.ros.qos import HANDOFF
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport
+
+if TYPE_CHECKING:
+    from rosrm.ros.sealed_topic import SealedWriter
 
 #: Seconds of silence until the source asks, and asks again.
 ASK_EVERY: Final = 10.0
@@ -20,17 +22,19 @@ class StrandedSource:
     """Asks the master every `ASK_EVERY` seconds, as long as the node is silent.
 
     A source may be silent without a handoff: the master was replaced by one that does not know of
-    it, or messages were forged. A master that knows of the handoff leaves the question unanswered.
+    it, or messages were forged, in a cluster without security. A master that knows of the handoff
+    leaves the question unanswered.
 
     Args:
-        destination: instance number that names the handoff.
+        channel: of the handoff for which the source is silent.
     """
 
-    def __init__(self, entities: NodeEntities, destination: int) -> None:
+    def __init__(self, entities: NodeEntities, channel: Channel) -> None:
         self._entities = entities
-        self._destination = destination
-        self._publisher: Any = None
-        self._timer = steady_timer(entities.plain, ASK_EVERY, self._ask)
+        self._questions = channel.links.questions
+        self._destination = channel.destination
+        self._publisher: SealedWriter | None = None
+        self._timer: Any = steady_timer(entities.plain, ASK_EVERY, self._ask)
 
     def _ask(self) -> None:
         entities = self._entities
@@ -38,11 +42,9 @@ class StrandedSource:
             if self._timer is None or entities.mode is not Mode.SILENT:
                 return
             if self._publisher is None:
-                names = Names(entities.identity.namespace)
-                self._publisher = entities.plain.create_publisher(
-                    HandoffReport, names.stranded_sources, HANDOFF,
-                    event_callbacks=NO_PUBLISHER_EVENTS,
-                )  # fmt: skip
+                self._publisher = self._questions.publisher(
+                    entities.plain, HANDOFF, event_callbacks=NO_PUBLISHER_EVENTS
+                )
             self._publisher.publish(
                 HandoffReport(
                     protocol_version=PROTOCOL_VERSION, destination=self._destination,
@@ -57,5 +59,5 @@ class StrandedSource:
             self._entities.plain.destroy_timer(self._timer)
             self._timer = None
         if self._publisher is not None:
-            self._entities.plain.destroy_publisher(self._publisher)
+            self._entities.plain.destroy_publisher(self._publisher.entity)
             self._publisher = None

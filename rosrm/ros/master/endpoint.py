@@ -105,11 +105,11 @@ class MasterEndpoint:
         self.events.clear()
         return events
 
-    def beat(self, uptime: float, unheard: Sequence[int], journal: int) -> None:
+    def beat(self, uptime: float, silent_hosts: Sequence[int], journal: int) -> None:
         """Publish the master's beat, and its load at most once a second.
 
         Args:
-            unheard: numbers of the hosts whose messages the master does not receive.
+            silent_hosts: numbers of the hosts whose messages the master does not receive.
             journal: sequence of the newest written record.
         """
         identity = self._identity
@@ -117,7 +117,8 @@ class MasterEndpoint:
             msg.MasterBeat(
                 protocol_version=PROTOCOL_VERSION, name=identity.name, hostname=identity.hostname,
                 pid=identity.pid, epoch=identity.epoch, incarnation=identity.incarnation,
-                beat=time.monotonic_ns(), uptime=uptime, journal=journal, unheard=list(unheard),
+                beat=time.monotonic_ns(), uptime=uptime, journal=journal,
+                silent_hosts=list(silent_hosts),
             )
         )  # fmt: skip
         if uptime - self._load_at >= _LOAD_EVERY:

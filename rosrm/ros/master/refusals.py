@@ -11,7 +11,7 @@ from rosrm.core.master import events as happened
 
 #: Kind of a refused message. A sender chooses its own name, but not the kind.
 Kind = Literal[
-    "handoff", "handshake", "kept_states", "master_beat", "process_status", "process_usage",
+    "handoff", "handshake", "snapshot_reports", "master_beat", "process_status", "process_usage",
     "resource_info",
 ]  # fmt: skip
 #: Takes the kind of a refused message, its sender and the reason.

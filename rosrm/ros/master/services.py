@@ -11,6 +11,7 @@ from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Reply
 from rosrm.errors import JournalError, Refused
+from rosrm.model.requester import Requester
 from rosrm.model.rows import Listing
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlServer, RequestGate, accepted, refused, version_refusal
@@ -41,10 +42,10 @@ class MasterIdentity:
 class Queries(Protocol):
     """Interface of the master for read-only requests."""
 
-    def snapshot(self, request: srv.List.Request) -> Listing:
-        """Return the requested listings."""
+    def snapshot(self, request: srv.List.Request, by: Requester) -> Listing:
+        """Return the requested listings, as far as the requester may read them."""
 
-    def explain(self, name: str) -> str | None:
+    def explain(self, name: str, by: Requester) -> str | None:
         """Return the story of a process as JSON; None: there is no process of that name."""
 
 
@@ -163,7 +164,7 @@ class MasterServices:
         try:
             description = convert.host_from_msg(request.host)
             statuses = tuple(convert.status_from_msg(status) for status in request.instances)
-            kept = tuple(convert.snapshot_from_msg(state) for state in request.kept)
+            snapshots = tuple(convert.snapshot_from_msg(state) for state in request.snapshots)
         except Refused as refusal:
             respond(srv.RegisterHost.Response(answer=refused(refusal.code, str(refusal))))
             return
@@ -176,14 +177,14 @@ class MasterServices:
             respond(response)
 
         token, seen = self._keep(answer), int(request.journal_seen)
-        self._handle(happened.HostRegistered(token, description, statuses, seen, kept))
+        self._handle(happened.HostRegistered(token, description, statuses, seen, snapshots))
 
     def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
-        kept = tuple(convert.status_from_msg(status) for status in request.kept)
+        running = tuple(convert.status_from_msg(status) for status in request.left_running)
         link = self._links.find(request.host_id, request.incarnation)
         if link is not None:
             self._links.left(link)
-        return happened.HostLeft(token, request.host_id, request.incarnation, kept)
+        return happened.HostLeft(token, request.host_id, request.incarnation, running)
 
     def _take_poll(self, request: srv.RequestProcess.Request, respond: _Respond) -> None:
         link = self._links.find(request.host_id, request.incarnation)
@@ -216,7 +217,7 @@ class MasterServices:
             open_request.answer(srv.List.Response(answer=refused("version", fault)))
             return
         try:
-            view = self._queries.snapshot(request)
+            view = self._queries.snapshot(request, _requester(request))
         except JournalError as trouble:
             open_request.answer(srv.List.Response(answer=refused("journal", str(trouble))))
             return
@@ -233,7 +234,7 @@ class MasterServices:
 
     def _take_explain(self, request: srv.Explain.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "explain")
-        text = None if fault else self._queries.explain(request.process)
+        text = None if fault else self._queries.explain(request.process, _requester(request))
         if text is None:
             reason = fault or f"no such process: {request.process}; see `rosrm ps`"
             answer = refused("version" if fault else "unknown", reason)
@@ -278,6 +279,8 @@ def _pruned(request: srv.Prune.Request, token: int) -> happened.Event:
     return happened.PruneRequested(token, names, hosts, _requester(request))
 
 
-def _requester(request: Any) -> str:
-    """Return the name of the client that sent a request, for records."""
-    return sanitized(request.envelope.sender.removeprefix("client "), _LONGEST_PEER)
+def _requester(request: Any) -> Requester:
+    """Return the client that sent a request; requests that only read do not name it."""
+    envelope = getattr(request, "envelope", None)
+    sender = "" if envelope is None else envelope.sender.removeprefix("client ")
+    return Requester(sanitized(sender, _LONGEST_PEER), is_operator=True)

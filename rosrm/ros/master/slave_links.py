@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign, OrderId, Redeliver, SendOrder, Withdraw
 from rosrm.errors import Refused
-from rosrm.model.orders import seconds_of
+from rosrm.model.orders import Order, StartInstance, seconds_of
 from rosrm.model.values import Assignment, HostDescription
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, accepted, version_refusal
@@ -76,16 +76,19 @@ class HostLinks:
         sender: of the orders, for messages.
         order_timeout: seconds beyond an order's own time for its answer.
         handle: receives the events.
+        state_key: returns the key by which the replicas of a process's snapshots are encrypted;
+            b"": they are not encrypted.
     """
 
     def __init__(
         self, participant: Participant, sender: str, epoch: int, order_timeout: float,
-        handle: Callable[[happened.Event], None],
+        handle: Callable[[happened.Event], None], state_key: Callable[[str], bytes] = lambda _: b"",
     ) -> None:  # fmt: skip
         self._participant = participant
         self._epoch = epoch
         self._order_timeout = order_timeout
         self._handle = handle
+        self._state_key = state_key
         self._names = names.Names(participant.settings.namespace)
         self._client = ControlClient(participant, sender)
         self._links: dict[int, HostLink] = {}
@@ -186,7 +189,7 @@ class HostLinks:
                     answer=accepted(epoch=self._epoch),
                     journal=journal,
                     slave_beat=int(self.reading_stats.beat[link.host_id]),
-                    assignments=[convert.assignment_to_msg(one) for one in batch],
+                    assignments=[convert.assignment_to_msg(self._keyed(one)) for one in batch],
                 )
             )
 
@@ -207,6 +210,15 @@ class HostLinks:
         if link is None or all(one.instance != assignment.instance for one in link.outbox):
             self.order(command.if_fetched, now)
 
+    def _keyed(self, assignment: Assignment) -> Assignment:
+        """Return an assignment with the key of its snapshots, if its process has snapshots.
+
+        The core and the journal have no keys: only this message does.
+        """
+        if not assignment.has_snapshots:
+            return assignment
+        return replace(assignment, state_key=self._state_key(assignment.spec.name))
+
     # --- orders --------------------------------------------------------------------------
 
     def order(self, command: SendOrder, now: float) -> None:
@@ -216,7 +228,7 @@ class HostLinks:
             why = "the host does not report"
             self._handle(happened.OrderAnswered.missing(command.order_id, why))
             return
-        request = order_to_msg(command.order)
+        request = order_to_msg(self._order_with_key(command.order))
         deadline = now + seconds_of(command.order) + self._order_timeout
 
         def done(response: srv.ControlHost.Response | None) -> None:
@@ -231,6 +243,11 @@ class HostLinks:
             self._client.call(link.control, request, deadline, done)
 
         self.after_first_reading(link, send, deadline, done)
+
+    def _order_with_key(self, order: Order) -> Order:
+        if not isinstance(order, StartInstance):
+            return order
+        return StartInstance(self._keyed(order.assignment))
 
     def expire(self, now: float) -> None:
         """End the orders and requests that got no answer in time."""

@@ -48,7 +48,7 @@ class SlaveSubscriptions:
         for kind, topic, take in (
             (msg.ProcessStatusBatch, names.PROCESS_STATUS, self._take_statuses),
             (msg.ProcessUsage, names.PROCESS_USAGE, self._take_usage),
-            (msg.KeptStates, names.KEPT_STATES, self._take_snapshots),
+            (msg.SnapshotReports, names.SNAPSHOT_REPORTS, self._take_snapshots),
         ):
             node.create_subscription(kind, path(topic), participant.counted(take), qos.STATUSES)
 
@@ -98,18 +98,18 @@ class SlaveSubscriptions:
             )
         )  # fmt: skip
 
-    def _take_snapshots(self, message: msg.KeptStates) -> None:
-        who = f"kept_states of host {message.host_id}"
+    def _take_snapshots(self, message: msg.SnapshotReports) -> None:
+        who = f"snapshot_reports of host {message.host_id}"
         fault = version_refusal(message.protocol_version, who)
         if fault:
-            self._refuse("kept_states", who, fault)
+            self._refuse("snapshot_reports", who, fault)
             return
         try:
-            states = tuple(convert.snapshot_from_msg(one) for one in message.states)
+            states = tuple(convert.snapshot_from_msg(one) for one in message.snapshots)
         except Refused as refusal:
-            self._refuse("kept_states", who, str(refusal))
+            self._refuse("snapshot_reports", who, str(refusal))
             return
-        self._handle(happened.KeptStatesReceived(message.host_id, message.incarnation, states))
+        self._handle(happened.SnapshotsReported(message.host_id, message.incarnation, states))
 
 
 def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:

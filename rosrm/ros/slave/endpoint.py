@@ -144,7 +144,7 @@ class SlaveEndpoint:
             msg.ProcessUsage, path(names.PROCESS_USAGE), qos.STATUSES
         )
         self._snapshot_reports = node.create_publisher(
-            msg.KeptStates, path(names.KEPT_STATES), qos.STATUSES
+            msg.SnapshotReports, path(names.SNAPSHOT_REPORTS), qos.STATUSES
         )
         node.create_subscription(
             msg.MasterBeat, path(names.MASTER_BEAT),
@@ -201,7 +201,7 @@ class SlaveEndpoint:
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._state.statuses()],
-            kept=[convert.snapshot_to_msg(one) for one in self._snapshots()],
+            snapshots=[convert.snapshot_to_msg(one) for one in self._snapshots()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
         self._incarnation = beat.incarnation
@@ -295,7 +295,7 @@ class SlaveEndpoint:
         sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))
-        if self.link is MasterLink.REGISTERED and self.host_id not in beat.unheard:
+        if self.link is MasterLink.REGISTERED and self.host_id not in beat.silent_hosts:
             self._take(events.ContactConfirmed(sent_at))
         if self.link is MasterLink.LISTENING:
             self._register_if_known()
@@ -416,10 +416,10 @@ class SlaveEndpoint:
         if self.link is not MasterLink.REGISTERED:
             return False
         self._snapshot_reports.publish(
-            msg.KeptStates(
+            msg.SnapshotReports(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                 incarnation=self._description.incarnation,
-                states=[convert.snapshot_to_msg(one) for one in states],
+                snapshots=[convert.snapshot_to_msg(one) for one in states],
             )
         )  # fmt: skip
         return True
@@ -434,25 +434,25 @@ class SlaveEndpoint:
                 _ACK_PATIENCE,
             )
 
-    def leave(self, done: Callable[[], None], kept: Sequence[InstanceStatus] = ()) -> None:
+    def leave(self, done: Callable[[], None], running: Sequence[InstanceStatus] = ()) -> None:
         """Report that this slave stops; `done` is called once, when the master knows or is silent.
 
         A master that this slave finds after that is informed as well.
 
         Args:
-            kept: all instances, if the slave leaves them running; (): it stops them.
+            running: all instances, if the slave leaves them running; (): it stops them.
         """
-        self._leaves = kept
+        self._leaves = running
         if self.link is MasterLink.REGISTERED:
-            self._send_leave(kept, done)
+            self._send_leave(running, done)
         else:
             done()
 
-    def _send_leave(self, kept: Sequence[InstanceStatus], done: Callable[[], None]) -> None:
+    def _send_leave(self, running: Sequence[InstanceStatus], done: Callable[[], None]) -> None:
         request = srv.Leave.Request(
             envelope=self._control.envelope(self._master_beat, self.epoch),
             host_id=self.host_id, incarnation=self._description.incarnation,
-            kept=[convert.status_to_msg(status) for status in kept],
+            left_running=[convert.status_to_msg(status) for status in running],
         )  # fmt: skip
         self._control.call(
             self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()

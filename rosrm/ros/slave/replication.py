@@ -75,12 +75,12 @@ class ReplicationEndpoint:
     def serve(self, host: ReplicationHost) -> None:
         """Offer the services."""
 
-        def take(request: srv.KeepState.Request, open_request: OpenRequest) -> None:
+        def take(request: srv.StoreReplica.Request, open_request: OpenRequest) -> None:
             fault = version_refusal(request.protocol_version, f"the slave of {request.sender}")
 
             def answer(refusal: NotStored | None) -> None:
                 answer = accepted() if refusal is None else refused(*refusal)
-                open_request.answer(srv.KeepState.Response(answer=answer))
+                open_request.answer(srv.StoreReplica.Response(answer=answer))
 
             if fault:
                 answer(NotStored("version", fault))
@@ -94,32 +94,32 @@ class ReplicationEndpoint:
             )  # fmt: skip
             host.take_part(part, answer)
 
-        def read(request: srv.ReadKept.Request, open_request: OpenRequest) -> None:
+        def read(request: srv.ReadSnapshot.Request, open_request: OpenRequest) -> None:
             fault = version_refusal(request.protocol_version, "a reader of snapshots")
 
             def answer(part: TransferPart | None) -> None:
                 open_request.answer(_read_answer(part))
 
             if fault:
-                open_request.answer(srv.ReadKept.Response(answer=refused("version", fault)))
+                open_request.answer(srv.ReadSnapshot.Response(answer=refused("version", fault)))
                 return
             age = (request.number, request.sequence)
             size = min(request.max_bytes or MOST, MOST)
             host.read_part(request.process, age, request.offset, size, answer)
 
         own = self._names.of_host
-        self._participant.serve(srv.KeepState, own(self._name, names.KEEP_STATE), take)
-        self._participant.serve(srv.ReadKept, own(self._name, names.READ_KEPT), read)
+        self._participant.serve(srv.StoreReplica, own(self._name, names.STORE_REPLICA), take)
+        self._participant.serve(srv.ReadSnapshot, own(self._name, names.READ_SNAPSHOT), read)
 
     # --- requests to other slaves --------------------------------------------------------
 
     def finds_receiver(self, host: str, now: float) -> bool:
         """Return True if a host's slave is discovered and can receive a replica."""
-        return bool(self._peer(srv.KeepState, names.KEEP_STATE, host, now).service_is_ready())
+        return bool(self._peer(srv.StoreReplica, names.STORE_REPLICA, host, now).service_is_ready())
 
     def finds_source(self, host: str, now: float) -> bool:
         """Return True if a host's slave is discovered and can send a snapshot."""
-        return bool(self._peer(srv.ReadKept, names.READ_KEPT, host, now).service_is_ready())
+        return bool(self._peer(srv.ReadSnapshot, names.READ_SNAPSHOT, host, now).service_is_ready())
 
     def _peer(self, kind: Any, name: str, host: str, now: float) -> Any:
         peer = self._peers.get((kind, host))
@@ -136,20 +136,20 @@ class ReplicationEndpoint:
         done: Callable[[NotStored | None], None],
     ) -> None:  # fmt: skip
         """Send a part to a slave; `done` gets None when it was stored, else the reason."""
-        request = srv.KeepState.Request(
+        request = srv.StoreReplica.Request(
             protocol_version=PROTOCOL_VERSION, sender=self._name, process=part.process,
             number=part.number, sequence=part.sequence, offset=part.offset, total=part.total,
             digest=part.digest, data=array("B", part.data),
         )  # fmt: skip
 
-        def answered(response: srv.KeepState.Response | None) -> None:
+        def answered(response: srv.StoreReplica.Response | None) -> None:
             if response is None:
                 done(NotStored("timeout", f"no answer within {timeout:g} s"))
             else:
                 answer = response.answer
                 done(None if answer.accepted else NotStored(answer.code, answer.message))
 
-        client = self._peer(srv.KeepState, names.KEEP_STATE, host, now)
+        client = self._peer(srv.StoreReplica, names.STORE_REPLICA, host, now)
         self._client.call(client, request, now + timeout, answered)
 
     def ask(
@@ -160,18 +160,18 @@ class ReplicationEndpoint:
 
         `wanted` has no data; number 0 means the newest snapshot.
         """
-        request = srv.ReadKept.Request(
+        request = srv.ReadSnapshot.Request(
             protocol_version=PROTOCOL_VERSION, process=wanted.process, number=wanted.number,
             sequence=wanted.sequence, offset=wanted.offset, max_bytes=MOST,
         )  # fmt: skip
 
-        def answered(response: srv.ReadKept.Response | None) -> None:
+        def answered(response: srv.ReadSnapshot.Response | None) -> None:
             if response is None:
                 done(NotSent(f"no answer within {timeout:g} s"))
             else:
                 done(_part_of(response, wanted))
 
-        client = self._peer(srv.ReadKept, names.READ_KEPT, host, now)
+        client = self._peer(srv.ReadSnapshot, names.READ_SNAPSHOT, host, now)
         self._client.call(client, request, now + timeout, answered)
 
     def expire(self, now: float) -> None:
@@ -181,7 +181,7 @@ class ReplicationEndpoint:
             self._participant.node.destroy_client(self._peers.pop(key).client)
 
 
-def _part_of(response: srv.ReadKept.Response, wanted: TransferPart) -> TransferPart | NotSent:
+def _part_of(response: srv.ReadSnapshot.Response, wanted: TransferPart) -> TransferPart | NotSent:
     answer = response.answer
     if not answer.accepted:
         return NotSent(str(answer.message))
@@ -191,10 +191,12 @@ def _part_of(response: srv.ReadKept.Response, wanted: TransferPart) -> TransferP
     )  # fmt: skip
 
 
-def _read_answer(part: TransferPart | None) -> srv.ReadKept.Response:
+def _read_answer(part: TransferPart | None) -> srv.ReadSnapshot.Response:
     if part is None:
-        return srv.ReadKept.Response(answer=refused("unknown", "there is no such snapshot here"))
-    return srv.ReadKept.Response(
+        return srv.ReadSnapshot.Response(
+            answer=refused("unknown", "there is no such snapshot here")
+        )
+    return srv.ReadSnapshot.Response(
         answer=accepted(), number=part.number, sequence=part.sequence, total=part.total,
         digest=part.digest, data=array("B", part.data),
     )  # fmt: skip

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import base64
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.model.values import Assignment, qualified_name
+from rosrm.model.values import Assignment, InstanceId, qualified_name
 from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
 from rosrm.runtime.ros_wheels import without_bootstrapper
@@ -19,12 +20,18 @@ EPOCH_FILE: Final = "ROSRM_EPOCH_FILE"
 #: Variables with the directory of the node's snapshots, and the seconds by which they may lag.
 KEEP: Final = "ROSRM_KEEP"
 KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
+#: Variable with the key of an instance, in base64.
+INSTANCE_KEY: Final = "ROSRM_INSTANCE_KEY"
 #: Variables that identify a process. A slave that was itself started by rosrm passes none of them
 #: on.
 _IDENTITY: Final = (
     "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
-    "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY,
+    "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY, INSTANCE_KEY,
 )  # fmt: skip
+
+
+def no_key(_instance: InstanceId) -> None:
+    """Return None: the cluster has no security."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,22 +42,24 @@ class ProcessLocation:
         host: name of the host in rosrm.
         cluster: name of the master.
         state_config: topic on which the master publishes handoffs.
-        kept: directory of the snapshots of all processes; None: no snapshots.
+        snapshots: directory of the snapshots of all processes; None: no snapshots.
         keep_every: seconds by which a snapshot may be behind the state.
         epoch_file: file with the newest epoch of the master; None: there is none.
+        instance_key: returns the key of an instance; None: the cluster has no security.
     """
 
     host: str
     cluster: str
     state_config: str
-    kept: Path | None = None
+    snapshots: Path | None = None
     keep_every: float = 1.0
     epoch_file: Path | None = None
+    instance_key: Callable[[InstanceId], bytes | None] = no_key
 
 
-def snapshot_directory(kept: Path, process: str) -> Path:
+def snapshot_directory(snapshots: Path, process: str) -> Path:
     """Return the directory of the snapshots of one process."""
-    return kept / token(process)
+    return snapshots / token(process)
 
 
 def process_environment(
@@ -79,9 +88,13 @@ def process_environment(
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:
         environment[SHADOW] = "1"
-    if assignment.has_snapshots and where.kept is not None:
-        environment[KEEP] = str(snapshot_directory(where.kept, spec.name))
+    if assignment.has_snapshots and where.snapshots is not None:
+        environment[KEEP] = str(snapshot_directory(where.snapshots, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
+    if assignment.has_snapshots or assignment.shadow:  # a node that takes part in handoffs
+        key = where.instance_key(assignment.instance)
+        if key is not None:
+            environment[INSTANCE_KEY] = base64.b64encode(key).decode()
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
     if assignment.shadow:  # a migration waits for the end of its discovery

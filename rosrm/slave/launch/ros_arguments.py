@@ -96,8 +96,8 @@ def _scalar(value: Any, path: str) -> str:
     if isinstance(value, str):
         return _text(value)
     raise LaunchError(
-        f"the parameter {path!r} is {value!r}: a ROS parameter holds a bool, a 64-bit int, a "
-        f"float, a text, or a list of one of these"
+        f"the parameter {path!r} is no ROS parameter, which holds a bool, a 64-bit int, a float, "
+        f"a text, or a list of one of these\nits value is {value!r}"
     )
 
 

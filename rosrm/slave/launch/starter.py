@@ -19,7 +19,7 @@ from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.slave.epoch import EPOCH_NOTE
 from rosrm.slave.launch.command import launch_order
-from rosrm.slave.launch.environment import ProcessLocation
+from rosrm.slave.launch.environment import ProcessLocation, no_key
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import to_memo
 from rosrm.slave.replication.service import ReplicationService
@@ -35,13 +35,14 @@ class Starter:
     """Conversion of assignments into orders for the supervisor, after their snapshots arrived.
 
     Attributes:
-        kept: directory of the snapshots.
+        snapshots: directory of the snapshots.
         state: instances of the slave; read-only here.
         take: takes events for the core.
+        instance_key: returns the key of an instance; None: the cluster has no security.
     """
 
     config: HostConfig
-    kept: Path
+    snapshots: Path
     state: SlaveState
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint
@@ -50,6 +51,7 @@ class Starter:
     sessions: SessionTable
     launchers: Launchers
     take: Callable[[events.Event], None]
+    instance_key: Callable[[InstanceId], bytes | None] = no_key
     _environment: Mapping[str, str] = field(init=False)
     _graph_before: dict[InstanceId, frozenset[bytes]] = field(init=False, default_factory=dict)
     _closed: bool = field(init=False, default=False)
@@ -68,7 +70,7 @@ class Starter:
         # Without this report the master would withdraw the assignment.
         waiting = [
             self.state.held[one.instance].status
-            for one in wanted if one not in ready and one.kept_on
+            for one in wanted if one not in ready and one.snapshot_hosts
         ]  # fmt: skip
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
@@ -109,6 +111,7 @@ class Starter:
     def ended(self, instance: InstanceId) -> None:
         """Stop awaiting the node of an instance."""
         self._graph_before.pop(instance, None)
+        self.replication.ended(instance)
 
     def _prepared(self, assignment: Assignment) -> None:
         held = self.state.held.get(assignment.instance)
@@ -143,5 +146,5 @@ class Starter:
         config = self.config
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
-            self.kept, config.keep.every, config.state / EPOCH_NOTE,
+            self.snapshots, config.keep.every, config.state / EPOCH_NOTE, self.instance_key,
         )  # fmt: skip

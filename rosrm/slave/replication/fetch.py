@@ -72,7 +72,7 @@ class Fetch:
         now = time.monotonic()
         if isinstance(part, NotSent):
             self._next_host(part.message, now)
-        elif part.number < self._assignment.kept_from or not part.data:
+        elif part.number < self._assignment.snapshots_from or not part.data:
             self._next_host("its snapshot is of an earlier process of that name", now)
         elif part.number > self._assignment.instance.number:
             self._next_host(f"its snapshot is of a later instance, {part.number}", now)

@@ -11,10 +11,10 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
@@ -22,7 +22,7 @@ from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import SnapshotStore
 from rosrm.snapshots.format import Head, TransferPart
-from rosrm.snapshots.reader import newest_head, snapshot_files
+from rosrm.snapshots.reader import snapshot_files
 from rosrm.snapshots.writer import drop_snapshots
 
 _log = logging.getLogger("rosrm.slave")
@@ -80,6 +80,18 @@ class _Transfer:
     digest: int = 0
     offset: int = 0
     waits: bool = True
+
+
+class _Found(NamedTuple):
+    """Newest snapshot on this host that a node can read.
+
+    Attributes:
+        head: its header; None: there is none.
+        fault: why the replica on this host is not used; "": it is, or there is none.
+    """
+
+    head: Head | None
+    fault: str
 
 
 class ReplicationService:
@@ -163,6 +175,11 @@ class ReplicationService:
         drop = partial(self._store.drop, instance.process, instance.number)
         self._in_thread(drop, lambda _: None)
         self._next_scan = 0.0
+
+    def ended(self, instance: InstanceId) -> None:
+        """Forget the key of an instance that has ended without a snapshot."""
+        drop = partial(self._store.keys.drop, instance.process, instance.number)
+        self._in_thread(drop, lambda _: None)
 
     def report_again(self) -> None:
         """Report all snapshots to a master that has just registered this host."""
@@ -326,30 +343,38 @@ class ReplicationService:
         if not assignment.has_snapshots:
             return True
         self._preparing[assignment.instance] = None
+        unkeyed = replace(assignment, state_key=b"")  # the key stays in the store
         self._in_thread(
             partial(self._look_for, assignment),
-            lambda here: self._looked(assignment, here, done),
+            lambda found: self._looked(unkeyed, found, done),
+            _Found(None, ""),
         )
         return False
 
-    def _look_for(self, assignment: Assignment) -> Head | None:
-        """Return the newest usable local snapshot, in the thread; delete unusable older ones."""
+    def _look_for(self, assignment: Assignment) -> _Found:
+        """Return the newest usable local snapshot, in the thread; delete unusable ones."""
+        process, number = assignment.instance.process, assignment.instance.number
         self._store.make()  # the node creates its own directory below
-        directory = self._store.directory(assignment.spec.name)
+        directory = self._store.directory(process)
         if not assignment.shadow and any(
-            head.instance < assignment.kept_from for _, head in snapshot_files(directory)
+            head.instance < assignment.snapshots_from for _, head in snapshot_files(directory)
         ):
-            drop_snapshots(directory, assignment.kept_from - 1)
-        return newest_head(directory)
+            drop_snapshots(directory, assignment.snapshots_from - 1)
+        self._store.keys.put(process, number, assignment.state_key)
+        fault = self._store.open_replica(process, number)
+        return _Found(self._store.newest_readable(process), fault)
 
     def _looked(
-        self, assignment: Assignment, here: Head | None, done: Callable[[Assignment], None]
+        self, assignment: Assignment, found: _Found, done: Callable[[Assignment], None]
     ) -> None:
         """Fetch a newer snapshot from another host, if there is one."""
-        instance, hosts = assignment.instance, assignment.kept_on
+        instance, hosts = assignment.instance, assignment.snapshot_hosts
+        if found.fault:
+            _log.info("the replica here is not used for %s: %s", instance, found.fault)
         if instance not in self._preparing:
             return
-        if assignment.shadow or not hosts or hosts[0] == self._host:
+        is_here = hosts[:1] == (self._host,) and not found.fault
+        if assignment.shadow or not hosts or is_here:
             del self._preparing[instance]
             done(assignment)
             return
@@ -361,7 +386,7 @@ class ReplicationService:
 
         fetch = self._preparing[instance] = Fetch(
             assignment, tuple(name for name in hosts if name != self._host), self._endpoint,
-            here=here, take=self._take_fetched, ended=ended,
+            here=found.head, take=self._take_fetched, ended=ended,
         )  # fmt: skip
         fetch.advance(time.monotonic())
 

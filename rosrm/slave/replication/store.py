@@ -13,9 +13,11 @@ from typing import Final
 from rosrm.model.values import InstanceId, SnapshotReport
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
-from rosrm.snapshots.format import LARGEST, Damaged, Head, TransferPart
-from rosrm.snapshots.reader import COPY, newest_content, newest_head, snapshot_files
-from rosrm.snapshots.writer import CopyWriter, drop_snapshots
+from rosrm.slave.replication.encryption import decrypted, encrypted
+from rosrm.slave.replication.keys import StateKeys
+from rosrm.snapshots.format import LARGEST_REPLICA, Damaged, Head, TransferPart
+from rosrm.snapshots.reader import COPY, newest_content, newest_head, peek, snapshot_files
+from rosrm.snapshots.writer import CopyWriter, drop_snapshots, write_slot
 
 #: Seconds for which a snapshot stays in memory between reads of its parts, and the most bytes of
 #: all snapshots in memory before older ones are dropped sooner.
@@ -69,10 +71,16 @@ class _BeingRead:
 class SnapshotStore:
     """Snapshot files of all processes below one directory.
 
+    While a process has a key here, no snapshot of it leaves this host without encryption, and no
+    replica of it is stored that was not encrypted with this key.
+
     Args:
         root: the directory, created with the first snapshot.
         max_bytes: most bytes of all replicas of other hosts' processes.
         clock: monotonic seconds.
+
+    Attributes:
+        keys: of the processes that have snapshots here.
     """
 
     def __init__(
@@ -85,6 +93,7 @@ class SnapshotStore:
         self._incoming: dict[str, _Incoming] = {}
         self._refreshed: dict[str, float] = {}
         self._being_read: dict[str, _BeingRead] = {}
+        self.keys = StateKeys(self.directory)
 
     def directory(self, process: str) -> Path:
         """Return the directory of the snapshots of a process."""
@@ -141,18 +150,68 @@ class SnapshotStore:
                 directory.symlink_to(right.name)
 
     def newer_than(self, process: str, age: tuple[int, int]) -> tuple[Head, bytes, int] | None:
-        """Return the newest complete snapshot with its CRC-32; None if none is newer than `age`."""
+        """Return the newest complete snapshot as other hosts get it, with its CRC-32.
+
+        None: none is newer than `age`.
+        """
         head = newest_head(self.directory(process))
         if head is None or head.age <= age:
             return None
         found = newest_content(self.directory(process))
         if found is None or found[0].age <= age:
             return None
-        return (*found, zlib.crc32(found[1]))
+        head, content = found
+        key = self.keys.of(process)
+        if key and not head.encrypted:
+            content = encrypted(key, head, content)
+        return head, content, zlib.crc32(content)
+
+    def open_replica(self, process: str, up_to: int) -> str:
+        """Make the replica on this host readable for a node that is about to start.
+
+        An encrypted replica that is newer than the node's own snapshots replaces the older one of
+        these. A replica that is not allowed is deleted.
+
+        Args:
+            process: its name.
+            up_to: number of the instance that starts.
+
+        Returns:
+            Why the replica is not used, as a sentence; "": it can be read, or is not needed.
+        """
+        directory = self.directory(process)
+        path, key = directory / COPY, self.keys.of(process)
+        copy = peek(path)
+        if copy is None or not (key or copy.encrypted):
+            return ""
+        own = self.newest_readable(process)
+        is_older = own is not None and copy.age <= own.age
+        if copy.encrypted and (copy.instance > up_to or is_older):
+            return ""
+        try:
+            write_slot(directory, self._decrypted(key, path))
+        except Damaged as fault:
+            path.unlink(missing_ok=True)
+            return str(fault)
+        except OSError as error:
+            return f"it cannot be written: {error.strerror}"
+        path.unlink(missing_ok=True)
+        return ""
+
+    def newest_readable(self, process: str) -> Head | None:
+        """Return the header of the newest snapshot that a node can read; None: there is none."""
+        heads = (head for _, head in snapshot_files(self.directory(process)))
+        return next((head for head in heads if not head.encrypted), None)
+
+    def _decrypted(self, key: bytes, path: Path) -> bytes:
+        if not key:
+            raise Damaged("it is encrypted, and this process has no key")
+        return decrypted(key, path)
 
     def drop(self, process: str, up_to: int) -> None:
         """Delete the snapshots of instances up to a number."""
         drop_snapshots(self.directory(process), up_to)
+        self.keys.drop(process, up_to)
         self._refreshed.pop(process, None)
 
     def end_interrupted(self, now: float) -> None:
@@ -196,20 +255,27 @@ class SnapshotStore:
 
     def _refusal(self, part: TransferPart, *, bounded: bool) -> NotStored | None:
         """Return why no transfer of this snapshot may begin; None: it may."""
-        newest = self._as_new_as(part)
+        newest = self._as_new_as(part, bounded=bounded)
         if newest is not None:
             return NotStored(
                 "newer", f"{newest.process}#{newest.instance}, cycle {newest.sequence} is here"
             )
-        if part.total > LARGEST:
-            return NotStored("full", f"it has {part.total} bytes; at most {LARGEST} are kept")
+        if part.total > LARGEST_REPLICA:
+            return NotStored(
+                "full", f"it has {part.total} bytes; at most {LARGEST_REPLICA} are kept"
+            )
         obstacle = self._obstacle(part) if bounded else ""
         return NotStored("full", obstacle) if obstacle else None
 
-    def _as_new_as(self, part: TransferPart) -> Head | None:
-        """Return a snapshot here that is at least as new as a part's, unless it is doubtful."""
+    def _as_new_as(self, part: TransferPart, *, bounded: bool) -> Head | None:
+        """Return a snapshot here that is at least as new as a part's, unless it is doubtful.
+
+        For a start, which is not `bounded`, only a snapshot counts that the node can read.
+        """
         refreshed = self._refreshed.get(part.process, self._began)
         for path, head in snapshot_files(self.directory(part.process)):
+            if head.encrypted and not bounded:
+                continue
             if head.age < part.age:
                 return None
             far = path.name == COPY and head.instance - part.number > FAR_AHEAD
@@ -250,11 +316,26 @@ class SnapshotStore:
 
     def _finish(self, part: TransferPart, coming: _Incoming) -> None:
         del self._incoming[part.process]
-        if coming.digest != part.digest:
+        try:
+            self._check_and_store(part, coming)
+        except (Damaged, OSError):
             coming.writer.abandon()
-            raise Damaged("what came does not match its checksum")
-        coming.writer.finish(part.process, part.age)
+            raise
         self._refreshed[part.process] = self._clock()
+
+    def _check_and_store(self, part: TransferPart, coming: _Incoming) -> None:
+        if coming.digest != part.digest:
+            raise Damaged("what came does not match its checksum")
+        head = coming.writer.check(part.process, part.age)
+        key = self.keys.of(part.process)
+        state = b""
+        if key or (head.encrypted and not coming.bounded):
+            state = self._decrypted(key, coming.writer.path)
+        if state and not coming.bounded:
+            write_slot(self.directory(part.process), state)
+            coming.writer.abandon()
+        else:
+            coming.writer.finish()
 
     def _abandon(self, process: str) -> None:
         coming = self._incoming.pop(process, None)

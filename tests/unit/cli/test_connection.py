@@ -189,3 +189,14 @@ def test_a_domain_of_the_environment_is_checked_before_ros_is_joined(monkeypatch
             f"to one, or give --domain N\n"
         )
     RosSettings(domain=3).check()
+
+
+def test_an_interface_that_does_not_exist_is_refused_before_a_part_starts(rosrm, monkeypatch):
+    """The error is the command's, and not that of the runtime that replaces it."""
+    monkeypatch.setenv("ROSRM_INTERFACE", "no-such-link")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    for command in ("master", "slave"):
+        result = rosrm(command)
+        assert (result.code, result.out) == (2, "")
+        assert result.err.startswith("rosrm: the network interface 'no-such-link' (ros.interface")
+        assert "lo (127.0.0.1)" in result.err.partition("; available: ")[2]

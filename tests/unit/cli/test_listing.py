@@ -119,7 +119,7 @@ def test_ps_json_has_every_process_with_every_field(rosrm, client):
         "name": "talker", "kind": "service", "state": "running", "host": "alpha", "number": 1,
         "pid": 99, "restarts": 2, "migrations": 1, "exit_code": 0, "priority": 0,
         "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000, "reason": "",
-        "stale": False,
+        "stale": False, "owner": "",
     }  # fmt: skip
 
 
@@ -213,6 +213,11 @@ def test_explain_shows_every_host_with_its_score_or_veto(rosrm, client):
     assert "and 5 more hosts cannot take it now" in out
     assert "at a higher score" not in out
     assert "62 s ago  submitted          talker was submitted" in out
+
+
+def test_explain_shows_the_owner_if_it_is_known():
+    assert drawn(explain.render({**STORY, "owner": "user:ada"}))[1] == "Owner: user:ada"
+    assert "Owner" not in "".join(drawn(explain.render({**STORY, "owner": ""})))
 
 
 def test_explain_prints_the_rounding_error_of_a_score_as_zero():

@@ -80,6 +80,8 @@ def test_every_setting_is_read(file, tmp_path):
               discovery: {range: localhost, server: "10.0.0.1:11811"}
               transports: UDPv4
               namespace: /fleet/rosrm
+              interface: wg0
+            security: none
             state: here
             scoring: {policy: threshold, options: {a: 1}}
             migration:
@@ -90,6 +92,7 @@ def test_every_setting_is_read(file, tmp_path):
               max_in_flight: 3
               automatic: false
             queue: {backfill: true}
+            quotas: {default: {processes: 50, memory: 64GB, cpu: 32}, ada@desk: {cpu: 1.5 cores}}
             defaults: {needs: {memory: 1GiB, cpu: 1}, settle: 5s}
             liveness: {suspect: 2s, lease: 20s}
             control: {max_age: 3s, beat_period: 100ms, order_retry: 1s}
@@ -102,7 +105,8 @@ def test_every_setting_is_read(file, tmp_path):
     assert (config.name, config.state) == ("lab", tmp_path / "here")
     assert (config.ros.domain, config.ros.discovery_range) == (7, "localhost")
     assert (config.ros.discovery_server, config.ros.transports) == ("10.0.0.1:11811", "UDPv4")
-    assert config.ros.namespace == "/fleet/rosrm"
+    assert (config.ros.namespace, config.ros.interface) == ("/fleet/rosrm", "wg0")
+    assert config.security == "none"
     assert (config.scoring.policy, config.scoring.options) == ("threshold", {"a": 1})
     assert dict(config.migration.strategies) == {"relaunch": {}, "handoff": {"x": 2}}
     assert config.core() == CoreSettings(
@@ -119,6 +123,10 @@ def test_every_setting_is_read(file, tmp_path):
         automatic=False,
         order_retry=1.0,
         keep_ended=20,
+        quotas={
+            "default": {"processes": 50, "memory": 64e9, "cpu": 32.0},
+            "user:ada@desk": {"cpu": 1.5},
+        },
     )
     assert (config.control.max_age, config.control.beat_period) == (3.0, 0.1)
     assert (config.journal.sync, config.journal.keep_events) == ("full", 10)
@@ -158,6 +166,26 @@ def test_every_error_is_reported_at_once_with_its_place(refusal):
     for line, start in zip(lines[1:], expected, strict=True):
         assert line.strip().startswith(start)
     assert f"{expected[7]}\n" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{ada: {procesess: 1}}",
+         "1:16: unknown key 'procesess' in quotas.ada; did you mean 'processes'? Allowed: "),
+        ("{ada: {processes: -1}}", "1:27: quotas.ada.processes: -1 is not within 0..2147483647"),
+        ("{ada: {processes: 1.5}}", "1:27: quotas.ada.processes: 1.5 is not a whole number"),
+        ("{ada: {memory: 5 cores}}",
+         "1:24: quotas.ada.memory: unknown unit 'cores'. Allowed: B, kB, KB,"),
+        ("{ada: {cpu: .inf}}", "1:21: quotas.ada.cpu:"),
+        ("{ada: 5}", "1:15: quotas.ada: a mapping is required, not 5"),
+        ("{'a b': {cpu: 1}}", "1:10: quotas: 'a b' names no user; for user:ada write ada"),
+        ("{'user:ada': {cpu: 1}}", "1:10: quotas: 'user:ada' names no user;"),
+        ("[ada]", "1:9: quotas: a mapping is required, not a list"),
+    ],
+)  # fmt: skip
+def test_a_wrong_quota_is_refused_with_its_place(refusal, text, said):
+    assert refusal(load_cluster, f"quotas: {text}").startswith(f"f.yaml:{said}")
 
 
 @pytest.mark.parametrize(

@@ -270,20 +270,22 @@ class Cluster(World[Machine]):
         return machine
 
     def register(
-        self, machine: Machine, kept: tuple[SnapshotReport, ...] = (), *, journal_seen: int = 0
+        self, machine: Machine, snapshots: tuple[SnapshotReport, ...] = (), *, journal_seen: int = 0
     ) -> Reply:
         """Register a slave; once accepted, it sends a reading and requests work."""
-        reply = self.enter(machine, journal_seen, kept)
+        reply = self.enter(machine, journal_seen, snapshots)
         if reply.accepted:
             self.read(machine)
             self.ask_for_work(machine)
         self.settle()
         return reply
 
-    def enter(self, machine: Machine, journal_seen: int, kept: tuple[SnapshotReport, ...]) -> Reply:
+    def enter(
+        self, machine: Machine, journal_seen: int, snapshots: tuple[SnapshotReport, ...]
+    ) -> Reply:
         """Register a slave, which sends no reading yet."""
         machine.begin_to_register()
-        reply = self.join(machine, self.now, machine.slave.statuses(), journal_seen, kept)
+        reply = self.join(machine, self.now, machine.slave.statuses(), journal_seen, snapshots)
         if reply.accepted:
             machine.fresh = machine.leaves = False
             machine.polled.clear()
@@ -351,8 +353,8 @@ class Cluster(World[Machine]):
     def detach(self, host: str) -> Reply:
         """Stop a slave that leaves its processes running; the host then has no slave."""
         machine = self.machines[host]
-        kept, machine.leaves = machine.begun(), True
-        reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, kept)
+        running, machine.leaves = machine.begun(), True
+        reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, running)
         machine.connected = False
         return reply
 

@@ -53,7 +53,7 @@ class Machine(Host[Program]):
         quirks: of the nodes of a process here, by process name; see `Node`.
         shown: base units that each process uses, by name; shows in readings and usages.
         ordered: orders on their way to the slave.
-        kept: newest snapshot or replica of each process on this host, by process name.
+        snapshots: newest snapshot or replica of each process on this host, by process name.
         ships: hosts that receive replicas of a process on this host, by process name.
         connected: True while the wires work.
         takes: False for a slave that accepts no work.
@@ -70,7 +70,7 @@ class Machine(Host[Program]):
     busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
     shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     ordered: deque[SendOrder] = field(default_factory=deque)
-    kept: dict[str, SnapshotReport] = field(default_factory=dict)
+    snapshots: dict[str, SnapshotReport] = field(default_factory=dict)
     ships: dict[str, tuple[str, ...]] = field(default_factory=dict)
     connected: bool = True
     takes: bool = True
@@ -174,22 +174,24 @@ class Machine(Host[Program]):
         name = order.instance.process
         if isinstance(order, ReplicateSnapshot):
             self.ships[name] = order.hosts
-        elif name in self.kept and self.kept[name].instance.number <= order.instance.number:
-            del self.kept[name]
+        elif (
+            name in self.snapshots and self.snapshots[name].instance.number <= order.instance.number
+        ):
+            del self.snapshots[name]
 
-    def keep_state(self, instance: InstanceId) -> SnapshotReport:
+    def publish_snapshot(self, instance: InstanceId) -> SnapshotReport:
         """Publish a snapshot that is newer than the one before."""
-        before = self.kept.get(instance.process)
+        before = self.snapshots.get(instance.process)
         cycles = before.sequence if before is not None and before.instance == instance else 0
-        self.kept[instance.process] = SnapshotReport(instance, cycles + 1, 100)
-        return self.kept[instance.process]
+        self.snapshots[instance.process] = SnapshotReport(instance, cycles + 1, 100)
+        return self.snapshots[instance.process]
 
     def take_state(self, state: SnapshotReport) -> None:
         """Receive a replica from another host; the slave keeps only the newest."""
-        own = self.kept.get(state.instance.process)
+        own = self.snapshots.get(state.instance.process)
         age = (state.instance.number, state.sequence)
         if own is None or (own.instance.number, own.sequence) < age:
-            self.kept[state.instance.process] = state
+            self.snapshots[state.instance.process] = state
 
     # --- the slave and its supervisor -----------------------------------------------------
 
@@ -216,8 +218,8 @@ class Machine(Host[Program]):
         waiting = self.slave.waiting
         return tuple(one for one in self.slave.statuses() if one.instance not in waiting)
 
-    def stop_unheard(self, now: float) -> None:
-        """Stop the slave while no master hears it; it ends all its processes."""
+    def stop_unreachable(self, now: float) -> None:
+        """Stop the slave while the master receives none of its messages; it ends all processes."""
         for instance in list(self.programs):
             self._end(instance, InstanceState.WITHDRAWN, now, signal=2)
 

@@ -11,6 +11,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Command, SendOrder
 from rosrm.model.orders import FenceInstance, SetRestartPolicy, StartInstance, StopInstance
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, Stop, plan_fault
+from rosrm.model.requester import Requester
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceId,
@@ -338,7 +339,7 @@ def test_a_drained_host_says_that_images_stay() -> None:
 def test_the_record_of_a_checkpoint_names_its_requester() -> None:
     """The record names the requester as the cause of the plan."""
     _, cluster = playing()
-    cluster.ask(happened.CheckpointRequested, "p", "anna@desk:42")
+    cluster.ask(happened.CheckpointRequested, "p", Requester("anna@desk:42", is_operator=True))
     (message,) = cluster.recorded("checkpoint_begun")
     assert message.endswith("; requested by anna@desk:42")
 

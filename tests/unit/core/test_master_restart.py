@@ -76,7 +76,7 @@ def test_a_process_that_its_slave_ended_without_a_master_is_queued_again(spec) -
     cluster = Cluster("a").with_processes(spec)
     machine = cluster.machines["a"]
     cluster.kill_master()
-    machine.stop_unheard(cluster.now)
+    machine.stop_unreachable(cluster.now)
     machine.restart_slave(cluster.now)
     cluster.register(machine)
     cluster.wait(1.0)
@@ -90,7 +90,7 @@ def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled(
     cluster.journal(cluster.decide(happened.CancelRequested(9, ("p",))))
     cluster.kill_master()
     machine = cluster.machines["a"]
-    machine.stop_unheard(cluster.now)
+    machine.stop_unreachable(cluster.now)
     machine.restart_slave(cluster.now)
     cluster.register(machine)
     assert cluster.phase("p") == "cancelled"

@@ -5,11 +5,13 @@ from __future__ import annotations
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.commands import Reply
+from rosrm.model.requester import Requester
 from tests.unit.core.cluster import Cluster, job, process
 
 
 def prune(cluster: Cluster, *names: str, hosts: tuple[str, ...] = ()) -> Reply:
-    return cluster.ask(happened.PruneRequested, names, hosts, "anna@desk")
+    by = Requester("anna@desk", is_operator=True)
+    return cluster.ask(happened.PruneRequested, names, hosts, by)
 
 
 def seen(cluster: Cluster) -> tuple[list[str], list[str]]:

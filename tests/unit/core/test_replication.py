@@ -51,8 +51,8 @@ def reported(*states: tuple[str, int, int]) -> tuple[SnapshotReport, ...]:
 def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
     """Report all snapshots of a host: process, instance, sequence."""
     machine = cluster.machines[host]
-    kept = reported(*states)
-    cluster.tell(happened.KeptStatesReceived(machine.host_id, machine.incarnation, kept))
+    snapshots = reported(*states)
+    cluster.tell(happened.SnapshotsReported(machine.host_id, machine.incarnation, snapshots))
 
 
 def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
@@ -111,7 +111,7 @@ def test_the_slave_gets_the_choice_of_the_policy_once():
 
 
 def test_the_order_of_the_chosen_hosts_makes_no_difference():
-    """A policy that lists the hosts as `kept_on` does causes no order and no event."""
+    """A policy that lists the hosts as `replica_hosts` does causes no order and no event."""
     policy = Asked()
     cluster = running(policy)
     one, two = others(cluster)
@@ -129,12 +129,12 @@ def test_the_policy_gets_hosts_replicas_and_age():
     cluster = running(policy)
     other = others(cluster)[0]
     cluster.wait(1.0)
-    assert (policy.views[-1].age, policy.views[-1].kept_on) == (None, ())
+    assert (policy.views[-1].age, policy.views[-1].replica_hosts) == (None, ())
     keep(cluster, other, ("p", cluster["p"].owner, 4))
     cluster.wait(5.0)
     view = policy.views[-1]
     assert view.host == where(cluster)
-    assert view.kept_on == (other,)
+    assert view.replica_hosts == (other,)
     assert view.age == pytest.approx(5.0, abs=1.2)
     assert set(view.hosts) == {"a", "b", "c"}
     assert view.size == 100
@@ -230,9 +230,9 @@ def test_a_start_after_a_loss_names_the_hosts_of_the_snapshot():
     cluster.cut(host, seconds=6.0)
     assert cluster.where("p")[-1:] == [two] or two in cluster.where("p")
     assignment = assigned(cluster)
-    assert assignment.kept_on == (two,)
-    assert assignment.kept_from <= number < assignment.instance.number
-    assert one not in assignment.kept_on
+    assert assignment.snapshot_hosts == (two,)
+    assert assignment.snapshots_from <= number < assignment.instance.number
+    assert one not in assignment.snapshot_hosts
 
 
 def test_a_restarted_process_is_replicated_from_its_first_snapshot_on():
@@ -263,8 +263,8 @@ def test_a_failed_process_that_is_restarted_continues_from_its_snapshot():
     assert not cluster.orders(DropReplica)
     cluster.restart("p")
     assignment = assigned(cluster)
-    assert assignment.kept_on == (host,)
-    assert assignment.kept_from <= number
+    assert assignment.snapshot_hosts == (host,)
+    assert assignment.snapshots_from <= number
     assert cluster.where("p") == [host]
 
 
@@ -284,8 +284,8 @@ def test_the_replicas_of_a_cancelled_process_are_dropped_everywhere():
     assert dropped == {cluster.machines[host].host_id}
     keep(cluster, host)
     cluster.submit(stateful())
-    assert assigned(cluster).kept_on == ()
-    assert assigned(cluster).kept_from > number
+    assert assigned(cluster).snapshot_hosts == ()
+    assert assigned(cluster).snapshots_from > number
     cluster.reconnect(other, seconds=3.0)
     assert cluster.sent(DropReplica)[-1].host_id == cluster.machines[other].host_id
     assert cluster.orders(DropReplica)[-1].instance == InstanceId("p", number)
@@ -405,7 +405,7 @@ def test_stateless_and_unknown_processes_cause_no_order():
     cluster.wait(3.0)
     assert not cluster.orders(ReplicateSnapshot)
     assert not cluster.orders(DropReplica)
-    assert assigned(cluster).kept_on == ()
+    assert assigned(cluster).snapshot_hosts == ()
     cluster.submit(process("t"))
     assert assigned(cluster).instance.number > 70, "no number is used twice"
 
@@ -423,7 +423,7 @@ def test_a_registration_brings_the_replicas_of_the_host():
     register(cluster, host, ("p", number, 5))
     cluster.wait(1.0)
     assert assigned(cluster).instance.number > number
-    assert assigned(cluster).kept_on == (host,)
+    assert assigned(cluster).snapshot_hosts == (host,)
 
 
 def test_after_a_start_of_the_master_a_process_waits_for_the_host_of_its_snapshot():
@@ -473,11 +473,11 @@ def test_a_process_whose_replica_is_lost_too_waits_one_lease_for_it(rejoins: boo
     assert "has not rejoined yet" in cluster["p"].reason
     if rejoins:
         cluster.reconnect(keeper, seconds=1.0)
-        assert assigned(cluster).kept_on == (keeper,)
+        assert assigned(cluster).snapshot_hosts == (keeper,)
     else:
         cluster.wait(3.0)
         assert left in cluster.where("p")
-        assert assigned(cluster).kept_on == ()
+        assert assigned(cluster).snapshot_hosts == ()
 
 
 def test_a_start_also_names_a_host_whose_replica_is_not_reported_yet():
@@ -489,4 +489,4 @@ def test_a_start_also_names_a_host_whose_replica_is_not_reported_yet():
     policy.answer = CheckpointChoice((keeper,))
     cluster.wait(2.0)
     cluster.cut(host, seconds=4.0)
-    assert assigned(cluster).kept_on == (keeper, stale)
+    assert assigned(cluster).snapshot_hosts == (keeper, stale)

@@ -9,6 +9,7 @@ from rosrm.core.master import listing
 from rosrm.core.slave import events
 from rosrm.model.orders import StartInstance, StopInstance
 from rosrm.model.plan import Move, Plan
+from rosrm.model.requester import Requester
 from rosrm.model.values import (
     InstanceId,
     InstanceState,
@@ -372,16 +373,15 @@ def test_a_process_that_every_host_refuses_has_failed() -> None:
 
 
 def test_equal_refusals_are_listed_once_without_their_details() -> None:
-    """The reply has the details on further lines; events and the explanation have one line."""
+    """The details are on further lines, also in events: `rosrm.master.disclosure` joins them."""
     refusal = "program 'p' is not on the PATH\nthe PATH is /bin"
     cluster = Cluster(*[Machine(name, refuses={"p": refusal}) for name in "abcd"])
     cluster.submit(process("p"))
     assert cluster["p"].reason == (
         "no host can start it: a, b and 2 more: program 'p' is not on the PATH"
     )
-    said = "program 'p' is not on the PATH; the PATH is /bin"
-    assert cluster.recorded("queued")[0] == f"p returns to the queue: a cannot run it: {said}"
-    assert said in cluster.explain("p")["history"][-2]["message"]
+    assert cluster.recorded("queued")[0] == f"p returns to the queue: a cannot run it: {refusal}"
+    assert refusal in cluster.explain("p")["history"][-2]["message"]
 
 
 def test_the_next_run_of_a_slave_may_accept_a_process_that_the_former_refused() -> None:
@@ -457,7 +457,7 @@ def test_the_record_of_a_request_names_its_requester() -> None:
     Records of moves name it in their cause.
     """
     cluster = Cluster("a")
-    by = "anna@desk:42"
+    by = Requester("anna@desk:42", is_operator=True)
     cluster.ask(happened.SubmissionReceived, (movable("p"), process("q")), by)
     cluster.add("b")
     cluster.ask(happened.MigrationRequested, "p", "b", by)
@@ -467,9 +467,9 @@ def test_the_record_of_a_request_names_its_requester() -> None:
     cluster.ask(happened.PruneRequested, ("q",), (), by)
     for kind in ("submitted", "restart_requested", "cancel_requested", "host_draining", "pruned"):
         record = next(record for record in cluster.records if record.kind == kind)
-        assert record.message.endswith(f" (by {by})"), kind
-        assert record.facts["by"] == by
-    assert cluster.recorded("migration_begun")[0].endswith(f"requested by {by}")
+        assert record.message.endswith(" (by anna@desk:42)"), kind
+        assert record.facts["by"] == by.name
+    assert cluster.recorded("migration_begun")[0].endswith("requested by anna@desk:42")
 
 
 def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ended() -> None:

@@ -51,8 +51,8 @@ ways = st.sampled_from(
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
 HOST_CHANGES = [
-    "cut", "mended", "killed", "killed", "leaves", "leaves unheard", "is detached", "loses power",
-    "loses a poll", "full", "over", "empty", "another supervisor",
+    "cut", "mended", "killed", "killed", "leaves", "stops unreachable", "is detached",
+    "loses power", "loses a poll", "full", "over", "empty", "another supervisor",
 ]  # fmt: skip
 #: Index of one of the present things; `Play.pick` takes it modulo their number.
 which_one = st.integers(0, 11)
@@ -92,7 +92,7 @@ class OneOther:
     """Checkpoint policy with one replica, on the same host as long as that is up."""
 
     def choose(self, view: CheckpointView) -> CheckpointChoice:
-        there = [name for name in (*view.kept_on, *sorted(view.hosts)) if name in view.hosts]
+        there = [name for name in (*view.replica_hosts, *sorted(view.hosts)) if name in view.hosts]
         return CheckpointChoice(tuple(name for name in there if name != view.host)[:1])
 
 
@@ -135,7 +135,7 @@ class Play(RuleBasedStateMachine):
         self.heard: dict[str, float] = {}
         self.records_seen = 0
         #: Snapshots that each host has reported to this run of the master, by name.
-        self.told_kept: dict[str, tuple[SnapshotReport, ...]] = {}
+        self.reported: dict[str, tuple[SnapshotReport, ...]] = {}
         #: For the present submission of each name: its first instance, and its newest snapshot.
         self.newest: dict[str, tuple[int, tuple[int, int]]] = {}
         self.prompt = True
@@ -180,12 +180,12 @@ class Play(RuleBasedStateMachine):
                 machine.name
                 for machine in self.cluster.machines.values()
                 if self.known(machine) and self.is_in_reach(machine)
-                for kept in self.told_kept.get(machine.name, ())
-                if kept.instance.process == one.instance.process
-                and kept.instance.number >= one.kept_from
+                for snapshot in self.reported.get(machine.name, ())
+                if snapshot.instance.process == one.instance.process
+                and snapshot.instance.number >= one.snapshots_from
             }
             if one.has_snapshots:
-                assert keepers <= set(one.kept_on), "assigned to begin from less than is kept"
+                assert keepers <= set(one.snapshot_hosts), "assigned without a known snapshot"
 
     def look_at_order(self, given: list[Assign]) -> None:
         """Check that no process was passed by an equal one (without backfill: by any)."""
@@ -206,10 +206,10 @@ class Play(RuleBasedStateMachine):
     def register(self, machine: Machine) -> None:
         if not machine.connected:
             return
-        kept = tuple(machine.kept.values())
-        before, self.told_kept[machine.name] = self.told_kept.get(machine.name, ()), kept
-        if not self.cluster.enter(machine, 0, kept).accepted:
-            self.told_kept[machine.name] = before
+        snapshots = tuple(machine.snapshots.values())
+        before, self.reported[machine.name] = self.reported.get(machine.name, ()), snapshots
+        if not self.cluster.enter(machine, 0, snapshots).accepted:
+            self.reported[machine.name] = before
 
     def pick(self, things: list, which: int) -> object:
         return things[which % len(things)]
@@ -549,9 +549,9 @@ class Play(RuleBasedStateMachine):
             # No slave runs until it is killed or `all_is_well`.
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation, machine.begun())
             machine.restart_slave(self.cluster.now)
-        elif what in ("leaves unheard", "loses power"):
-            if what == "leaves unheard":
-                machine.stop_unheard(self.cluster.now)
+        elif what in ("stops unreachable", "loses power"):
+            if what == "stops unreachable":
+                machine.stop_unreachable(self.cluster.now)
             else:
                 self.lose_power(machine)
             machine.restart_slave(self.cluster.now)
@@ -626,7 +626,7 @@ class Play(RuleBasedStateMachine):
     def master_is_killed(self, registering: list[str]) -> None:
         """Kill the master, restore it from its journal and register some slaves."""
         self.late.clear()
-        self.told_kept.clear()
+        self.reported.clear()
         self.cluster.kill_master()
         self.cluster.state.replication.policy = OneOther()
         for host in registering:
@@ -636,21 +636,21 @@ class Play(RuleBasedStateMachine):
 
     @precondition(lambda self: self.nodes())
     @rule(which=which_one, told=chance)
-    def state_is_kept(self, which: int, told: bool) -> None:
+    def snapshot_is_published(self, which: int, told: bool) -> None:
         """Publish a snapshot on the node's host; its slave sends replicas if ordered to."""
-        self.keep_a_state(*self.pick(self.nodes(), which), told=told)
+        self.publish_snapshot(*self.pick(self.nodes(), which), told=told)
         self.flow()
 
-    def keep_a_state(self, machine: Machine, node: Node, *, told: bool) -> None:
+    def publish_snapshot(self, machine: Machine, node: Node, *, told: bool) -> None:
         if node.shadow or not node.active:
             return
-        state = machine.keep_state(node.instance)
+        state = machine.publish_snapshot(node.instance)
         for name in machine.ships.get(node.instance.process, ()):
             if machine.connected and self.machine(name).connected:
                 self.machine(name).take_state(state)
         if told:
             for one in self.cluster.machines.values():
-                self.tell_what_is_kept(one)
+                self.report_snapshots(one)
 
     @precondition(lambda self: self.nodes())
     @rule(which=which_one, comes_back=chance, stubborn=chance)
@@ -663,10 +663,10 @@ class Play(RuleBasedStateMachine):
             return
         if stubborn:
             machine.stubborn.add(node.instance.process)
-        self.keep_a_state(machine, node, told=True)
+        self.publish_snapshot(machine, node, told=True)
         self.time_passes(1.0, quiet=False)  # the slave receives the hosts of the next replica
         if node.instance in machine.programs:
-            self.keep_a_state(machine, node, told=True)
+            self.publish_snapshot(machine, node, told=True)
         machine.connected = False
         for _ in range(4):
             self.time_passes(2.5, quiet=False)
@@ -676,15 +676,15 @@ class Play(RuleBasedStateMachine):
                 self.time_passes(0.5, quiet=False)
 
     @rule(host=hosts)
-    def kept_states_are_told(self, host: str) -> None:
-        self.tell_what_is_kept(self.machine(host))
+    def snapshots_are_reported(self, host: str) -> None:
+        self.report_snapshots(self.machine(host))
         self.flow()
 
-    def tell_what_is_kept(self, machine: Machine) -> None:
+    def report_snapshots(self, machine: Machine) -> None:
         if self.known(machine):
-            kept = tuple(machine.kept.values())
-            self.told_kept[machine.name] = kept
-            self.tell(happened.KeptStatesReceived(machine.host_id, machine.incarnation, kept))
+            snapshots = tuple(machine.snapshots.values())
+            self.reported[machine.name] = snapshots
+            self.tell(happened.SnapshotsReported(machine.host_id, machine.incarnation, snapshots))
 
     @rule(name=names, durable=chance)
     def master_is_killed_in_the_act(self, name: str, durable: bool) -> None:
@@ -788,9 +788,9 @@ class Play(RuleBasedStateMachine):
             if process.phase.is_terminal or process.wanted is DesiredState.CANCEL:
                 continue
             ages = [
-                (kept.instance.number, kept.sequence)
+                (one.instance.number, one.sequence)
                 for machine in self.cluster.machines.values()
-                if (kept := machine.kept.get(name)) is not None and kept.instance.number >= born
+                if (one := machine.snapshots.get(name)) is not None and one.instance.number >= born
             ]
             newest = max(ages, default=(0, 0))
             if before[0] == born:
@@ -827,7 +827,7 @@ class Play(RuleBasedStateMachine):
         cluster.now += 2.0
         cluster.tell(happened.TimePassed())
         for machine in cluster.machines.values():
-            cluster.register(machine, tuple(machine.kept.values()))
+            cluster.register(machine, tuple(machine.snapshots.values()))
         for name in HOSTS:
             cluster.set_host(name, "uncordon")
         self._let_nodes_come_up(40)

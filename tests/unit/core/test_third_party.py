@@ -66,7 +66,7 @@ def test_a_state_on_topics_has_snapshots():
     keep(cluster, other, ("p", cluster["p"].owner, 4))
     cluster.machines[where(cluster)].connected = False
     cluster.wait(12.0)
-    assert assigned(cluster).kept_on == (other,)
+    assert assigned(cluster).snapshot_hosts == (other,)
 
 
 def test_a_strategy_that_can_shadow_has_standbys():

@@ -210,11 +210,11 @@ def test_an_answer_is_compared_but_for_what_differs_each_time(given, same):
 # --- names ------------------------------------------------------------------------------------
 
 TOPICS = {
-    "resource_info", "process_status", "process_usage", "kept_states", "master_beat",
+    "resource_info", "process_status", "process_usage", "snapshot_reports", "master_beat",
     "master_load", "state_config",
 }  # fmt: skip
 NAMES = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
-OF_A_HOST = {names.CONTROL, names.READ_LOG, names.KEEP_STATE, names.READ_KEPT}
+OF_A_HOST = {names.CONTROL, names.READ_LOG, names.STORE_REPLICA, names.READ_SNAPSHOT}
 
 
 def test_the_protocol_page_has_every_name():

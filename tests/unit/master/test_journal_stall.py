@@ -23,7 +23,7 @@ KEPT = {
     happened.HostLeft, happened.StatusesReceived, happened.OrderAnswered,
     happened.HandoffReported, happened.AssignmentWithdrawn,
 }  # fmt: skip
-NEWEST = {happened.ProcessRequested, happened.KeptStatesReceived}
+NEWEST = {happened.ProcessRequested, happened.SnapshotsReported}
 DROPPED = {
     happened.TimePassed, happened.UsagesReceived, happened.PeerRefused, happened.SourceStranded,
 }  # fmt: skip

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.errors import PluginError
+from rosrm.journal.sqlite import SqliteJournal
 from rosrm.master.queries import MasterQueries
+from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.rows import PluginRow
 from rosrm_msgs import srv
-from tests.unit.core.cluster import Cluster
+from tests.unit.core.cluster import Cluster, Machine, process
 
 SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")
 
@@ -23,7 +27,7 @@ def rows(cluster: Cluster, *, failing: bool = False) -> list[PluginRow]:
         uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
     )  # fmt: skip
     asked = SimpleNamespace(hosts=0, processes=0, plugins=True, events=0, failing=failing)
-    return list(reading.snapshot(asked).plugins)
+    return list(reading.snapshot(asked, OPERATOR).plugins)
 
 
 def named(cluster: Cluster, name: str) -> PluginRow:
@@ -46,7 +50,7 @@ def test_a_page_of_events_is_bounded(after: int, most: int, wanted: tuple[int, i
         uptime=lambda: 0.0, core_now=lambda: 0.0, trouble=lambda: "",
     )  # fmt: skip
     request = srv.List.Request(events=True, after_sequence=after, max_events=most)
-    assert queries.snapshot(request).events == []
+    assert queries.snapshot(request, OPERATOR).events == []
     assert asked == [wanted]
 
 
@@ -84,3 +88,45 @@ def test_a_probe_that_fails_is_shown_as_failing_on_its_host() -> None:
         assert states == {"a": state, "b": "selected"}
         fails = [("cpu", "a")] if failing else []
         assert [(row.name, row.host) for row in rows(cluster, failing=True)] == fails
+
+
+@pytest.mark.parametrize(
+    ("by", "details"),
+    [
+        (Requester("user:ada"), True),
+        (OPERATOR, True),
+        (Requester("user:bob"), False),
+        (Requester(), False),
+    ],
+)
+def test_environment_and_parameters_are_shown_to_owner_and_operators(
+    tmp_path: Path, by: Requester, *, details: bool
+) -> None:
+    """Nothing that another user can read has a value of them, in a sentence or in its details."""
+    refusal = "program 'p' is not on the PATH\nthe PATH is /secret/bin"
+    cluster = Cluster(Machine("a", refuses={"p": refusal}), Machine("b", refuses={"q": refusal}))
+    spec = process("p", environment={"PATH": "/secret/bin"}, parameters={"key": "/secret/key"})
+    cluster.ask(happened.SubmissionReceived, (spec, process("q")), Requester("user:ada"))
+    cluster["q"].reason = refusal
+    journal = SqliteJournal(tmp_path / "journal.sqlite")
+    journal.write(cluster.records, [], 0.0)
+    queries = MasterQueries(
+        "m", cluster.state, journal, [],
+        uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
+    )  # fmt: skip
+    request = srv.List.Request(events=True, processes=True, hosts=True, plugins=True)
+    listed = queries.snapshot(request, by)
+    journal.close()
+    story = queries.explain("p", by)
+    assert story is not None
+    messages = [row.message for row in listed.events] + [
+        one["message"] for one in json.loads(story)["history"]
+    ]
+    assert sum("not on the PATH" in message for message in messages) >= 2
+    joined = "not on the PATH; the PATH is /secret/bin"
+    assert any(joined in message for message in messages) is details
+    assert (joined in story) is details
+    reasons = {row.name: row.reason for row in listed.processes}
+    assert reasons["q"] == (refusal if details else refusal.partition("\n")[0])
+    assert ("secret" in f"{listed} {story} {queries.explain('q', by)}") is details
+    assert "/secret/key" not in f"{listed} {story}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+
 import pytest
 
 from rosrm.node.identity import NodeIdentity, identity_from
@@ -25,6 +27,22 @@ def test_a_shadow_is_marked_in_its_environment():
     """Only the exact value makes a shadow."""
     assert identity_from({**FULL, "ROSRM_SHADOW": "1"}).shadow
     assert not identity_from({**FULL, "ROSRM_SHADOW": ""}).shadow
+
+
+def test_the_key_of_the_instance_is_not_shown():
+    """Without a key the cluster has no security."""
+    key = base64.b64encode(bytes(range(32))).decode()
+    identity = identity_from({**FULL, "ROSRM_INSTANCE_KEY": key})
+    assert identity.key == bytes(range(32))
+    assert repr(identity.key)[2:-1] not in repr(identity)
+    assert identity_from(FULL).key is None
+
+
+@pytest.mark.parametrize("key", ["c2hvcnQ=", "no base64", "A" * 64])
+def test_a_node_with_a_damaged_key_does_not_start(key):
+    """Without a key the node would accept every message."""
+    with pytest.raises(ValueError, match="base64"):
+        identity_from({**FULL, "ROSRM_INSTANCE_KEY": key})
 
 
 @pytest.mark.parametrize("missing", ["ROSRM_INSTANCE", "ROSRM_STATE_CONFIG"])

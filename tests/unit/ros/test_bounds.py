@@ -46,7 +46,7 @@ def test_the_fields_with_a_bound_exist() -> None:
 def test_texts_and_sequences_without_a_bound_of_their_own_have_the_general_one() -> None:
     by_field = {bound.field: bound for bound in bounds_of(msg.MasterBeat)}
     assert by_field["name"] == ("name", 0, MOST_LETTERS, False)
-    assert by_field["unheard"] == ("unheard", MOST_ENTRIES, 0, False)
+    assert by_field["silent_hosts"] == ("silent_hosts", MOST_ENTRIES, 0, False)
 
 
 def many(kind, count: int):
@@ -57,7 +57,7 @@ def many(kind, count: int):
     ("message", "said"),
     [
         (msg.MasterBeat(name=65_537 * "n"), "MasterBeat.name has 65537 letters; at most 65536"),
-        (msg.MasterBeat(unheard=65_537 * [1]), "MasterBeat.unheard has 65537 entries"),
+        (msg.MasterBeat(silent_hosts=65_537 * [1]), "MasterBeat.silent_hosts has 65537 entries"),
         (
             srv.Submit.Request(envelope=msg.Envelope(request_id=65_537 * "x")),
             "Envelope.request_id has 65537 letters",

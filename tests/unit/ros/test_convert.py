@@ -39,10 +39,32 @@ def test_spec_survives(spec) -> None:
     assert survives(spec.restart, "restart")
 
 
-@given(drawn(values.Assignment, spec=SPECS, fence=st.none() | FENCES))
+#: An assignment has a key of 32 bytes, or none.
+STATE_KEYS = st.just(b"") | st.binary(min_size=32, max_size=32)
+
+
+@given(drawn(values.Assignment, spec=SPECS, fence=st.none() | FENCES, state_key=STATE_KEYS))
 @settings(max_examples=30, deadline=None)
 def test_assignment_survives(assignment) -> None:
     assert survives(assignment, "assignment")
+
+
+@pytest.mark.parametrize("size", [1, 31, 33])
+def test_a_state_key_of_another_length_is_refused(size) -> None:
+    spec = values.ProcessSpec("p", command=("true",))
+    message = convert.assignment_to_msg(
+        values.Assignment(values.InstanceId("p", 1), spec, 1, "p", state_key=bytes(size))
+    )
+    with pytest.raises(Refused, match=f"p: state_key has {size} bytes; allowed: 0 or 32"):
+        convert.assignment_from_msg(message)
+
+
+def test_the_text_of_an_assignment_has_no_key() -> None:
+    """A log line with an assignment shows no key."""
+    spec = values.ProcessSpec("p", command=("true",))
+    one = values.Assignment(values.InstanceId("p", 1), spec, 1, "p", state_key=b"Q" * 32)
+    assert "Q" not in repr(one)
+    assert "state_key" not in repr(one)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +146,23 @@ def test_a_host_row_with_a_reading_too_few_is_refused() -> None:
 def test_rows_survive() -> None:
     """Rows of `ps`, `plugins` and `events` are received whole."""
     process = ProcessRow(
-        "a", "job", "failed", "h", 2**40, 12, 3, 1, -9, -5, 0, 1.5, 0.9, 2**40, "why", True
+        "a",
+        "job",
+        "failed",
+        "h",
+        2**40,
+        12,
+        3,
+        1,
+        -9,
+        -5,
+        0,
+        1.5,
+        0.9,
+        2**40,
+        "why",
+        True,
+        "user:ada",
     )
     plugin = PluginRow("probe", "gpu", "rosrm-resources 0.1", "absent", "no driver", "h")
     event = EventRow(2**40, 1.7e9, 12.5, "assigned", "a", "h", "a goes to h", {"n": [1, {"x": 2}]})
@@ -254,7 +292,7 @@ def test_reports_of_improper_names_are_refused(name) -> None:
             msg.ProcessStatus(state="exited", instance=msg.InstanceId(process=name))
         )
     with pytest.raises(Refused, match="cannot be the name of a process"):
-        convert.snapshot_from_msg(msg.KeptState(process=name))
+        convert.snapshot_from_msg(msg.SnapshotReport(process=name))
 
 
 def test_control_characters_in_a_reason_are_replaced() -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree as ET
 
 import pytest
 
-from rosrm.ros.fast_dds import announcements, announcing
+from rosrm.errors import ConfigError
+from rosrm.ros.fast_dds import announcements, announcing, bound
+from rosrm.ros.network_interface import check_interface
 
 
 def test_fast_dds_is_given_a_profile_while_the_node_is_made():
@@ -66,3 +70,59 @@ def test_what_the_user_has_set_stands(variable):
     with announcing(environment, "steady", udp=True):
         assert environment == {variable: "/etc/robot.xml"}
     assert environment == {variable: "/etc/robot.xml"}
+
+
+# --- one network interface ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pace", ["eager", "steady"])
+@pytest.mark.parametrize("before", [{}, {"FASTRTPS_DEFAULT_PROFILES_FILE": "/etc/robot.xml"}])
+def test_a_bound_participant_has_one_transport_with_one_interface(pace, before):
+    """The rest of the profile is that of the pace; the user's profile returns afterwards."""
+    environment = dict(before)
+    with bound(environment, pace, "a<b"):
+        path = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"])
+        profile = ET.fromstring(path.read_text().split("-->", 1)[1])
+    assert environment == before
+    assert not path.exists()
+    names = {"": profile.tag.partition("}")[0][1:]}
+    assert [one.text for one in profile.iterfind(".//interfaceWhiteList/address", names)] == ["a<b"]
+    chosen = profile.find("participant/rtps/userTransports/transport_id", names)
+    made = profile.find("transport_descriptors/transport_descriptor/transport_id", names)
+    assert chosen.text == made.text
+    assert profile.find("participant/rtps/useBuiltinTransports", names).text == "false"
+    assert profile.find(".//initialAnnouncements/count", names).text == "60"
+    assert (profile.find(".//heartbeatPeriod", names) is not None) == (pace == "steady")
+
+
+@pytest.fixture
+def _two_interfaces(monkeypatch):
+    address = SimpleNamespace(family=socket.AF_INET, address="10.0.0.1")
+    link = SimpleNamespace(family=socket.AF_PACKET, address="00:00:00:00:00:00")
+    found = {"wg0": [address], "eth0": [link]}
+    monkeypatch.setattr("psutil.net_if_addrs", lambda: found)
+
+
+@pytest.mark.usefixtures("_two_interfaces")
+@pytest.mark.parametrize("interface", ["wg0", "10.0.0.1"])
+def test_an_interface_is_given_by_name_or_address(interface):
+    """Both are accepted as they are."""
+    check_interface(interface)
+
+
+@pytest.mark.usefixtures("_two_interfaces")
+@pytest.mark.parametrize(
+    ("interface", "fault"),
+    [
+        ("wg1", "does not exist on this machine"), ("10.0.0.2", "does not exist on this machine"),
+        ("eth0", "has no IPv4 address"),
+    ],
+)  # fmt: skip
+def test_a_wrong_interface_is_refused_with_the_available_ones(interface, fault):
+    """The message says where the interface was chosen."""
+    with pytest.raises(ConfigError) as refused:
+        check_interface(interface)
+    assert str(refused.value) == (
+        f"the network interface {interface!r} (ros.interface or ROSRM_INTERFACE) {fault}; "
+        "available: wg0 (10.0.0.1)"
+    )

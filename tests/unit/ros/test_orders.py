@@ -54,10 +54,10 @@ def test_an_order_is_the_same_after_its_way_to_the_slave(order):
 
 
 @pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -1.0, 4e8])
-@pytest.mark.parametrize("order", [ORDERS[-3], ORDERS[-2]], ids=["timeout", "keep_every"])
+@pytest.mark.parametrize("order", [ORDERS[-3], ORDERS[-2]], ids=["timeout", "replicate_every"])
 def test_an_order_with_a_time_that_never_ends_is_refused(order, seconds):
     request = order_to_msg(order)
-    request.timeout = request.keep_every = seconds
+    request.timeout = request.replicate_every = seconds
     with pytest.raises(Refused, match="allowed: 0 to"):
         order_from_msg(request)
 

@@ -152,11 +152,14 @@ def net(tmp_path, caplog):
     return Net(tmp_path, caplog)
 
 
-def assignment(*kept_on: str, kept_from: int = 1, number: int = 9, **fields) -> Assignment:
+def assignment(
+    *snapshot_hosts: str, snapshots_from: int = 1, number: int = 9, **fields
+) -> Assignment:
     spec = ProcessSpec("p", command=("x",), ros=True, migration=MigrationPolicy("handoff"))
     return Assignment(
-        InstanceId("p", number), spec, 1, "p", kept_on=kept_on, kept_from=kept_from, **fields
-    )
+        InstanceId("p", number), spec, 1, "p", snapshot_hosts=snapshot_hosts,
+        snapshots_from=snapshots_from, **fields,
+    )  # fmt: skip
 
 
 # --- shipping ---------------------------------------------------------------------------------
@@ -463,7 +466,7 @@ def test_a_start_that_needs_no_snapshot_of_another_host_fetches_none(net, needs_
 
 def test_a_stateless_process_starts_at_once(net):
     """No host is asked for a snapshot."""
-    stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", kept_on=("b",))
+    stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", snapshot_hosts=("b",))
     assert net.add("a").prepare(stateless, pytest.fail)
 
 
@@ -471,7 +474,7 @@ def test_snapshots_of_a_former_process_are_deleted_before_a_start(net):
     """The origin of these snapshots makes no difference."""
     net.add("a")
     net.write("a", 42)
-    prepare(net, "a", assignment(kept_from=8))
+    prepare(net, "a", assignment(snapshots_from=8))
     assert net.age("a") is None
 
 

@@ -22,7 +22,7 @@ class Slave:
         self.now, self.log = 100.0, log
         self.when_stopped = lambda: None
         self.endpoint = SimpleNamespace(
-            failure="", leave=lambda done, _kept: done(),
+            failure="", leave=lambda done, _running: done(),
             wait_until_received=lambda: None,
         )  # fmt: skip
         self.state = SlaveState()

@@ -13,14 +13,16 @@ from hypothesis import strategies as st
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
 from rosrm.slave.replication import store as stores
+from rosrm.slave.replication.encryption import decrypted, encrypted
 from rosrm.slave.replication.store import SnapshotStore
 from rosrm.snapshots import reader
-from rosrm.snapshots.format import Block, TransferPart, encoded_head
+from rosrm.snapshots.format import Block, TransferPart, checked, encoded_head
 from rosrm.snapshots.writer import SlotWriter
 from tests.limits import no_more_files
 
 #: The name that release 0.1.0 gave the directory of the process "map-server".
 OLD_NAME = "map_server_651ecfc8"
+KEY = bytes(range(32))
 
 
 class Shelf:
@@ -51,10 +53,13 @@ def snapshot(process: str, number: int, sequence: int = 1, content: bytes = b"st
 
 
 def parts(
-    process: str, number: int, sequence: int = 1, content: bytes = b"state", size: int = 40
-) -> list[TransferPart]:
-    """Return the parts of a snapshot, of `size` bytes each."""
+    process: str, number: int, sequence: int = 1, content: bytes = b"state", size: int = 40,
+    key: bytes = b"",
+) -> list[TransferPart]:  # fmt: skip
+    """Return the parts of a snapshot, of `size` bytes each; encrypted, if there is a key."""
     data = snapshot(process, number, sequence, content)
+    if key:
+        data = encrypted(key, checked(data)[0], data)
     digest = zlib.crc32(data)
     return [
         TransferPart(process, number, sequence, at, len(data), digest, data[at : at + size])
@@ -181,15 +186,22 @@ def test_the_replica_of_a_successor_is_never_displaced(shelf):
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_no_sequence_of_parts_harms_the_transfer_of_another_process(tmp_path_factory, data):
-    """Any numbers, in any order, at any time: bounded files, and an honest replica arrives."""
+    """Any numbers, in any order, at any time: bounded files, and an honest replica arrives.
+
+    Where a process has a key, no replica is stored that was not encrypted with it.
+    """
     numbers = st.sampled_from([0, 1, 7, 8, 40, 2**31, 2**52, 2**62, 2**63, 2**64 - 1])
     shelf = Shelf(tmp_path_factory.mktemp("s") / "kept")
+    keyed = data.draw(st.sets(st.sampled_from(["a", "b", "p", "honest"])))
+    for process in keyed:
+        shelf.store.keys.put(process, 1, KEY)
     before = open_files()
     forged = st.builds(
         TransferPart, st.sampled_from(["a", "b", "p", "", "../x", "\0", "x" * 300]),
         numbers, numbers, numbers, numbers, st.integers(0, 2**32 - 1), st.binary(max_size=50),
     )  # fmt: skip
     honest = [*parts("a", 7), *parts("b", 2**52), *parts("a", 8, content=b"x" * 99)]
+    honest += [part for key in (KEY, bytes(32)) for part in parts("a", 9, size=200, key=key)]
     forged |= st.sampled_from(honest)
     for part in data.draw(st.lists(forged, max_size=30)):
         shelf.now += data.draw(st.sampled_from([0.0, 1.0, 29.0, 31.0]))
@@ -197,7 +209,11 @@ def test_no_sequence_of_parts_harms_the_transfer_of_another_process(tmp_path_fac
         assert open_files() <= before + stores.MOST_INCOMING
     shelf.store.end_interrupted(shelf.now + 100.0)
     assert open_files() == before
-    assert shelf.send("honest", 7) == ""
+    key = KEY if "honest" in keyed else b""
+    assert [shelf.take(part) for part in parts("honest", 7, size=200, key=key)] == [""]
+    for process in keyed:
+        copy = shelf.store.directory(process) / reader.COPY
+        assert not copy.exists() or decrypted(KEY, copy)
     assert {path.parent for path in shelf.root.parent.iterdir()} == {shelf.root.parent}
 
 

@@ -26,7 +26,8 @@ def write_copy(directory: Path, data: bytes) -> None:
     copy = CopyWriter(directory)
     copy.append(data)
     head = decoded(data).head
-    copy.finish(head.process, head.age)
+    copy.check(head.process, head.age)
+    copy.finish()
 
 
 def write(directory: Path, sequence: int, *contents: bytes, instance: int = 7) -> bool:
@@ -104,7 +105,8 @@ def test_a_replica_of_another_process_or_age_replaces_nothing(tmp_path):
         copy = CopyWriter(tmp_path)
         copy.append(data)
         with pytest.raises(Damaged, match="it is a state of other#"):
-            copy.finish(process, age)
+            copy.check(process, age)
+        copy.abandon()
     assert newest(tmp_path, up_to=2**41) == ((7, 5), (b"mine",))
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(reader.SLOTS)
 

@@ -14,6 +14,7 @@ from hypothesis import given
 
 from rosrm.errors import LaunchError
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy, StopPolicy
+from rosrm.node.identity import identity_from
 from rosrm.slave.launch.ament_index import find_executable
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import (
@@ -375,6 +376,19 @@ def test_a_process_knows_the_file_with_the_masters_epoch():
     made = process_environment(assignment(command=("x",)), {}, here)
     assert made["ROSRM_EPOCH_FILE"] == "/state/epoch"
     assert "ROSRM_EPOCH_FILE" not in process_environment(assignment(command=("x",)), made, HERE)
+
+
+def test_only_a_node_that_takes_part_in_handoffs_gets_a_key():
+    """The key is of its instance; a process that the node starts as a slave inherits none."""
+    here = replace(HERE, instance_key=lambda instance: str(instance).encode().ljust(32))
+    key = "dGFsa2VyIzcgICAgICAgICAgICAgICAgICAgICAgICA="
+    stateful = replace(assignment(command=("x",)), snapshots_from=1)
+    made = process_environment(stateful, {}, here)
+    assert made["ROSRM_INSTANCE_KEY"] == key
+    assert identity_from(made).key == b"talker#7".ljust(32)
+    assert "ROSRM_INSTANCE_KEY" in process_environment(shadow(), {}, here)
+    assert "ROSRM_INSTANCE_KEY" not in process_environment(assignment(command=("x",)), made, here)
+    assert "ROSRM_INSTANCE_KEY" not in process_environment(stateful, {}, HERE)
 
 
 def test_the_identity_of_the_slave_is_not_inherited():

@@ -8,14 +8,14 @@ that is not in the record (the end of a process that was still running) is not s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Final
 
 import numpy as np
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import Assign, Command, PublishStateConfig
+from rosrm.core.master.commands import Assign, Command, PublishStateConfig, Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
@@ -23,6 +23,7 @@ from rosrm.core.slave.state import awaits_graph
 from rosrm.model.codec import from_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Record
+from rosrm.model.requester import OPERATOR
 from rosrm.model.values import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Recording
@@ -116,7 +117,9 @@ class Extraction:
             for status in event.statuses:
                 self._status(status, at)
         elif isinstance(event, _REQUESTS):
-            self._requests.append((at, event))
+            # A submission of a workload has no owner, so only an operator may act on its processes.
+            if not any(isinstance(one, Reply) and one.code == "denied" for one in commands):
+                self._requests.append((at, replace(event, by=OPERATOR)))
         elif isinstance(event, happened.HostLeft):
             host = state.hosts.find(event.host_id, event.incarnation)
             if host is not None and host.name in self._hosts:

@@ -53,13 +53,11 @@ _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
 # --- reports ----------------------------------------------------------------------------------
 
 
-def kept_states_received(
-    state: MasterState, event: happened.KeptStatesReceived, now: float
-) -> None:
+def snapshots_reported(state: MasterState, event: happened.SnapshotsReported, now: float) -> None:
     """Note all snapshots and replicas that a host reports."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is not None:
-        note_states(state, host, event.states, now)
+        note_states(state, host, event.snapshots, now)
 
 
 def note_states(
@@ -199,8 +197,8 @@ def _current_choice(
     process: Process, host: Host, replicas: Mapping[str, Replica]
 ) -> CheckpointChoice:
     """Choose the other hosts with a replica from after the last submission."""
-    kept = (name for name, one in replicas.items() if one.number >= process.born)
-    return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
+    current = (name for name, one in replicas.items() if one.number >= process.born)
+    return CheckpointChoice(tuple(sorted(name for name in current if name != host.name)))
 
 
 def _is_same(one: CheckpointChoice, other: CheckpointChoice) -> bool:
@@ -218,8 +216,8 @@ def _choice(
     policy, policy_name = state.replication.policy, state.replication.policy_name
     if policy is None:
         return CheckpointChoice(())
-    kept = state.replication.replicas.hosts_of(process.name, process.born)
-    others = tuple(name for name in kept if name != host.name)
+    current = state.replication.replicas.hosts_of(process.name, process.born)
+    others = tuple(name for name in current if name != host.name)
     hosts = {
         one.name: one.description.labels
         for one in state.hosts.hosts

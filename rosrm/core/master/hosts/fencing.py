@@ -31,7 +31,9 @@ def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
     follows = spec.host_loss.then == "elsewhere" or spec.standby.wanted
     stops = spec.isolation.then == "stop"
     graces = spec.stop.interrupt_grace + spec.stop.terminate_grace
-    own = max(spec.isolation.after, 0.0)  # a negative one would end each instance at its start
+    # A negative time would end each instance at its start, and so would NaN: `max` keeps the first
+    # of two values that it cannot compare.
+    own = max(0.0, spec.isolation.after)
     if not follows:
         return Fence(own or settings.lease, graces) if stops else None
     delay = 0.0 if spec.standby.wanted else spec.host_loss.delay

@@ -65,7 +65,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         },
     )  # fmt: skip
     note_seen(state, host.name, event.journal_seen, now)
-    replication.note_states(state, host, event.kept, now)  # replicas decide on placement
+    replication.note_states(state, host, event.snapshots, now)  # replicas decide on placement
     loss.mark_rejoined(state, host, now)
     stopping = [instance for instance in state.instances_of(host) if instance.stopping]
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
@@ -131,7 +131,7 @@ def _registered_again(
     master orders a full report in sequence.
     """
     state.hosts.last_contact[host.column] = now
-    replication.note_states(state, host, event.kept, now)
+    replication.note_states(state, host, event.snapshots, now)
     condition = state.hosts.condition_of(host)
     if condition in (HostCondition.LOST, HostCondition.SUSPECT):
         mark_up(state, host, now)
@@ -182,8 +182,8 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
     if host is None:
         raise RequestRefused("this host is not registered", "unknown")
     host.left_since = now
-    if event.kept:
-        _detach(state, host, event.kept, now)
+    if event.left_running:
+        _detach(state, host, event.left_running, now)
         state.emit(Reply(event.request))
         return
     state.hosts.set_condition(host, HostCondition.LEFT)
@@ -196,15 +196,17 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
     state.emit(Reply(event.request))
 
 
-def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], now: float) -> None:
+def _detach(
+    state: MasterState, host: Host, running: tuple[InstanceStatus, ...], now: float
+) -> None:
     """Detach a host: adopt the reported instances; an instance not reported has not begun."""
     state.hosts.set_condition(host, HostCondition.DETACHED)
     state.record(
         now, EventKind.HOST_DETACHED,
-        f"{host.name} is detached: its slave was stopped and left {_live(kept)} running",
+        f"{host.name} is detached: its slave was stopped and left {_live(running)} running",
         host=host.name,
     )  # fmt: skip
-    lifecycle.reconcile(state, host, kept, now, registering=True)
+    lifecycle.reconcile(state, host, running, now, registering=True)
     loss.detach(state, host, lease_end(state, host), now)
 
 

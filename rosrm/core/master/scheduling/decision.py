@@ -22,7 +22,6 @@ from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Scores
 from rosrm.extensions.plugin_calls import PluginCalls, required
 from rosrm.model.values import EMPTY
-from rosrm.wording import one_line
 
 #: Largest number of hosts that an explanation names all; of more, it names the best fitting ones.
 _NAMED_HOSTS: Final = 16
@@ -190,7 +189,7 @@ def _verdict(
         reason = _policy_reason(moment, scores, at, veto=False)
         return Verdict(name, "chosen" if chosen else "fits", score, reason)
     if refused is not None:
-        return Verdict(name, refused.filter.verdict, None, one_line(refused.reason))
+        return Verdict(name, refused.filter.verdict, None, refused.reason)
     return Verdict(name, "vetoed", None, _policy_reason(moment, scores, at, veto=True))
 
 

@@ -13,7 +13,7 @@ from rosrm.core.master.state.lazy import Plain
 from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
 from rosrm.model.values import InstanceId, InstanceStatus
-from rosrm.wording import one_line
+from rosrm.wording import first_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,7 @@ class Migration:
         if end is None:
             return "it was never started"
         codes = f"exit code {end.status.exit_code}, signal {end.status.exit_signal}"
-        return one_line(end.status.message) or codes
+        return first_line(end.status.message) or codes
 
     def phases_of(self, instance: InstanceId) -> Mapping[ReportPhase, str]:
         """Return all phases that the source or the destination has reported."""

@@ -148,6 +148,7 @@ class Image:
 #: Fields of a process that are journaled unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
+    "principal",
 )  # fmt: skip
 
 
@@ -157,6 +158,7 @@ class Process:
 
     Attributes:
         order: place in the queue; unchanged when the process returns to the queue.
+        principal: principal that submitted it and so owns it, "user:ada"; "": unknown.
         since: start of its phase by this master's clock; earlier than the master's own start if the
             phase is from the journal.
         wall: unix time of the start of its phase.
@@ -186,6 +188,7 @@ class Process:
     order: int
     phase: ProcessPhase
     since: float
+    principal: str = ""
     wanted: DesiredState = DesiredState.RUN
     owner: int = 0
     instances: set[int] = field(default_factory=set)

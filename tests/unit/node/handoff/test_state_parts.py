@@ -39,3 +39,13 @@ def test_unchanged_before_anything_was_saved_is_a_fault():
     """The author's function refers to a state that does not exist."""
     with pytest.raises(StateError, match="before it had returned any state"):
         part(None).refresh()
+
+
+def test_an_unchanged_part_is_shown_once_to_each_successor():
+    """A later handoff has another key, and its destination needs the part again."""
+    one, shown = part(Int64(data=7), None, None, None), []
+    for successor in "ab":
+        one.show_to(lambda data, to=successor: shown.append((to, len(data))))
+        one.publish()
+        one.publish()
+    assert shown == [("a", 12), ("b", 12)]

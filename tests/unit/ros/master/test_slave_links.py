@@ -8,16 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rosrm.core.master.commands import SendOrder
+from rosrm.core.master.commands import Assign, SendOrder
 from rosrm.core.master.events import BAD_RESULT
-from rosrm.model.orders import ReportInstances
-from rosrm.model.values import HostDescription
+from rosrm.model.orders import ReportInstances, StartInstance
+from rosrm.model.values import Assignment, HostDescription, InstanceId, ProcessSpec
 from rosrm.ros.control import accepted
 from rosrm.ros.master.slave_links import HostLinks, _order_answered
 from rosrm.ros.reading_codec import Runs
 from rosrm_msgs import srv
 
 HOST, RUN = 1, 500
+#: Keys of the snapshots of processes.
+KEYS = {"stateful": b"k" * 32}
 DESCRIPTION = HostDescription("shelf", RUN)
 
 
@@ -26,13 +28,14 @@ class FakeClient:
 
     def __init__(self) -> None:
         self.beats: list[int] = []
+        self.requests: list = []
 
     def envelope(self, beat, epoch):
         self.beats.append(beat)
         return SimpleNamespace()
 
-    def call(self, *arguments):
-        pass
+    def call(self, control, request, *arguments):
+        self.requests.append(request)
 
 
 def heard(links: HostLinks, beat: int, sequence: int) -> None:
@@ -63,10 +66,13 @@ def control() -> Control:
 def links(monkeypatch, control) -> HostLinks:
     node = SimpleNamespace(create_client=lambda *arguments, **named: control)
     participant = SimpleNamespace(node=node, settings=SimpleNamespace(namespace="/rosrm"))
-    links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
+    links = HostLinks(
+        participant, "master test", 1, 5.0, lambda event: None, lambda process: KEYS[process]
+    )
     links._client = FakeClient()
     monkeypatch.setattr(
-        "rosrm.ros.master.slave_links.order_to_msg", lambda command: SimpleNamespace(envelope=None)
+        "rosrm.ros.master.slave_links.order_to_msg",
+        lambda order: SimpleNamespace(envelope=None, order=order),
     )
     return links
 
@@ -104,6 +110,30 @@ def test_waiting_requests_of_one_slave_are_bounded(links):
         links.after_first_reading(link, partial(sent.append, number))
     heard(links, beat=100, sequence=1)
     assert sent == list(range(200, 1200))
+
+
+def assignment(process: str, snapshots_from: int) -> Assignment:
+    spec = ProcessSpec(process, command=("true",))
+    return Assignment(InstanceId(process, 7), spec, 1, process, snapshots_from=snapshots_from)
+
+
+def test_only_the_messages_have_the_key_and_only_for_a_process_with_snapshots(links):
+    """The core derives, stores and journals no key."""
+    links.renew(HOST, DESCRIPTION)
+    link, answers = links.find(HOST, RUN), []
+    kept = [assignment("stateful", 1), assignment("stateless", 0)]
+    for one in kept:
+        links.assign(Assign(HOST, one))
+    assert link.outbox == kept
+    links.open_poll(link, answers.append, lambda: None)
+    links.flush(0)
+    keys = [bytes(one.state_key) for one in answers[0].assignments]
+    assert keys == [KEYS["stateful"], b""]
+    heard(links, beat=100, sequence=1)
+    for number, one in enumerate(kept):
+        links.order(SendOrder(number, HOST, StartInstance(one)), now=0.0)
+    started = [request.order.assignment.state_key for request in links._client.requests]
+    assert started == keys
 
 
 @pytest.mark.parametrize("text", ["null", "[1]", "3", "{"])

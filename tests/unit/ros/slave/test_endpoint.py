@@ -55,10 +55,10 @@ class Master:
         self._incarnation = incarnation
         self._epoch = epoch
 
-    def beat(self, unheard=(), age: float = 0.0, journal: int = 0) -> None:
+    def beat(self, silent_hosts=(), age: float = 0.0, journal: int = 0) -> None:
         beat = msg.MasterBeat(
             protocol_version=PROTOCOL_VERSION, incarnation=self._incarnation,
-            beat=self._slave.clock.monotonic_ns() - int(age * 1e9), unheard=list(unheard),
+            beat=self._slave.clock.monotonic_ns() - int(age * 1e9), silent_hosts=list(silent_hosts),
             journal=journal, **self._is,
         )  # fmt: skip
         self._slave.wire.hear[msg.MasterBeat](beat)
@@ -207,10 +207,10 @@ def test_beats_confirm_the_contact_of_this_host(slave) -> None:
     ours.take_in()
     slave.host.contacts.clear()
     slave.clock.now += 1.0
-    ours.beat(unheard=[1, 7])
+    ours.beat(silent_hosts=[1, 7])
     another.beat()
     assert slave.host.contacts == []
-    ours.beat(unheard=[2])
+    ours.beat(silent_hosts=[2])
     assert slave.host.contacts == pytest.approx([slave.clock.now])
 
 

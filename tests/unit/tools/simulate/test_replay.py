@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rosrm.core.master import events as happened
 from rosrm.core.master.settings import CoreSettings
 from rosrm.model.records import Intent
+from rosrm.model.requester import OPERATOR, Requester
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Header, Recording
 from rosrm_scoring.weighted import Weighted, WeightedOptions
@@ -186,6 +187,20 @@ def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
     assert agreement.same_host >= 0.75
     assert agreement.ranked["memory"] < 0.06
     assert agreement.balance["memory"] < 0.08
+
+
+def test_the_workload_of_a_record_has_no_denied_request():
+    """The others are repeated by an operator, because its submissions have no owner."""
+    root, bob = Requester("user:root", is_operator=True), Requester("user:bob")
+    requests = [
+        (3.0, happened.CancelRequested(0, ("p",), bob)),
+        (5.0, happened.CancelRequested(0, ("p",), root)),
+    ]
+    made = simulation([host("a")], [plan("p", 50.0)], requests=requests, until=10.0)
+    extraction = Extraction(record := read(recorded(made)))
+    replay(record, watch=extraction.watch)
+    ((at, repeated),) = extraction.workload().requests
+    assert (at, repeated.by) == (pytest.approx(5.0, abs=0.1), OPERATOR)
 
 
 def test_what_hands_over_keeps_its_age_in_the_workload_made_of_it():

@@ -1,0 +1,199 @@
+"""Commands `rosrm key`: the cluster's secret, and the keys of hosts and users."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from rosrm.cli.output.plain import echo
+from rosrm.errors import ConfigError
+from rosrm.wording import counted
+
+if TYPE_CHECKING:
+    from rosrm.keys.cluster import ClusterSecret
+
+key = typer.Typer(no_args_is_help=True, help="Manage the keys of hosts and users.")
+
+_PRINCIPAL = typer.Argument(metavar="PRINCIPAL", help="host:NAME or user:NAME.")
+_STANDARD_OUTPUT: Final = 1
+
+
+@key.callback()
+def _group() -> None:
+    """Manage the keys of hosts and users: on the machine of the master, but for `check`."""
+
+
+@key.command()
+def init() -> None:
+    """Draw the cluster's secret, unless this user has one already.
+
+    `rosrm master` does this too. Whoever can read the file has all rights in the cluster.
+    """
+    from rosrm.keys import key_files
+
+    home = key_files.key_home()
+    known = key_files.read_secret(home) is not None
+    key_files.make_secret(home)
+    echo(f"{home / key_files.CLUSTER_FILE}: {'exists already' if known else 'drawn'}")
+
+
+@key.command()
+def add(
+    principal: Annotated[str, _PRINCIPAL],
+    role: Annotated[
+        str | None,
+        typer.Option(
+            "--role", metavar="ROLE",
+            help="Of a user: viewer (reads), submitter (changes its own processes) or operator "
+            "(everything).  [default: submitter]",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE",
+            help="Key file, for example robot-1.key, mode 0600; default: the standard output.",
+        ),
+    ] = None,
+) -> None:  # fmt: skip
+    """Make a new key for a host or user, and write its key file.
+
+    An earlier key of the same principal ends at once. Copy the file to ~/.config/rosrm/ on that
+    host. Use --out in a directory that others can read: with `> FILE` the shell creates the file
+    before its mode is 0600.
+    """
+    from rosrm.keys import key_files
+    from rosrm.keys.roles import Role, principal_of
+
+    whom = principal_of(principal)
+    allowed = [Role.HOST] if whom.kind == "host" else [one for one in Role if one is not Role.HOST]
+    names = [one.value for one in allowed]
+    chosen = role or ("host" if whom.kind == "host" else "submitter")
+    if chosen not in names:
+        raise ConfigError(f"{whom} cannot have the role {chosen!r}; allowed: {', '.join(names)}")
+    secret = _secret()
+    if out is None:
+        _make_output_private()
+    grant = key_files.add_grant(key_files.key_home(), whom, Role(chosen))
+    made = secret.key_of(grant)
+    if out is None:
+        echo(key_files.text_of(made).rstrip())
+    else:
+        key_files.write_key(out, made)
+    echo(
+        f"rosrm: {whom} has a new key (role {chosen}). Copy the file to ~/.config/rosrm/ of its "
+        f"user, with mode 0600",
+        err=True,
+    )
+
+
+def _make_output_private() -> None:
+    """Give the file behind the standard output mode 0600, before it holds a key."""
+    facts = os.fstat(_STANDARD_OUTPUT)
+    if stat.S_ISREG(facts.st_mode) and facts.st_uid == os.geteuid():
+        os.fchmod(_STANDARD_OUTPUT, 0o600)
+
+
+@key.command(name="list")
+def list_keys() -> None:
+    """List the principals that have a key, with their roles."""
+    from rosrm.cli.output.tables import console, table
+    from rosrm.keys import key_files
+
+    _secret()
+    home = key_files.key_home()
+    rows = table("principal", "role", "key", right=["key"])
+    grants = key_files.read_grants(home)
+    for grant in grants:
+        rows.add_row(str(grant.principal), grant.role.value, str(grant.generation))
+    console().print(rows)
+    echo(
+        f"{counted(len(grants), 'key', 'keys')}; this user of this machine has all rights by "
+        f"{home / key_files.CLUSTER_FILE}"
+    )
+
+
+@key.command()
+def revoke(principals: Annotated[list[str], _PRINCIPAL]) -> None:
+    """End the keys of hosts or users; a running master refuses them within a second."""
+    from rosrm.keys import key_files
+    from rosrm.keys.roles import principal_of
+
+    chosen = [principal_of(text) for text in principals]
+    key_files.revoke(key_files.key_home(), chosen)
+    echo(f"revoked: {', '.join(map(str, chosen))}")
+
+
+@key.command()
+def rotate(
+    directory: Annotated[
+        Path,
+        typer.Option(
+            "--out", metavar="DIRECTORY",
+            help="Directory for the new key files, for example new-keys; created if missing.",
+        ),
+    ],
+) -> None:  # fmt: skip
+    """Draw a new secret for the cluster, and write new key files for all principals.
+
+    All former keys end when the master reads the new secret, within a second. Copy each file to its
+    host or user.
+    """
+    from rosrm.keys import key_files
+
+    _secret()
+    written = key_files.rotate(key_files.key_home(), directory)
+    echo(f"a new secret; {counted(len(written), 'key file', 'key files')} in {directory}")
+
+
+@key.command()
+def check(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FILE]",
+            help="A key file, for example robot-1.key; default: all keys of this user.",
+        ),
+    ] = None,
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host", metavar="HOST",
+            help="Name of the slave's host, for example robot-1; default: the machine's host name.",
+        ),
+    ] = "",
+) -> None:  # fmt: skip
+    """Show which keys this user has on this machine, and what they do not protect.
+
+    Exits with 1 if a key is missing, open to others, or not valid.
+    """
+    from rosrm.cli.output.keys import file_report, user_report
+    from rosrm.keys.key_files import key_home
+
+    report = user_report(key_home(), host) if file is None else file_report(key_home(), file)
+    for label, text in report.rows:
+        echo(f"{label:<15}{text}")
+    for fault in report.faults:
+        echo(f"{'problem':<15}{fault}")
+    if report.faults:
+        raise typer.Exit(1)
+
+
+def _secret() -> ClusterSecret:
+    from rosrm.keys import key_files
+
+    home = key_files.key_home()
+    secret = key_files.read_secret(home)
+    if secret is None:
+        raise ConfigError(
+            f"there is no {home / key_files.CLUSTER_FILE}: run this on the machine of the master, "
+            f"as its user, or begin with `rosrm key init`"
+        )
+    return secret

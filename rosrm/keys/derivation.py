@@ -1,0 +1,42 @@
+"""Derivation of keys: keyed BLAKE2b over a purpose and its arguments.
+
+BLAKE2b with a key is a pseudo-random function (RFC 7693, section 2.9), so that a derived key tells
+nothing about the key that it comes from, nor about its siblings.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from typing import Final
+
+#: Bytes of every secret key.
+KEY_BYTES: Final = 32
+
+#: Separates this use of BLAKE2b from every other one; at most 16 bytes.
+_PERSON: Final = b"rosrm keys 1"
+
+
+def derived(key: bytes, purpose: str, *arguments: str | int | bytes) -> bytes:
+    """Return a key of `KEY_BYTES` for a purpose.
+
+    Args:
+        key: secret that only the parties of the derived key know, or one of them and the master.
+        purpose: what the derived key is used for.
+        arguments: what else distinguishes it. Each enters with its length, so that no two lists of
+            arguments give the same bytes. A number enters as 64 bits.
+    """
+    state = hashlib.blake2b(key=key, digest_size=KEY_BYTES, person=_PERSON)
+    for argument in (purpose, *arguments):
+        part = _bytes_of(argument)
+        state.update(struct.pack("<I", len(part)))
+        state.update(part)
+    return state.digest()
+
+
+def _bytes_of(argument: str | int | bytes) -> bytes:
+    if isinstance(argument, str):
+        return argument.encode("utf-8", "surrogatepass")
+    if isinstance(argument, int):
+        return struct.pack("<Q", argument)
+    return argument

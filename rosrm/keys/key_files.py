@@ -1,0 +1,366 @@
+"""Files of keys: the cluster's secret and its grants at the master, one file for each principal.
+
+All lie in one directory, `key_home`, are readable by their owner alone, and are refused otherwise,
+as ssh does. A principal's file may have any name that ends in ".key".
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import fcntl
+import os
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+import yaml
+
+from rosrm.errors import ConfigError
+from rosrm.keys.cluster import ClusterSecret, PrincipalKey, own_grant
+from rosrm.keys.derivation import KEY_BYTES
+from rosrm.keys.roles import Grant, Principal, Role, principal_of
+from rosrm.runtime import atomic_file
+from rosrm.runtime.private_files import (
+    make_private_directory,
+    make_safe_directory,
+    open_own,
+    open_private,
+)
+
+#: File of the cluster's secret, on the master's machine alone.
+CLUSTER_FILE: Final = "cluster.key"
+#: File of the grants, beside it.
+GRANTS_FILE: Final = "principals.yaml"
+
+_LOCK_FILE: Final = "keys.lock"
+_OTHERS: Final = 0o077
+_LARGEST: Final = 1 << 20
+_WARNING: Final = "# Secret: whoever reads this file can act as its owner. Mode 0600.\n"
+
+
+def key_home() -> Path:
+    """Return the directory of this user's keys: ROSRM_KEYS, else `~/.config/rosrm`."""
+    base = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
+    return Path(os.environ.get("ROSRM_KEYS") or Path(base) / "rosrm")
+
+
+# --- the cluster's secret ------------------------------------------------------------------
+
+
+def read_secret(home: Path) -> ClusterSecret | None:
+    """Return the cluster's secret; None: there is none in this directory.
+
+    Raises:
+        ConfigError: the file is invalid, or others can read it.
+    """
+    path = home / CLUSTER_FILE
+    fields = _read(path)
+    return None if fields is None else ClusterSecret(_key_in(fields, "secret", path))
+
+
+def make_secret(home: Path) -> ClusterSecret:
+    """Return the cluster's secret, drawn now if this directory has none.
+
+    Two masters that start at once get the same one.
+
+    Raises:
+        ConfigError: the file is invalid, others can read it, or it cannot be written.
+    """
+    with _locked(home):
+        return read_secret(home) or _draw_secret(home)
+
+
+def _draw_secret(home: Path) -> ClusterSecret:
+    secret = ClusterSecret(os.urandom(KEY_BYTES))
+    _write_secret(home, secret)
+    return secret
+
+
+def _write_secret(home: Path, secret: ClusterSecret) -> None:
+    _write(home / CLUSTER_FILE, {"secret": _text_of(secret.secret)})
+
+
+def rotate(home: Path, directory: Path) -> list[Path]:
+    """Replace the cluster's secret, and write new key files of all principals.
+
+    Args:
+        home: directory of this user's keys.
+        directory: for the key files; created if it is missing.
+
+    Returns:
+        The key files. They are written first, so that no principal is without a key.
+
+    Raises:
+        ConfigError: a file is invalid, others can read it, or it cannot be written. Then the former
+            secret is still valid.
+    """
+    secret = ClusterSecret(os.urandom(KEY_BYTES))
+    written = []
+    with _locked(home):
+        for grant in read_grants(home):
+            path = directory / f"{grant.principal.kind}-{quote(grant.principal.name, safe='@')}.key"
+            write_key(path, secret.key_of(grant))
+            written.append(path)
+        _write_secret(home, secret)
+    return written
+
+
+# --- grants --------------------------------------------------------------------------------
+
+
+def read_grants(home: Path) -> list[Grant]:
+    """Return the grants, revoked ones left out; [] without a file.
+
+    Raises:
+        ConfigError: the file is invalid, or others can read it.
+    """
+    return [grant for grant, revoked in _all_grants(home) if not revoked]
+
+
+def add_grant(home: Path, principal: Principal, role: Role) -> Grant:
+    """Give a principal a role and a new key; an earlier key of it ends.
+
+    Raises:
+        ConfigError: the file is invalid, others can read it, or it cannot be written.
+    """
+    with _locked(home):
+        entries = _all_grants(home)
+        former = [old.generation for old, _ in entries if old.principal == principal]
+        grant = Grant(principal, role, max(former, default=0) + 1)
+        others = [(old, revoked) for old, revoked in entries if old.principal != principal]
+        _write_grants(home, [*others, (grant, False)])
+    return grant
+
+
+def revoke(home: Path, principals: Collection[Principal]) -> None:
+    """End the keys of principals, of all or of none.
+
+    Raises:
+        ConfigError: one of them has no key, the file is invalid, others can read it, or it cannot
+            be written.
+    """
+    with _locked(home):
+        entries = _all_grants(home)
+        held = {grant.principal for grant, revoked in entries if not revoked}
+        unknown = [str(one) for one in principals if one not in held]
+        if unknown:
+            raise ConfigError(
+                f"no key of {', '.join(unknown)}; `rosrm key list` shows all. Nothing was revoked"
+            )
+        _write_grants(
+            home, [(grant, gone or grant.principal in principals) for grant, gone in entries]
+        )
+
+
+def grants_version(home: Path) -> tuple[tuple[int, int], ...]:
+    """Return a value that changes whenever the grants or the cluster's secret change."""
+    return tuple(_version(home / name) for name in (GRANTS_FILE, CLUSTER_FILE))
+
+
+def _version(path: Path) -> tuple[int, int]:
+    try:
+        facts = path.stat()
+    except FileNotFoundError:
+        return (0, 0)
+    return (facts.st_mtime_ns, facts.st_ino)
+
+
+def _all_grants(home: Path) -> list[tuple[Grant, bool]]:
+    path = home / GRANTS_FILE
+    fields = _read(path) or {}
+    rows = fields.get("principals", [])
+    if not isinstance(rows, list):
+        raise ConfigError(f"{path}: principals: must be a list")
+    return [(_grant_in(row, path), row.get("revoked") is True) for row in rows]
+
+
+def _write_grants(home: Path, entries: list[tuple[Grant, bool]]) -> None:
+    rows = [_row_of(grant) | ({"revoked": True} if gone else {}) for grant, gone in entries]
+    _write(home / GRANTS_FILE, {"principals": rows})
+
+
+# --- a principal's file ----------------------------------------------------------------------
+
+
+def text_of(key: PrincipalKey) -> str:
+    """Return the content of a principal's key file."""
+    return _text(_fields_of(key))
+
+
+def _fields_of(key: PrincipalKey) -> dict[str, Any]:
+    return {**_row_of(key.grant), "key": _text_of(key.key), "master": _text_of(key.master)}
+
+
+def write_key(path: Path, key: PrincipalKey) -> None:
+    """Write a principal's key file; missing directories are created.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    try:
+        make_safe_directory(path.parent)
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+    _write(path, _fields_of(key))
+
+
+def read_key(path: Path) -> PrincipalKey:
+    """Return the key in a principal's file.
+
+    Raises:
+        ConfigError: the file is missing or invalid, or others can read it.
+    """
+    fields = _read(path)
+    if fields is None:
+        raise ConfigError(f"the key file {path} does not exist")
+    grant = _grant_in(fields, path)
+    return PrincipalKey(grant, _key_in(fields, "key", path), _key_in(fields, "master", path))
+
+
+def find_key(kind: str, name: str, home: Path, explicit: str = "") -> PrincipalKey | None:
+    """Return the key with which a process of this user speaks; None: there is none.
+
+    Args:
+        kind: "host" or "user".
+        name: of the host; for a user "" accepts the key of every user.
+        home: directory of this user's keys.
+        explicit: path of a key file; "": search `home`, then use the cluster's secret.
+
+    Raises:
+        ConfigError: a file is invalid, or there are keys of several users.
+    """
+    if explicit:
+        return read_key(Path(explicit))
+    found = {
+        path: key for path in key_paths(home)
+        if (key := read_key(path)).grant.principal.kind == kind
+        and name in ("", key.grant.principal.name)
+    }  # fmt: skip
+    if len(found) > 1:
+        names = ", ".join(f"{path.name} ({key.grant.principal})" for path, key in found.items())
+        raise ConfigError(
+            f"{home} has several keys for this: {names}; name the file of one in ROSRM_KEY"
+        )
+    if found:
+        return next(iter(found.values()))
+    secret = read_secret(home)
+    if secret is None:
+        return None
+    principal = principal_of(f"{kind}:{name or _user()}")
+    return secret.key_of(own_grant(principal))
+
+
+def _user() -> str:
+    try:
+        import pwd  # noqa: PLC0415 - only where a key is derived
+
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # a user id without an account, as in containers
+        return f"uid-{os.getuid()}"
+
+
+def key_paths(home: Path) -> list[Path]:
+    """Return the paths of the principals' key files in a directory."""
+    return [path for path in sorted(home.glob("*.key")) if path.name != CLUSTER_FILE]
+
+
+# --- fields ----------------------------------------------------------------------------------
+
+
+def _row_of(grant: Grant) -> dict[str, Any]:
+    return {
+        "principal": str(grant.principal),
+        "role": grant.role.value,
+        "generation": grant.generation,
+    }
+
+
+def _grant_in(fields: Any, path: Path) -> Grant:
+    try:
+        principal = principal_of(str(fields["principal"]))
+        role = Role(fields["role"])
+        generation = fields["generation"]
+    except (KeyError, TypeError, ValueError, ConfigError) as error:
+        raise ConfigError(f"{path}: invalid entry {fields!r}: {error}") from None
+    if (role is Role.HOST) is not (principal.kind == "host"):
+        raise ConfigError(f"{path}: {principal} cannot have the role {role.value}")
+    if not isinstance(generation, int) or not 1 <= generation < 1 << 32:
+        raise ConfigError(f"{path}: the generation of {principal} must be from 1 to {2**32 - 1}")
+    return Grant(principal, role, generation)
+
+
+def _key_in(fields: Mapping[str, Any], name: str, path: Path) -> bytes:
+    try:
+        key = base64.b64decode(str(fields[name]), validate=True)
+    except (KeyError, ValueError):
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise ConfigError(f"{path}: `{name}` must be {KEY_BYTES} bytes in base64")
+    return key
+
+
+def _text_of(key: bytes) -> str:
+    return base64.b64encode(key).decode()
+
+
+# --- reading and writing ---------------------------------------------------------------------
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """Return the fields of a file that only its owner can read; None: there is no file."""
+    try:
+        descriptor, mode = open_own(str(path), os.O_RDONLY | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(f"the key file {path} cannot be used: {error.strerror}") from None
+    with os.fdopen(descriptor, "rb") as file:
+        if mode & _OTHERS:
+            raise ConfigError(
+                f"the key file {path} has mode {mode:04o}, so that others can read or change it; "
+                f"run `chmod 600 {path}`. If others may have read it, replace the key: `rosrm key "
+                f"add` again at the master"
+            )
+        content = file.read(_LARGEST)
+    try:
+        fields = yaml.safe_load(content)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
+        fields = None
+    if not isinstance(fields, dict):
+        raise ConfigError(f"{path} is no key file of rosrm")
+    return fields
+
+
+def _text(fields: Mapping[str, Any]) -> str:
+    return _WARNING + yaml.safe_dump(dict(fields), sort_keys=False)
+
+
+def _write(path: Path, fields: Mapping[str, Any]) -> None:
+    """Write a file that only its owner can read, whole or not at all, and onto the disk."""
+    try:
+        os.close(atomic_file.replace(str(path), _text(fields).encode(), os.O_SYNC))
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+
+
+@contextlib.contextmanager
+def _locked(home: Path) -> Iterator[None]:
+    """Create the directory of keys if it is missing, and keep other processes from changing it.
+
+    Otherwise two commands at a time would lose one of two grants.
+    """
+    try:
+        make_private_directory(home)
+        lock = open_private(str(home / _LOCK_FILE), os.O_RDWR | os.O_CREAT)
+    except OSError as error:
+        raise ConfigError(
+            f"the directory of keys {home} cannot be used: {error.strerror}; another one can be "
+            f"named in ROSRM_KEYS"
+        ) from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)

@@ -1,0 +1,119 @@
+"""Sealing of messages: ChaCha20-Poly1305 (RFC 8439) under keys that are used for one thing each.
+
+A key belongs to one direction (a principal to the master, or back), one run of the sender and one
+channel (a topic, or the requests or answers of a service). So a message that is moved to another
+channel, receiver or run cannot be opened there, and the sender's counter alone is a nonce that
+never repeats. Messages of one sender on one channel arrive in order. So a counter that is not above
+the last one marks a repetition.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from nacl.bindings import (
+    crypto_aead_chacha20poly1305_ietf_decrypt,
+    crypto_aead_chacha20poly1305_ietf_encrypt,
+)
+from nacl.exceptions import CryptoError
+
+from rosrm.keys.derivation import derived
+
+#: Version of the sealing, in the clear in each message.
+FORMAT: Final = 1
+#: Bytes that sealing adds to a message: the tag of Poly1305.
+OVERHEAD: Final = 16
+#: Bytes that name a run of a sender: random, drawn at its start.
+RUN_BYTES: Final = 16
+#: The first counter is 1, and the last one is this: a sender then starts a new run.
+LAST_COUNTER: Final = 2**64 - 1
+
+
+class Direction(str, Enum):
+    """Between whom a key is used."""
+
+    TO_MASTER = "to the master"
+    FROM_MASTER = "from the master"
+    TO_PEER = "to a peer"
+    FROM_PEER = "from a peer"
+
+
+def channel_of(name: str, type_name: str) -> bytes:
+    """Return the channel of a topic or service: 16 bytes that its name and type determine.
+
+    Args:
+        name: fully qualified, for example "/rosrm/submit".
+        type_name: for example "rosrm_msgs/srv/Submit_Request"; requests and answers of a service
+            are two channels.
+    """
+    text = f"{name}\0{type_name}".encode()
+    return hashlib.blake2b(text, digest_size=16, person=b"rosrm channel").digest()
+
+
+def channel_key(principal_key: bytes, direction: Direction, run: bytes, channel: bytes) -> bytes:
+    """Return the key of one channel.
+
+    Args:
+        principal_key: of the principal that speaks with the master or with a peer.
+        direction: from which side the messages come.
+        run: of the sender, `RUN_BYTES`.
+        channel: see `channel_of`.
+    """
+    return derived(principal_key, direction.value, run, channel)
+
+
+def _nonce(counter: int) -> bytes:
+    return struct.pack("<IQ", 0, counter)
+
+
+@dataclass(slots=True)
+class Sealer:
+    """Seals the messages of one channel.
+
+    Attributes:
+        counter: of the last message.
+    """
+
+    _key: bytes
+    counter: int = 0
+
+    def seal(self, plaintext: bytes, context: bytes = b"") -> bytes:
+        """Return a message, `OVERHEAD` bytes longer; `counter` is the number to send beside it.
+
+        Args:
+            plaintext: the message.
+            context: bytes that the receiver has to know to open the message.
+        """
+        self.counter += 1
+        return crypto_aead_chacha20poly1305_ietf_encrypt(
+            plaintext, context, _nonce(self.counter), self._key
+        )
+
+
+@dataclass(slots=True)
+class Opener:
+    """Opens the messages of one channel, each once and in order.
+
+    Attributes:
+        newest: counter of the newest message that was opened.
+    """
+
+    _key: bytes
+    newest: int = 0
+
+    def open(self, counter: int, sealed: bytes, context: bytes = b"") -> bytes | None:
+        """Return the plaintext; None: the message is a repetition, or not the sender's."""
+        if not self.newest < counter <= LAST_COUNTER or len(sealed) < OVERHEAD:
+            return None
+        try:
+            plaintext: bytes = crypto_aead_chacha20poly1305_ietf_decrypt(
+                sealed, context, _nonce(counter), self._key
+            )
+        except CryptoError:
+            return None
+        self.newest = counter
+        return plaintext

@@ -1,0 +1,31 @@
+"""Network interfaces of this machine."""
+
+from __future__ import annotations
+
+import socket
+
+from rosrm.errors import ConfigError
+from rosrm.model.ros_settings import INTERFACE_VARIABLE
+
+
+def check_interface(interface: str) -> None:
+    """Check that this machine has a network interface, given by its name or IPv4 address.
+
+    Raises:
+        ConfigError: there is none, or the interface has no IPv4 address.
+    """
+    import psutil  # noqa: PLC0415 - only where an interface is chosen
+
+    addresses = {
+        name: [one.address for one in found if one.family == socket.AF_INET]
+        for name, found in psutil.net_if_addrs().items()
+    }
+    usable = {name: found for name, found in addresses.items() if found}
+    if interface in usable or any(interface in found for found in usable.values()):
+        return
+    fault = "has no IPv4 address" if interface in addresses else "does not exist on this machine"
+    shown = ", ".join(f"{name} ({', '.join(found)})" for name, found in sorted(usable.items()))
+    raise ConfigError(
+        f"the network interface {interface!r} (ros.interface or {INTERFACE_VARIABLE}) {fault}; "
+        f"available: {shown or 'none'}"
+    )

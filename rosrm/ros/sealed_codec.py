@@ -1,0 +1,71 @@
+"""CDR form of `rosrm_msgs/Sealed`, written and read without rclpy's message objects.
+
+rclpy copies the body of a message four times more. For a state of 64 MiB that takes 0.2 s, in which
+neither node of a handoff is active. In the test of this module each side reads the other's form.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final, NamedTuple
+
+#: Encapsulation: little-endian plain CDR, no options.
+_HEADER: Final = b"\x00\x01\x00\x00"
+#: Most letters of a principal: the name of a process has 200.
+_MOST_LETTERS: Final = 256
+#: Format and length of the principal, before its letters.
+_FIRST: Final = struct.Struct("<B3xI")
+#: Generation, run of the sender, run of the receiver.
+_MIDDLE: Final = struct.Struct("<I16s16s")
+#: Counter and length of the body.
+_LAST: Final = struct.Struct("<QI")
+
+
+class Envelope(NamedTuple):
+    """Fields of a message in `rosrm_msgs/Sealed`."""
+
+    format: int
+    principal: str
+    generation: int
+    run: bytes
+    receiver_run: bytes
+    counter: int
+    body: bytes | memoryview
+
+
+def encode(envelope: Envelope) -> bytes:
+    """Return a message as it is sent."""
+    principal = envelope.principal.encode() + b"\0"
+    first = _FIRST.pack(envelope.format, len(principal)) + principal
+    middle = _MIDDLE.pack(envelope.generation, envelope.run, envelope.receiver_run)
+    head = first + _padding(first, 4) + middle
+    last = _LAST.pack(envelope.counter, len(envelope.body))
+    return b"".join((_HEADER, head, _padding(head, 8), last, envelope.body))
+
+
+def _padding(before: bytes, alignment: int) -> bytes:
+    return bytes(-len(before) % alignment)
+
+
+def decode(data: bytes) -> Envelope | None:
+    """Return the fields of a message, without a copy of its body; None: it is malformed."""
+    if data[:2] != _HEADER[:2]:
+        return None
+    content = memoryview(data)[len(_HEADER) :]
+    try:
+        kind, letters = _FIRST.unpack_from(content)
+        if letters > _MOST_LETTERS:
+            return None
+        end = _FIRST.size + letters
+        principal = bytes(content[_FIRST.size : end]).rstrip(b"\0").decode()
+        end += -end % 4
+        generation, run, receiver_run = _MIDDLE.unpack_from(content, end)
+        end += _MIDDLE.size
+        end += -end % 8
+        counter, size = _LAST.unpack_from(content, end)
+    except (struct.error, UnicodeDecodeError):
+        return None
+    body = content[end + _LAST.size :][:size]
+    if len(body) != size:
+        return None
+    return Envelope(kind, principal, generation, run, receiver_run, counter, body)

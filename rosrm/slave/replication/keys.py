@@ -1,0 +1,118 @@
+"""Keys of processes that have snapshots on this host, each in a file beside these snapshots.
+
+An instance may run on over a restart of the slave. So the next run of the slave finds the key here,
+and never sends a snapshot without encryption. The file lies beside the state that its key protects,
+and is deleted with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from rosrm.keys.derivation import KEY_BYTES
+from rosrm.runtime.private_files import open_private
+from rosrm.snapshots.format import Damaged
+from rosrm.snapshots.reader import SLOTS
+
+#: Name of the file, in the directory of the process.
+KEY: Final = "key"
+#: Number of the instance whose assignment had the key, and the key.
+_RECORD: Final = struct.Struct(f"<Q{KEY_BYTES}s")
+
+
+class StateKeys:
+    """The keys of processes on this host.
+
+    Args:
+        directory_of: returns the directory of the snapshots of a process.
+    """
+
+    def __init__(self, directory_of: Callable[[str], Path]) -> None:
+        self._directory_of = directory_of
+        self._unsaved: dict[str, bytes] = {}
+
+    def put(self, process: str, number: int, key: bytes) -> None:
+        """Store the key of a process; b"": it has none.
+
+        Args:
+            process: its name.
+            number: of the instance whose assignment has the key.
+            key: replaces an earlier key.
+
+        Raises:
+            OSError: the file cannot be written; `of` tries again.
+        """
+        if key:
+            self._unsaved[process] = _RECORD.pack(number, key)
+            self._save(process)
+        else:
+            self._delete(process)
+
+    def of(self, process: str) -> bytes:
+        """Return the key of a process; b"": it has none.
+
+        Raises:
+            OSError: the file cannot be read, or an unsaved key cannot be written. Without the file
+                the next run of this slave would send the snapshots without encryption.
+            Damaged: the file holds no key.
+        """
+        if process in self._unsaved:
+            self._save(process)
+        record = self._record_of(process)
+        return b"" if record is None else record[1]
+
+    def drop(self, process: str, up_to: int) -> None:
+        """Delete the key of instances up to a number, unless the node has snapshots here."""
+        directory = self._directory_of(process)
+        if any((directory / name).exists() for name in SLOTS):
+            return
+        try:
+            record = self._record_of(process)
+        except Damaged:
+            record = (0, b"")
+        if record is not None and record[0] <= up_to:
+            self._delete(process)
+
+    def _record_of(self, process: str) -> tuple[int, bytes] | None:
+        path = self._directory_of(process) / KEY
+        try:
+            packed = self._unsaved.get(process) or _content_of(path)
+            number, key = _RECORD.unpack(packed)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except struct.error:
+            raise Damaged(f"{path} holds no key") from None
+        return number, key
+
+    def _save(self, process: str) -> None:
+        directory = self._directory_of(process)
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        draft = directory / f"{KEY}.new"
+        file = open_private(str(draft), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        try:
+            os.write(file, self._unsaved[process])
+        finally:
+            os.close(file)
+        draft.replace(directory / KEY)
+        del self._unsaved[process]
+
+    def _delete(self, process: str) -> None:
+        directory = self._directory_of(process)
+        self._unsaved.pop(process, None)
+        with contextlib.suppress(OSError):
+            for name in (KEY, f"{KEY}.new"):
+                (directory / name).unlink(missing_ok=True)
+            directory.rmdir()  # fails, as intended, if the directory holds snapshots
+
+
+def _content_of(path: Path) -> bytes:
+    file = open_private(str(path), os.O_RDONLY)
+    try:
+        return os.read(file, _RECORD.size + 1)
+    finally:
+        os.close(file)

@@ -1,0 +1,190 @@
+"""Sealed topics and services over real DDS, with a stranger on the same domain."""
+
+from __future__ import annotations
+
+import os
+from array import array
+
+import pytest
+
+from rosrm.keys.cluster import ClusterSecret, own_grant
+from rosrm.keys.roles import principal_of
+from rosrm.keys.sealing import FORMAT
+from rosrm.keys.security import MasterSecurity, MemberSecurity
+from rosrm.model.ros_settings import RosSettings
+from rosrm.ros import qos
+from rosrm.ros.control import accepted
+from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedEndpoints
+from rosrm.testing.local_cluster import claim_domain
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import msg, srv
+from tests.waiting import holds_for, wait_until
+
+SERVICE, TOPIC = "/rosrm/explain", "/rosrm/process_usage"
+SECRET = ClusterSecret(bytes(range(32)))
+ADA = SECRET.key_of(own_grant(principal_of("user:ada")))
+
+
+class Stage:
+    """A master, a member, and a stranger who sees and sends everything without a key."""
+
+    def __init__(self) -> None:
+        domain, self.claim = claim_domain()
+        names = ("rosrm_master", "rosrm_client", "stranger")
+        self.parts = [Participant(RosSettings(domain=domain), name) for name in names]
+        self.master, self.member, self.stranger = self.parts
+        self.refused: list[str] = []
+        self.ada = MemberSecurity(ADA)
+        self.cluster = MasterSecurity(SECRET)
+        self.server = SealedEndpoints(self.master, self.cluster, self.refused.append)
+        self.user = SealedEndpoints(self.member, self.ada, self.refused.append)
+        self.asked: list[tuple[str, str]] = []
+        self.raises = False
+
+    def serve(self, *, first_contact: bool = True) -> None:
+        def take(request, opened) -> None:
+            self.asked.append((opened.peer.principal, request.process))
+            if self.raises:
+                raise ValueError("broken handler")
+            opened.answer(srv.Explain.Response(answer=accepted(), explanation=request.process))
+
+        self.server.serve(srv.Explain, SERVICE, take, first_contact=first_contact)
+
+    def client(self):
+        client = self.user.client(srv.Explain, SERVICE, self.ada.master)
+        wait_until(client.service_is_ready, "the service to be discovered", pause=self.spin)
+        return client
+
+    def ask(self, client, process: str):
+        future = client.call_async(
+            srv.Explain.Request(protocol_version=PROTOCOL_VERSION, process=process)
+        )
+        wait_until(future.done, f"an answer about {process}", pause=self.spin)
+        return future.result()
+
+    def overhear(self) -> list[msg.Sealed]:
+        """Let the stranger offer the same service: DDS sends it every request, too."""
+        heard: list[msg.Sealed] = []
+
+        def take(request, opened) -> None:
+            heard.append(request.message)
+            for body in (b"", request.message.body, os.urandom(60)):
+                opened.answer(
+                    srv.Sealed.Response(message=self.forged(body, request.message.counter))
+                )
+
+        self.stranger.serve(srv.Sealed, SERVICE, take)
+        return heard
+
+    def forged(self, body: bytes, counter: int = 1) -> msg.Sealed:
+        return msg.Sealed(
+            format=FORMAT, principal="user:ada", generation=0,
+            run=array("B", self.cluster.run), receiver_run=array("B", self.cluster.run),
+            counter=counter, body=array("B", body),
+        )  # fmt: skip
+
+    def spin(self, seconds: float) -> None:
+        for part in self.parts:
+            part.spin(seconds / len(self.parts))
+
+    def close(self) -> None:
+        for part in self.parts:
+            part.close()
+        self.claim.close()
+
+
+@pytest.fixture
+def stage():
+    """Yield a stage in a domain of its own."""
+    stage = Stage()
+    yield stage
+    stage.close()
+
+
+def test_a_member_is_answered_and_a_second_server_is_not_believed(stage: Stage) -> None:
+    """The stranger answers first, and as often as it likes; it can read nothing."""
+    stage.serve()
+    client = stage.client()
+    heard = stage.overhear()
+    names = [f"p{number}" for number in range(20)]
+    while not heard:
+        names.append(f"p{len(names)}")
+        stage.ask(client, names[-1])
+    for name in names[:20]:
+        assert stage.ask(client, name).explanation == name
+    assert {principal for principal, _ in stage.asked} == {"user:ada"}
+    wait_until(lambda: len(heard) > 20, "the stranger to see the requests", pause=stage.spin)
+    assert not any(b"p1" in bytes(message.body) for message in heard)
+    assert SERVICE in stage.refused
+
+
+def test_a_stranger_is_not_answered(stage: Stage) -> None:
+    """Neither a forged request nor a recorded one nor one of an unknown principal."""
+    stage.serve()
+    client = stage.client()
+    heard = stage.overhear()
+    while not heard:
+        stage.ask(client, "p")
+    stage.asked.clear()
+    unknown = stage.forged(os.urandom(50))
+    unknown.principal = "host:\x1b[2J"
+    changed = stage.forged(bytes(heard[0].body), heard[0].counter + 1)
+    client = stage.stranger.node.create_client(srv.Sealed, SERVICE, qos_profile=qos.SERVICE)
+    graph = stage.stranger.node
+    wait_until(client.service_is_ready, "the stranger to find the service", pause=stage.spin)
+    wait_until(
+        lambda: "rosrm_master" in graph.get_node_names(), "the master to be found", pause=stage.spin
+    )
+    stage.refused.clear()
+    for message in (heard[0], stage.forged(b""), stage.forged(os.urandom(50)), unknown, changed):
+        client.call_async(srv.Sealed.Request(message=message))
+    wait_until(lambda: len(stage.refused) == 5, "five refusals", pause=stage.spin)
+    assert stage.asked == []
+
+
+def test_a_request_for_a_former_run_is_answered_as_stale(stage: Stage) -> None:
+    """The sender is genuine and has to shake hands again; nothing is done."""
+    stage.serve(first_contact=False)
+    client = stage.client()
+    client.receiver_run = bytes(16)
+    answer = stage.ask(client, "p").answer
+    assert (answer.accepted, answer.code) == (False, "stale")
+    client.receiver_run = stage.cluster.run
+    assert stage.ask(client, "p").explanation == "p"
+    assert stage.asked == [("user:ada", "p")]
+
+
+def test_a_handler_that_raises_answers_as_failed(stage: Stage) -> None:
+    """The member learns the kind of the error, and the service goes on."""
+    stage.serve()
+    stage.raises = True
+    client = stage.client()
+    answer = stage.ask(client, "p").answer
+    assert (answer.accepted, answer.code) == (False, "failed")
+    assert "ValueError" in answer.message
+    stage.raises = False
+    assert stage.ask(client, "q").answer.accepted
+
+
+def test_messages_of_a_topic_arrive_once_and_from_members_alone(stage: Stage) -> None:
+    """A stranger who repeats what it sees, and invents, is refused; a former run's is dropped."""
+    taken: list[tuple[int, str]] = []
+    stage.server.subscribe(
+        msg.ProcessUsage, TOPIC, qos.STATUSES,
+        lambda message, peer: taken.append((message.host_id, peer.principal)),
+    )  # fmt: skip
+    publisher = stage.user.publisher(msg.ProcessUsage, TOPIC, qos.STATUSES, stage.ada.master)
+    seen: list[msg.Sealed] = []
+    stage.stranger.node.create_subscription(msg.Sealed, TOPIC, seen.append, qos.STATUSES)
+    forger = stage.stranger.node.create_publisher(msg.Sealed, TOPIC, qos.STATUSES)
+    counts = [one.get_subscription_count for one in (publisher._publisher, forger)]
+    wait_until(lambda: all(count() == 2 for count in counts), "both readers", pause=stage.spin)
+    publisher.publish(msg.ProcessUsage(host_id=1))  # for a run that the member does not know yet
+    publisher.receiver_run = stage.cluster.run
+    publisher.publish(msg.ProcessUsage(host_id=2))
+    wait_until(lambda: len(seen) == 2 and taken, "the member's messages", pause=stage.spin)
+    for message in (*seen, stage.forged(b""), stage.forged(os.urandom(40))):
+        forger.publish(message)
+    wait_until(lambda: len(stage.refused) == 4, "the stranger's messages", pause=stage.spin)
+    holds_for(0.2, lambda: taken == [(2, "user:ada")], "one message", pause=stage.spin)

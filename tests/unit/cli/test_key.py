@@ -1,0 +1,357 @@
+"""Commands `rosrm key`: the cluster's secret, keys of hosts and users, and their check."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rosrm.keys import key_files
+from rosrm.keys.cluster import ClusterSecret
+
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs files of another user")
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """Use an empty directory of keys; the host's name is `desk`."""
+    for variable in ("ROSRM_KEY", "ROSRM_SECURITY"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("ROSRM_KEYS", str(tmp_path / "keys"))
+    monkeypatch.setattr("socket.gethostname", lambda: "desk")
+    return tmp_path / "keys"
+
+
+@pytest.fixture
+def secret(rosrm, home):
+    """Make the directory of keys that of a master."""
+    assert rosrm("key", "init").code == 0
+    return key_files.read_secret(home)
+
+
+def mode_of(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def listed(rosrm):
+    """Return the rows of `rosrm key list`: principal, role and number of the key."""
+    lines = [line.split() for line in rosrm("key", "list").out.splitlines()]
+    return [tuple(words) for words in lines if ":" in words[0]]
+
+
+# --- init, add, list --------------------------------------------------------------------------
+
+
+def test_the_secret_is_drawn_once(rosrm, home):
+    path = home / "cluster.key"
+    assert rosrm("key", "init").out == f"{path}: drawn\n"
+    before = path.read_bytes()
+    assert rosrm("key", "init").out == f"{path}: exists already\n"
+    assert path.read_bytes() == before
+    assert (mode_of(path), mode_of(home)) == (0o600, 0o700)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("add", "host:a"), ("list",), ("rotate", "--out", "new")],
+)  # fmt: skip
+def test_a_command_of_the_master_refuses_another_machine(rosrm, home, words):
+    result = rosrm("key", *words)
+    assert (result.code, result.out) == (2, "")
+    assert result.err == (
+        f"rosrm: there is no {home}/cluster.key: run this on the machine of the master, as its "
+        "user, or begin with `rosrm key init`\n"
+    )
+    assert not home.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "principal", "role"),
+    [
+        (("host:robot-1",), "host:robot-1", "host"),
+        (("user:ada",), "user:ada", "submitter"),
+        (("user:ada", "--role", "viewer"), "user:ada", "viewer"),
+        (("user:ada@desk", "--role", "operator"), "user:ada@desk", "operator"),
+    ],
+)
+def test_a_new_key_is_written_to_the_standard_output(
+    rosrm, secret, tmp_path, words, principal, role
+):
+    result = rosrm("key", "add", *words)
+    assert result.code == 0
+    assert result.err == (
+        f"rosrm: {principal} has a new key (role {role}). Copy the file to ~/.config/rosrm/ of its "
+        "user, with mode 0600\n"
+    )
+    path = tmp_path / "some.key"
+    path.touch(mode=0o600)
+    path.write_text(result.out)
+    key = key_files.read_key(path)
+    assert (str(key.grant.principal), key.grant.role.value) == (principal, role)
+    assert key == secret.key_of(key.grant)
+    assert listed(rosrm) == [(principal, role, "1")]
+
+
+def test_a_second_key_replaces_the_first(rosrm, secret):
+    rosrm("key", "add", "user:ada", "--role", "viewer")
+    rosrm("key", "add", "host:robot-1")
+    rosrm("key", "add", "user:ada", "--role", "operator")
+    assert sorted(listed(rosrm)) == [("host:robot-1", "host", "1"), ("user:ada", "operator", "2")]
+
+
+@pytest.mark.parametrize("name", ["robot-1", "host:", "host:a b", "group:x", "user:é", ":a", ""])
+@pytest.mark.parametrize("command", ["add", "revoke"])
+def test_a_wrong_name_is_refused(rosrm, secret, command, name):
+    result = rosrm("key", command, name)
+    assert (result.code, result.out) == (2, "")
+    assert result.err == (
+        f"rosrm: {name!r} names no principal; write host:NAME or user:NAME, with a name of 1 to "
+        "128 letters, digits and characters of _ . ~ / @ -\n"
+    )
+    assert listed(rosrm) == []
+
+
+@pytest.mark.parametrize(
+    ("principal", "role", "allowed"),
+    [
+        ("host:a", "operator", "host"), ("user:a", "host", "viewer, submitter, operator"),
+        ("user:a", "root", "viewer, submitter, operator"),
+        ("user:a", "Viewer", "viewer, submitter, operator"),
+    ],
+)  # fmt: skip
+def test_a_wrong_role_is_refused_with_the_allowed_ones(rosrm, secret, principal, role, allowed):
+    result = rosrm("key", "add", principal, "--role", role)
+    assert (result.code, result.out) == (2, "")
+    assert result.err == f"rosrm: {principal} cannot have the role {role!r}; allowed: {allowed}\n"
+    assert listed(rosrm) == []
+
+
+def test_the_file_behind_the_standard_output_becomes_private(home, secret, tmp_path):
+    """The shell makes the file, for everybody, before the command starts."""
+    path = tmp_path / "robot-1.key"
+    with path.open("wb") as output:
+        path.chmod(0o644)
+        subprocess.run(
+            [sys.executable, "-m", "rosrm.cli", "key", "add", "host:robot-1"],
+            stdout=output, stderr=subprocess.DEVNULL, check=True,
+        )  # fmt: skip
+    assert mode_of(path) == 0o600
+    assert str(key_files.read_key(path).grant.principal) == "host:robot-1"
+
+
+def test_an_output_file_is_private_from_its_beginning(rosrm, secret, tmp_path):
+    """Missing directories are made; an earlier file with another mode is replaced."""
+    path = tmp_path / "new" / "ada.key"
+    assert rosrm("key", "add", "user:ada", "--out", path).out == ""
+    path.chmod(0o644)
+    assert rosrm("key", "add", "user:ada", "--out", path).code == 0
+    assert mode_of(path) == 0o600
+    assert key_files.read_key(path).grant.generation == 2
+
+
+# --- revoke, rotate ---------------------------------------------------------------------------
+
+
+def test_revoked_keys_leave_the_list(rosrm, secret):
+    for name in ("host:a", "host:b", "user:c"):
+        rosrm("key", "add", name)
+    assert rosrm("key", "revoke", "host:a", "user:c").out == "revoked: host:a, user:c\n"
+    assert listed(rosrm) == [("host:b", "host", "1")]
+    rosrm("key", "add", "host:a")
+    assert ("host:a", "host", "2") in listed(rosrm)
+
+
+def test_an_unknown_name_revokes_nothing(rosrm, secret):
+    rosrm("key", "add", "host:a")
+    result = rosrm("key", "revoke", "host:a", "host:b")
+    assert (result.code, result.out) == (2, "")
+    assert result.err == (
+        "rosrm: no key of host:b; `rosrm key list` shows all. Nothing was revoked\n"
+    )
+    assert listed(rosrm) == [("host:a", "host", "1")]
+
+
+def test_a_rotation_writes_new_files_of_all_that_have_a_key(rosrm, home, secret, tmp_path):
+    for name in ("host:a", "user:ada@desk", "host:b/c", "host:gone"):
+        rosrm("key", "add", name)
+    rosrm("key", "revoke", "host:gone")
+    result = rosrm("key", "rotate", "--out", tmp_path / "new")
+    assert result.out == f"a new secret; 3 key files in {tmp_path}/new\n"
+    changed = key_files.read_secret(home)
+    assert changed != secret
+    files = sorted((tmp_path / "new").iterdir())
+    assert [path.name for path in files] == ["host-a.key", "host-b%2Fc.key", "user-ada@desk.key"]
+    for path in files:
+        key = key_files.read_key(path)
+        assert key == changed.key_of(key.grant)
+
+
+# --- files that are refused -------------------------------------------------------------------
+
+
+def spoil(path, fault):
+    """Give a key file a fault, and return the text of its refusal."""
+    if fault == "mode":
+        path.chmod(0o644)
+        return (
+            f"the key file {path} has mode 0644, so that others can read or change it; run `chmod "
+            f"600 {path}`. If others may have read it, replace the key: `rosrm key add` again at "
+            "the master"
+        )
+    if fault == "owner":
+        os.chown(path, 12345, -1)
+        return (
+            f"the key file {path} cannot be used: it belongs to user 12345, and this is user "
+            f"{os.geteuid()}"
+        )
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to(path.with_name("elsewhere"))
+    return f"the key file {path} cannot be used: it is a symbolic link"
+
+
+FAULTS = ["mode", "link", pytest.param("owner", marks=as_root)]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", ["cluster.key", "principals.yaml"])
+def test_files_of_the_master_that_are_not_private_are_refused(rosrm, home, secret, name, fault):
+    rosrm("key", "add", "host:a")
+    before = (home / "principals.yaml").read_bytes()
+    text = spoil(home / name, fault)
+    for words in (("add", "host:b"), ("list",), ("rotate", "--out", home / "new")):
+        result = rosrm("key", *words)
+        assert (result.code, result.out, result.err) == (2, "", f"rosrm: {text}\n")
+    assert (home / "principals.yaml").read_bytes() == before
+    check = rosrm("key", "check")
+    assert check.code == 1
+    assert f"problem        {text}\n" in check.out
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_key_file_that_is_not_private_is_refused(rosrm, home, secret, fault):
+    path = home / "ada.key"
+    rosrm("key", "add", "user:ada", "--out", path)
+    text = spoil(path, fault)
+    result = rosrm("key", "check", path)
+    assert (result.code, result.out, result.err) == (2, "", f"rosrm: {text}\n")
+    result = rosrm("key", "check")
+    assert result.code == 1
+    assert result.out.count(text) == 1
+
+
+# --- check ------------------------------------------------------------------------------------
+
+
+def facts(result):
+    """Return the rows of `rosrm key check` by their labels."""
+    found: dict[str, list[str]] = {}
+    for line in result.out.splitlines():
+        found.setdefault(line[:15].strip(), []).append(line[15:])
+    return found
+
+
+def test_the_user_of_the_master_has_all_rights_without_a_key_file(rosrm, home, secret):
+    result = rosrm("key", "check")
+    shown = facts(result)
+    assert result.code == 0
+    (commands,) = shown["commands"]
+    assert commands.startswith("user:")
+    assert commands.endswith(", role operator, from cluster.key")
+    assert shown["slave"] == ["host:desk, role host, from cluster.key"]
+    assert shown["cluster.key"] == ["here: all rights in the cluster"]
+    assert shown["not protected"] == [
+        "topics and services of the applications",
+        "names, sizes and times of rosrm's messages",
+        "delivery: floods and forged packets of DDS can delay messages",
+    ]
+    assert "problem" not in shown
+
+
+def test_a_user_without_a_key_is_told_where_to_get_one(rosrm, home):
+    result = rosrm("key", "check")
+    shown = facts(result)
+    assert result.code == 1
+    assert (shown["commands"], shown["slave"]) == (["no key"], ["no key"])
+    assert shown["cluster.key"] == ["not here: no rights but those of its keys"]
+    (problem,) = shown["problem"]
+    assert problem.startswith(f"this user has no key. Copy a key file of `rosrm key add` to {home}")
+
+
+@pytest.fixture
+def robot(home):
+    """Make the directory of keys that of a robot, with the keys of its host and a viewer."""
+    secret = ClusterSecret(bytes(32))
+    for name, row in (("robot-1", "host"), ("ada", "viewer")):
+        kind = "host" if row == "host" else "user"
+        grant = key_files._grant_in(
+            {"principal": f"{kind}:{name}", "role": row, "generation": 2}, Path("test")
+        )
+        key_files.write_key(home / f"{name}.key", secret.key_of(grant))
+    return home
+
+
+def test_a_robot_uses_its_key_files(rosrm, robot):
+    result = rosrm("key", "check", "--host", "robot-1")
+    shown = facts(result)
+    assert result.code == 0
+    assert shown["commands"] == ["user:ada, role viewer, key 2"]
+    assert shown["slave"] == ["host:robot-1, role host, key 2"]
+    assert shown["files"] == ["2 key files, 2 of them readable by this user alone"]
+    assert facts(rosrm("key", "check"))["slave"] == ["no key"]  # its name is not `desk`
+
+
+def test_the_variable_chooses_a_key(rosrm, robot, monkeypatch):
+    monkeypatch.setenv("ROSRM_KEY", str(robot / "ada.key"))
+    shown = facts(rosrm("key", "check", "--host", "robot-1"))
+    assert shown["commands"] == ["user:ada, role viewer, key 2"]
+    assert shown["slave"] == ["no key: ROSRM_KEY names that of user:ada"]
+    monkeypatch.setenv("ROSRM_KEY", str(robot / "none.key"))
+    result = rosrm("key", "check")
+    assert result.code == 1
+    assert facts(result)["problem"] == [f"the key file {robot}/none.key does not exist"]
+
+
+def test_security_that_is_switched_off_is_shown(rosrm, secret, monkeypatch):
+    monkeypatch.setenv("ROSRM_SECURITY", "none")
+    shown = facts(rosrm("key", "check"))
+    assert shown["security"] == ["none, by ROSRM_SECURITY: keys are not used"]
+
+
+def test_a_directory_that_others_can_write_is_a_problem(rosrm, home, secret):
+    home.chmod(0o777)
+    result = rosrm("key", "check")
+    assert result.code == 1
+    assert facts(result)["problem"] == [
+        f"other users can replace files in {home}; run `chmod 700 {home}`"
+    ]
+
+
+def test_one_file_is_described_and_compared_with_the_grants(rosrm, home, secret, tmp_path):
+    path = tmp_path / "robot-1.key"
+    rosrm("key", "add", "host:robot-1", "--out", path)
+    described = "robot-1.key    host:robot-1, role host, key 1; only this user can read the file\n"
+    result = rosrm("key", "check", path)
+    assert (result.code, result.out) == (
+        0, f"{described}valid          yes, in this user's cluster\n"
+    )  # fmt: skip
+    rosrm("key", "revoke", "host:robot-1")
+    result = rosrm("key", "check", path)
+    assert result.code == 1
+    assert result.out == (
+        f"{described}valid          no\n"
+        "problem        the key of host:robot-1 is not valid in the cluster of this "
+        "machine: it was revoked or replaced, or is of another cluster\n"
+    )
+
+
+def test_one_file_is_described_on_a_machine_without_the_grants(rosrm, robot):
+    result = rosrm("key", "check", robot / "robot-1.key")
+    assert result.code == 0
+    assert result.out == (
+        "robot-1.key    host:robot-1, role host, key 2; only this user can read the file\n"
+        "valid          unknown: only the machine of the master can check this\n"
+    )

@@ -1,0 +1,196 @@
+"""Files of keys: who may read them, and what is in them."""
+
+from __future__ import annotations
+
+import os
+import stat
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from rosrm.errors import ConfigError
+from rosrm.keys import key_files
+from rosrm.keys.cluster import OWN, Principals
+from rosrm.keys.roles import Principal, Role, principal_of
+
+ROBOT, ADA = Principal("host", "robot-1"), Principal("user", "ada")
+
+
+def test_the_secret_is_drawn_once_and_is_its_owners_alone(tmp_path: Path) -> None:
+    """Many processes that start at once share one secret, in a file of mode 0600."""
+    home = tmp_path / "keys"
+    with ThreadPoolExecutor(8) as pool:
+        secrets = set(pool.map(lambda _: key_files.make_secret(home).secret, range(32)))
+    assert len(secrets) == 1
+    assert {path.name for path in home.iterdir()} == {key_files.CLUSTER_FILE, "keys.lock"}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in home.iterdir()} == {0o600}
+    assert stat.S_IMODE(home.stat().st_mode) == 0o700
+
+
+def test_grants_of_commands_at_the_same_time_are_all_kept(tmp_path: Path) -> None:
+    """Each command reads and writes the whole file, one after the other."""
+    names = [Principal("host", f"robot-{number}") for number in range(16)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda one: key_files.add_grant(tmp_path, one, Role.HOST), names))
+    assert {grant.principal for grant in key_files.read_grants(tmp_path)} == set(names)
+
+
+def test_each_change_of_grants_or_secret_changes_their_version(tmp_path: Path) -> None:
+    """A running master looks at the version, and reads the files again after a change."""
+    changes = [
+        lambda: key_files.make_secret(tmp_path),
+        lambda: key_files.add_grant(tmp_path, ROBOT, Role.HOST),
+        lambda: key_files.rotate(tmp_path, tmp_path / "new"),
+        lambda: key_files.revoke(tmp_path, [ROBOT]),
+    ]
+    seen = {key_files.grants_version(tmp_path)}
+    for change in changes:
+        change()
+        seen.add(key_files.grants_version(tmp_path))
+    assert len(seen) == 1 + len(changes)
+
+
+def test_a_full_disk_keeps_the_former_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rotation that fails does not end the keys that are in use."""
+    secret = key_files.make_secret(tmp_path)
+    key_files.add_grant(tmp_path, ROBOT, Role.HOST)
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        with pytest.raises(ConfigError, match=r"robot-1\.key cannot be written: No space left"):
+            key_files.rotate(tmp_path, tmp_path / "new")
+    assert key_files.read_secret(tmp_path) == secret
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+@pytest.mark.parametrize("fault", ["a file", "a link"])
+def test_a_directory_of_keys_that_cannot_be_used_is_refused(tmp_path: Path, fault: str) -> None:
+    """The message names the variable by which another one is chosen."""
+    home = tmp_path / "keys"
+    if fault == "a file":
+        home.touch()
+    else:
+        home.symlink_to(tmp_path)
+    with pytest.raises(ConfigError, match=r"keys cannot be used: .*ROSRM_KEYS"):
+        key_files.make_secret(home)
+
+
+def test_a_key_file_opens_what_its_grant_allows_until_it_is_revoked(tmp_path: Path) -> None:
+    """A new key ends the former one, and a revoked one has no successor of its number."""
+    secret = key_files.make_secret(tmp_path)
+    first = key_files.add_grant(tmp_path, ROBOT, Role.HOST)
+    path = tmp_path / "robot-1.key"
+    key_files.write_key(path, secret.key_of(first))
+    held = key_files.read_key(path)
+    known = Principals(secret, key_files.read_grants(tmp_path)).key_of(ROBOT, held.grant.generation)
+    assert known == held
+    before = key_files.grants_version(tmp_path)
+    second = key_files.add_grant(tmp_path, ROBOT, Role.HOST)
+    assert key_files.grants_version(tmp_path) != before
+    valid = Principals(secret, key_files.read_grants(tmp_path))
+    assert valid.key_of(ROBOT, first.generation) is None
+    assert valid.key_of(ROBOT, second.generation) is not None
+    key_files.revoke(tmp_path, [ROBOT])
+    with pytest.raises(ConfigError, match="no key of host:robot-1"):
+        key_files.revoke(tmp_path, [ROBOT])
+    assert key_files.read_grants(tmp_path) == []
+    assert key_files.add_grant(tmp_path, ROBOT, Role.HOST).generation == second.generation + 1
+
+
+def test_a_process_finds_its_own_key(tmp_path: Path) -> None:
+    """The file of its principal, of any name; else a key of the cluster's secret; else none."""
+    assert key_files.find_key("host", "robot-1", tmp_path) is None
+    secret = key_files.make_secret(tmp_path)
+    own = key_files.find_key("host", "robot-1", tmp_path)
+    assert own is not None
+    assert (own.grant.principal, own.grant.generation) == (ROBOT, OWN)
+    assert Principals(secret).key_of(ROBOT, OWN) == own
+    key = secret.key_of(key_files.add_grant(tmp_path, ROBOT, Role.HOST))
+    path = tmp_path / "any name.key"
+    key_files.write_key(path, key)
+    assert key_files.find_key("host", "robot-1", tmp_path) == key
+    assert key_files.find_key("user", "", tmp_path, explicit=str(path)) == key
+    me = key_files.find_key("user", "", tmp_path)
+    assert me is not None
+    assert me.grant.role is Role.OPERATOR
+
+
+def test_keys_of_two_users_are_not_guessed_at(tmp_path: Path) -> None:
+    """The message names both files and the variable that chooses."""
+    secret = key_files.make_secret(tmp_path)
+    for name in ("ada", "bob"):
+        grant = key_files.add_grant(tmp_path, principal_of(f"user:{name}"), Role.VIEWER)
+        key_files.write_key(tmp_path / f"{name}.key", secret.key_of(grant))
+    named = r"ada\.key \(user:ada\), bob\.key \(user:bob\); .*ROSRM_KEY"
+    with pytest.raises(ConfigError, match=named):
+        key_files.find_key("user", "", tmp_path)
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o644, 0o660])
+def test_a_file_that_others_can_open_is_refused(tmp_path: Path, mode: int) -> None:
+    """As by ssh; the message says how to mend it."""
+    key_files.make_secret(tmp_path)
+    path = tmp_path / key_files.CLUSTER_FILE
+    path.chmod(mode)
+    with pytest.raises(ConfigError, match=rf"mode {mode:04o}.*chmod 600"):
+        key_files.read_secret(tmp_path)
+
+
+def test_a_link_a_pipe_and_a_file_of_another_user_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None is followed or waited for."""
+    key_files.make_secret(tmp_path)
+    path = tmp_path / key_files.CLUSTER_FILE
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "geteuid", lambda: path.stat().st_uid + 1)
+        with pytest.raises(ConfigError, match="belongs to user"):
+            key_files.read_secret(tmp_path)
+    moved = path.rename(tmp_path / "moved")
+    path.symlink_to(moved)
+    with pytest.raises(ConfigError, match="symbolic link"):
+        key_files.read_secret(tmp_path)
+    path.unlink()
+    os.mkfifo(path, 0o600)
+    with pytest.raises(ConfigError, match="no regular file"):
+        key_files.read_secret(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "- 1", "{", "\x00", "[" * 5000, "secret: 1", "secret: AAAA", "secret: é",
+        "other: " + "A" * 44,
+    ],
+)  # fmt: skip
+def test_an_invalid_secret_is_refused(tmp_path: Path, content: str) -> None:
+    """Never a traceback."""
+    path = tmp_path / key_files.CLUSTER_FILE
+    path.touch(mode=0o600)
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=r"cluster\.key"):
+        key_files.read_secret(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "1", "{}", "{principal: host:a, role: operator, generation: 1}",
+        "{principal: user:a, role: host, generation: 1}",
+        "{principal: user:a, role: root, generation: 1}",
+        "{principal: user:a, role: viewer, generation: 0}",
+        "{principal: user:a, role: viewer, generation: x}",
+        "{principal: user:a, role: [viewer], generation: 1}",
+    ],
+)  # fmt: skip
+def test_an_invalid_grant_is_refused(tmp_path: Path, row: str) -> None:
+    """A key of generation 0 cannot be granted, and a host has no role of users."""
+    path = tmp_path / key_files.GRANTS_FILE
+    path.touch(mode=0o600)
+    path.write_text(f"principals: [{row}]")
+    with pytest.raises(ConfigError, match=r"principals\.yaml"):
+        key_files.read_grants(tmp_path)
