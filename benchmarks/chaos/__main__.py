@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> 
                     options.lab, folder, lambda text: event_log.add(text, aloud=True)
                 ) as cluster,
                 ClientLoad(cluster.lab, folder / "desk.log", event_log.add) as client_load,
-                StallWatch(cluster.slaves(), LEASE_S) as stall_watch,
+                StallWatch(cluster.pids(), LEASE_S) as stall_watch,
             ):
                 trial = Trial(
                     cluster, client_load, lines, out, event_log, tally,

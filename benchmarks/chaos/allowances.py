@@ -23,7 +23,7 @@ _LAST_SECOND: Final = 12
 #: Seconds of silence after which a host that is cut off may have stopped isolated processes:
 #: 1.425 s by its fence (lease 3 s, suspect 1 s), less a beat (0.2 s) before and one after, and less
 #: the same once more because a busy machine processes messages late.
-_FENCED: Final = 0.8
+FENCED: Final = 0.8
 #: Seconds of silence after which a host may be lost: the lease, less a second for the next contact.
 _LOST: Final = 2.0
 #: Seconds from the last "active" of a process that is being ended until it has ended.
@@ -71,6 +71,7 @@ class Disturbance:
         kind: of the fault; or "move", "overlap" (a migration during which both may be active).
         hosts: that were concerned; "*": all of them.
         process: that was struck or moved; "": no single one.
+        instance: that a fence ended: only its end is explained; "": no single one.
         begun, ended: monotonic time.
         kills: the processes on the hosts end.
         hides: the hosts and the master have no contact.
@@ -85,6 +86,7 @@ class Disturbance:
     ended: float
     hosts: frozenset[str] = frozenset()
     process: str = ""
+    instance: str = ""
     kills: bool = False
     hides: bool = False
     restarts: bool = False
@@ -122,7 +124,7 @@ def _is_parted(guarantees: Guarantees, run: Run, disturbances: Sequence[Disturba
     hidden = _silence([disturbance for disturbance in here if disturbance.hides], until)
     deaf = _silence([disturbance for disturbance in here if disturbance.deafens], until)
     # In a cut, a host stops a process that is not isolated only if it cannot reach its slave.
-    return deaf >= _FENCED or hidden >= (_FENCED if guarantees.isolated else _LOST)
+    return deaf >= FENCED or hidden >= (FENCED if guarantees.isolated else _LOST)
 
 
 def _silence(disturbances: Iterable[Disturbance], until: float) -> float:
@@ -211,7 +213,7 @@ def _is_blow(disturbance: Disturbance, name: str) -> bool:
         return disturbance.process == name and disturbance.kind not in MOVES
     silences = (disturbance.hides or disturbance.deafens) and _silence(
         [disturbance], math.inf
-    ) >= _FENCED
+    ) >= FENCED
     return disturbance.kills or disturbance.fills or silences
 
 

@@ -22,6 +22,7 @@ import psutil
 from benchmarks.chaos import clocks
 from benchmarks.chaos.faults import MASTER
 from benchmarks.chaos.work import LINE_HOST, ROOT
+from rosrm.errors import LabError
 from rosrm_lab import GIB, MIB, HostPlan, Lab, uniform
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ assert LINE_HOST in HOSTS
 
 #: Seconds of silence after which a host is lost. Some faults last less than that, some longer.
 LEASE_S: Final = 3.0
+#: Instance record of a host's supervisor, on the host's disk.
+INSTANCE_RECORD: Final = "slave/supervisor/instances.jsonl"
 _ROSRM: Final = (sys.executable, "-m", "rosrm.cli")
 _MEMORY: Final = 2 * GIB
 _DISK: Final = 96 * MIB
@@ -148,9 +151,15 @@ class Cluster:
             elif now >= part.ended + _AGAIN:
                 self.start(name)
 
-    def slaves(self) -> dict[str, Callable[[], int]]:
-        """Return by host the function that returns the pid of its slave on this machine, or 0."""
-        return {host: partial(getattr, self.parts[host], "pid") for host in HOSTS}
+    def pids(self) -> dict[str, Callable[[], int]]:
+        """Return by part the function that returns its pid on this machine, or 0."""
+        return {name: partial(getattr, part, "pid") for name, part in self.parts.items()}
+
+    def instance_record(self, host: str) -> str:
+        """Return the instance record of a host's supervisor; "": it is out of reach."""
+        with contextlib.suppress(LabError, OSError):
+            return self.lab.outside(host, INSTANCE_RECORD).read_text()
+        return ""
 
     def supervisor(self, host: str) -> int:
         """Return the pid of a host's supervisor on this machine; 0: there is none."""

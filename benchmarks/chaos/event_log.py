@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.chaos.cluster import DESK, HOSTS, Cluster
+from benchmarks.chaos.cluster import DESK, HOSTS, INSTANCE_RECORD, Cluster
 from benchmarks.machine import say
 
 #: Number of lines that the log keeps.
@@ -18,7 +18,7 @@ _LENGTH: Final = 400
 #: Files of each host that help to find the cause.
 _KEPT: Final = {
     DESK: ("master/journal.sqlite", "master/journal.sqlite-wal"),
-    **dict.fromkeys(HOSTS, ("slave/supervisor/instances.jsonl", "slave/supervisor/supervisor.log")),
+    **dict.fromkeys(HOSTS, (INSTANCE_RECORD, "slave/supervisor/supervisor.log")),
 }
 
 

@@ -86,14 +86,19 @@ def judge_service(
         ]
     )
     for index, (one, following) in enumerate(itertools.pairwise(chained)):
+        relevant = [
+            disturbance
+            for disturbance in disturbances
+            if disturbance.instance in ("", one.instance)
+        ]
         for other in chained[index + 1 :]:
             if _overlap(one, other) > _CROSSING:
                 judged.add(_judge_overlap(name, guarantees, one, other, disturbances, reached))
-        if not may_end(name, guarantees, one, disturbances):
+        if not may_end(name, guarantees, one, relevant):
             text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
             judged.violations.append(Violation("touched", name, text))
         if guarantees.stateful:
-            judged.add(_judge_state(name, guarantees, one, following, disturbances))
+            judged.add(_judge_state(name, guarantees, one, following, relevant))
     return judged
 
 
@@ -116,6 +121,7 @@ def _judge_overlap(
         disturbance
         for disturbance in disturbances
         if disturbance.hides
+        and not disturbance.instance
         and (disturbance.concerns(one.host) or disturbance.concerns(other.host))
     ]
     # A fault explains it, or else an overload, which may last to the end.

@@ -14,13 +14,13 @@ from typing import Any, Final
 from benchmarks.chaos import work
 from benchmarks.chaos.allowances import MOVES, Disturbance, Guarantees
 from benchmarks.chaos.client_load import ClientLoad, ClientRequest
-from benchmarks.chaos.cluster import HOSTS, Cluster
+from benchmarks.chaos.cluster import HOSTS, LEASE_S, Cluster
 from benchmarks.chaos.event_log import EventLog
 from benchmarks.chaos.fault_injector import FaultInjector
 from benchmarks.chaos.faults import Fault, Move, Round
 from benchmarks.chaos.oracle import AcceptedRequests, Deviation, Oracle
 from benchmarks.chaos.rules import Violation
-from benchmarks.chaos.stalls import StallWatch, confirmed
+from benchmarks.chaos.stalls import StallWatch, before_fences, confirmed, read_fences
 from benchmarks.machine import say
 
 #: Seconds after the last fault was undone within which all must be well.
@@ -57,7 +57,8 @@ class Tally:
         whole: the same, from the first fault on.
         loads: load average of the machine at the end of each round.
         counts: live processes at each look, from the first round on.
-        overloaded: rounds in which a slave got no processor for its lease, and its host was silent.
+        overloaded: rounds with a stall in which the master recorded the host as silent, or the host
+            recorded a fence.
     """
 
     by_kind: Counter[str] = field(default_factory=Counter)
@@ -86,7 +87,7 @@ class Trial:
         lines: folder for the lines of the workload, empty.
         out: folder for violations.
         tally: counted in.
-        stall_watch: of the slaves of the cluster.
+        stall_watch: of the master and the slaves of the cluster.
     """
 
     def __init__(
@@ -170,20 +171,31 @@ class Trial:
             say(f"{self._tally.faults} faults; {', '.join(kinds)}: recovered after {took:.1f} s")
 
     def _note_stalls(self) -> None:
-        """Record the load, and as disturbances the stalls that made a host silent."""
+        """Record the load, and as disturbances the stalls that silenced a host, by a record too."""
         self._tally.loads.append(os.getloadavg()[0])
         measured = self._stall_watch.take()
         if not measured:
             return
         since_boot = time.time() - time.monotonic()
         silent = self._ask_master().get("silent", [])
-        stalls = confirmed(measured, [(wall_time - since_boot, host) for wall_time, host in silent])
-        self._tally.overloaded += bool(stalls)
-        self._disturbances += stalls
+        moments = [(wall_time - since_boot, host) for wall_time, host in silent]
+        stalls = confirmed(measured, moments, LEASE_S)
+        fences = [
+            fence
+            for host in HOSTS
+            for fence in read_fences(host, self._cluster.instance_record(host))
+        ]
+        fenced = before_fences(measured, fences)
+        self._tally.overloaded += bool(stalls or fenced)
+        self._disturbances += stalls + fenced
         for stall in measured:
-            seconds, host = stall.ended - stall.begun, ", ".join(stall.hosts)
-            remark = "" if stall in stalls else ", but its host was not silent"
-            self._event_log.add(f"the slave of {host} waited {seconds:.1f} s for a core{remark}")
+            part = "the master" if "*" in stall.hosts else f"the slave of {', '.join(stall.hosts)}"
+            remark = "; the master recorded it as silent" if stall in stalls else ""
+            seconds = stall.ended - stall.begun
+            self._event_log.add(f"{part} waited {seconds:.1f} s for a core{remark}")
+        for stall in fenced:
+            seconds = stall.ended - stall.begun
+            self._event_log.add(f"{stall.instance} was fenced: {seconds:.1f} s without a core")
 
     def _do(self, drawn: Round, begun: float) -> list[Fault]:
         """Do everything of a round at its time; return the faults that were done."""

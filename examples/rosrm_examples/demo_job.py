@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm import Kind, MigrationPolicy, ProcessSpec
+from rosrm import Kind, MigrationPolicy, ProcessSpec, StopPolicy
 from rosrm.config.settings import (
     ClusterConfig,
     HostConfig,
@@ -22,6 +22,9 @@ from rosrm.config.settings import (
 
 HOSTS: Final = ("host1", "host2", "host3")
 MEMORY_LIMIT: Final = 0.8
+#: Stop of a ROS node. On a busy machine its end may take more than the usual 10 s, and a node that
+#: is killed leaves its shared memory. `LocalCluster` waits 30 s for a slave and its processes.
+NODE_STOP: Final = StopPolicy(interrupt_grace=15.0, terminate_grace=5.0)
 #: Bytes of memory in the budget of each host, where the machine has as much.
 BUDGET: Final = 768 * 2**20
 #: Bytes; with less than this a host has no room for the demo.
@@ -168,6 +171,7 @@ def _piece(scenario: Scenario, number: int, out: Path, working_directory: Path) 
         ros=True,
         kind=Kind.JOB,
         needs={"memory": _PIECE_MB * 1e6},
+        stop=NODE_STOP,
     )  # fmt: skip
 
 

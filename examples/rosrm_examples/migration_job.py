@@ -15,7 +15,7 @@ import numpy as np
 
 from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessRow, ProcessSpec
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
-from rosrm_examples.demo_job import MEMORY_LIMIT
+from rosrm_examples.demo_job import MEMORY_LIMIT, NODE_STOP
 from rosrm_examples.demo_record import ENDED
 from rosrm_examples.drives import Drive
 from rosrm_examples.observer import Observer
@@ -118,6 +118,7 @@ def slam_spec(live: LiveDrive) -> ProcessSpec:
         needs={"memory": _SLAM_MB * 1e6},
         preferred_labels=_FAST_DISK,
         migration=MigrationPolicy(strategy="handoff"),
+        stop=NODE_STOP,
     )
 
 
@@ -135,6 +136,7 @@ def player_spec(live: LiveDrive) -> ProcessSpec:
         kind=Kind.JOB,
         needs={"memory": _PLAYER_MB * 1e6},
         required_labels=_SCANNER,
+        stop=NODE_STOP,
     )  # fmt: skip
 
 

@@ -85,7 +85,18 @@ class Run:
     def check_clean(self) -> None:
         """Check that no process and no shared memory is left."""
         assert self.processes() == []
-        assert [path for path in sorted(self.shared) if self.left(Path(path))] == []
+        left = [path for path in sorted(self.shared) if self.left(Path(path))]
+        assert not left, f"left in shared memory: {left}; {self.killed()}"
+
+    def killed(self) -> str:
+        """Return a text with the instances that were killed, which leave their shared memory."""
+        found = {}
+        for record in self.out.glob("cluster/hosts/*/supervisor/instances.jsonl"):
+            for line in record.read_text().splitlines():
+                state = json.loads(line)
+                if "SIGKILL" in state.get("message", ""):
+                    found["{}#{}".format(*state["key"])] = state["message"]
+        return f"killed: {found}"
 
     def left(self, path: Path) -> bool:
         """Return True if a file belongs to this run only and is newer than the demo.

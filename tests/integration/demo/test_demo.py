@@ -62,7 +62,7 @@ def test_ctrl_c_ends_everything_with_one_line(start: Start) -> None:
     run.wait_for("holder")  # the pieces run
     run.look()
     run.demo.send_signal(signal.SIGINT)
-    status, _, errors = run.end(seconds=30.0)
+    status, _, errors = run.end(seconds=60.0)
     assert status == 130
     assert errors == "demo: stopped by SIGINT\n"
     run.check_clean()
@@ -73,7 +73,7 @@ def test_ctrl_c_while_the_cluster_comes_up(start: Start) -> None:
     run = start("--drive", "street:40", "--pieces", "4")
     run.wait_for("rosrm demo")
     run.demo.send_signal(signal.SIGINT)
-    status, _, errors = run.end(seconds=30.0)
+    status, _, errors = run.end(seconds=60.0)
     assert (status, errors) == (130, "demo: stopped by SIGINT\n")
     run.check_clean()
 

@@ -56,7 +56,7 @@ def test_ctrl_c_ends_the_migration_demo(start: Start) -> None:
     run.wait_for("scans mapped, on host1")
     run.look()
     run.demo.send_signal(signal.SIGINT)
-    status, _, errors = run.end(seconds=30.0)
+    status, _, errors = run.end(seconds=60.0)
     assert (status, errors) == (130, "demo_migration: stopped by SIGINT\n")
     run.check_clean()
     assert not (run.out / "summary.json").exists()

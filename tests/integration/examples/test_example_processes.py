@@ -31,7 +31,7 @@ def domain() -> Iterator[int]:
 
 @pytest.fixture
 def start(domain: int) -> Iterator[Start]:
-    """Yield a function that starts example modules; kill the remaining ones at the end."""
+    """Yield a function that starts example modules; end the remaining ones afterwards."""
     started: list[subprocess.Popen[str]] = []
     environment = {
         **os.environ,
@@ -52,8 +52,13 @@ def start(domain: int) -> Iterator[Start]:
 
     yield start_module
     for process in started:
-        process.kill()
-        process.communicate()
+        process.send_signal(signal.SIGINT)  # a node that is killed leaves its shared memory
+    for process in started:
+        try:
+            process.communicate(timeout=20.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
 
 
 class Listener:
