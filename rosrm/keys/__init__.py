@@ -1,7 +1,16 @@
-"""Keys: who may speak with whom in a cluster, and the sealing of what they say.
+"""Keys of hosts and users, their roles, and the sealing of messages. Nothing here imports ROS.
 
-`derivation` computes all keys from the cluster's secret, `sealing` encrypts and authenticates
-messages, `roles` says which role may send which request, `cluster` is the master's side (the secret
-and its principals), and `key_files` reads and writes all of it. Nothing here knows ROS. The format
-is documented in docs/reference/keys.md.
+The page "Keys" of the reference documents the format.
+
+roles.py        principals, their roles, and the requests that each role may send
+derivation.py   derivation of all keys from the cluster's secret
+sealing.py      encryption and authentication of the messages of one channel
+links.py        both ends of the messages under one key
+tickets.py      permission to send requests to a slave
+handoffs.py     keys of instances and handoffs
+names.py        texts that name these keys in sealed messages
+cluster.py      the cluster's secret and its principals, at the master
+key_files.py    reading and writing of key files
+security.py     keys, peers and signatures of a master, slave or client
+finding.py      choice of the security from a user's key files
 """

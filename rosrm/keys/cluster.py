@@ -1,4 +1,4 @@
-"""The cluster's secret and its principals: what the master knows of keys."""
+"""The cluster's secret and its principals, at the master."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from nacl.signing import SigningKey
 from rosrm.keys.derivation import derived
 from rosrm.keys.roles import Grant, Principal, Role
 
-#: Generation of the keys that a holder of the cluster's secret derives without a grant.
+#: Generation of a key without a grant, derived by a program that can read the cluster's secret.
 OWN: Final = 0
 
 
 @dataclass(frozen=True, slots=True)
 class PrincipalKey:
-    """A principal's key: what its key file holds.
+    """A principal's key, as in its key file.
 
     Attributes:
         key: secret that the principal and the master share.
@@ -25,49 +25,50 @@ class PrincipalKey:
     """
 
     grant: Grant
-    key: bytes
+    key: bytes = field(repr=False)
     master: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class ClusterSecret:
-    """The secret from which all keys of a cluster are derived; whoever has it has the cluster."""
+    """Secret from which all keys of a cluster are derived; its holder has all rights."""
 
     secret: bytes = field(repr=False)
 
     @property
     def signing_key(self) -> SigningKey:
-        """The key by which the master signs what it publishes to all."""
+        """The key by which the master signs its messages to all receivers."""
         return SigningKey(derived(self.secret, "signature of the master"))
 
+    def shared_key(self, grant: Grant) -> bytes:
+        """Return the secret that a principal and the master share, in a generation."""
+        return derived(self.secret, "principal", str(grant.principal), grant.generation)
+
     def key_of(self, grant: Grant) -> PrincipalKey:
-        """Return the key of a principal in a generation."""
-        key = derived(self.secret, "principal", str(grant.principal), grant.generation)
-        return PrincipalKey(grant, key, bytes(self.signing_key.verify_key))
+        """Return the content of a principal's key file."""
+        return PrincipalKey(grant, self.shared_key(grant), bytes(self.signing_key.verify_key))
 
 
 def own_grant(principal: Principal) -> Grant:
-    """Return the grant of a process that holds the cluster's secret itself."""
+    """Return the grant of a principal whose program can read the cluster's secret."""
     return Grant(principal, Role.HOST if principal.kind == "host" else Role.OPERATOR, OWN)
 
 
 class Principals:
-    """The grants that are valid now.
+    """The valid grants of a cluster.
 
-    A principal without a grant is refused, except with a key of generation `OWN`.
+    A principal without a grant is refused, except with a key of generation `OWN`. A stranger may
+    ask for any number of names, so that nothing is stored here.
     """
 
-    def __init__(self, secret: ClusterSecret, grants: Iterable[Grant] = ()) -> None:
-        self._secret = secret
+    def __init__(self, grants: Iterable[Grant] = ()) -> None:
         self._grants: Mapping[Principal, Grant] = {one.principal: one for one in grants}
-        self._keys: dict[Grant, PrincipalKey] = {}
 
-    def key_of(self, principal: Principal, generation: int) -> PrincipalKey | None:
-        """Return the key by which messages of a principal are opened; None: it has no grant."""
+    def grant_of(self, principal: Principal) -> Grant:
+        """Return the grant of a principal; without one, its grant of generation `OWN`."""
+        return self._grants.get(principal) or own_grant(principal)
+
+    def valid_grant(self, principal: Principal, generation: int) -> Grant | None:
+        """Return the grant of a principal in a generation; None: it has none."""
         grant = own_grant(principal) if generation == OWN else self._grants.get(principal)
-        if grant is None or grant.generation != generation:
-            return None
-        known = self._keys.get(grant)
-        if known is None:
-            known = self._keys[grant] = self._secret.key_of(grant)
-        return known
+        return grant if grant is not None and grant.generation == generation else None

@@ -1,7 +1,7 @@
 """Derivation of keys: keyed BLAKE2b over a purpose and its arguments.
 
-BLAKE2b with a key is a pseudo-random function (RFC 7693, section 2.9), so that a derived key tells
-nothing about the key that it comes from, nor about its siblings.
+BLAKE2b with a key is a pseudo-random function (RFC 7693, section 2.9). So a derived key reveals
+neither the key from which it is derived, nor other keys derived from that key.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ def derived(key: bytes, purpose: str, *arguments: str | int | bytes) -> bytes:
     """Return a key of `KEY_BYTES` for a purpose.
 
     Args:
-        key: secret that only the parties of the derived key know, or one of them and the master.
-        purpose: what the derived key is used for.
-        arguments: what else distinguishes it. Each enters with its length, so that no two lists of
-            arguments give the same bytes. A number enters as 64 bits.
+        key: secret of one party of the derived key and the master, or of the master alone.
+        purpose: use of the derived key, for example "ticket".
+        arguments: further values that distinguish the key. Each is preceded by its length, so that
+            no two lists of arguments give the same bytes. A number has 64 bits.
     """
     state = hashlib.blake2b(key=key, digest_size=KEY_BYTES, person=_PERSON)
     for argument in (purpose, *arguments):

@@ -1,14 +1,15 @@
 """Keys of handoffs: one for each instance, and one for each handoff between two of them.
 
-The slave gives the key of an instance to its node. The master derives the same key. It tells the
-two nodes of a handoff, each under its own key, the key under which the nodes speak with each other.
+The slave gives the key of an instance to its node, and the master derives the same key. The master
+sends the key of a handoff to its two nodes, to each under the key of its instance. The nodes seal
+their messages to each other under the key of the handoff.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from rosrm.keys.derivation import derived
 from rosrm.keys.links import KeyedLink, Link, OpenLink
@@ -21,10 +22,12 @@ def instance_key(host_key: bytes, process: str, number: int) -> bytes:
 
 
 def new_link(key: bytes | None, outward: Direction, inward: Direction) -> Link:
-    """Return a link with a run of its own; its counters may then begin at 1 under any key.
+    """Return a link with a new run, whose counters begin at 1.
 
     Args:
-        key: of an instance or a handoff; None: the cluster has no security.
+        key: of an instance or a handoff; None: with `security: none`.
+        outward: direction of the messages that the link seals.
+        inward: direction of the messages that it opens.
     """
     run = os.urandom(RUN_BYTES)
     return OpenLink(run) if key is None else KeyedLink(key, run, outward, inward)
@@ -35,12 +38,12 @@ class HandoffKeys:
     """The keys that the master derives for handoffs.
 
     Args:
-        secret: of the cluster.
-        host_key: returns the key of the host that runs an instance, given by process and number;
-            None: the instance is unknown, or its host has no valid grant.
+        _secret: returns that of the cluster, which an operator may replace.
+        _host_key: returns the key of the host that runs an instance, given by process and number;
+            None: the instance is unknown.
     """
 
-    _secret: bytes = field(repr=False)
+    _secret: Callable[[], bytes]
     _host_key: Callable[[str, int], bytes | None]
 
     def of_instance(self, process: str, number: int) -> bytes | None:
@@ -50,4 +53,4 @@ class HandoffKeys:
 
     def of_handoff(self, process: str, destination: int) -> bytes:
         """Return the key of a handoff, which the number of its destination identifies."""
-        return derived(self._secret, "handoff", process, destination)
+        return derived(self._secret(), "handoff", process, destination)

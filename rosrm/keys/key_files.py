@@ -1,7 +1,7 @@
-"""Files of keys: the cluster's secret and its grants at the master, one file for each principal.
+"""Key files: the cluster's secret and its grants at the master, one file for each principal.
 
-All lie in one directory, `key_home`, are readable by their owner alone, and are refused otherwise,
-as ssh does. A principal's file may have any name that ends in ".key".
+All files are in one directory, `key_home`. As by ssh, a file that other users can read is refused.
+The file of a principal may have any name that ends in ".key".
 """
 
 from __future__ import annotations
@@ -31,13 +31,15 @@ from rosrm.runtime.private_files import (
 
 #: File of the cluster's secret, on the master's machine alone.
 CLUSTER_FILE: Final = "cluster.key"
-#: File of the grants, beside it.
+#: File of the grants, in the same directory.
 GRANTS_FILE: Final = "principals.yaml"
 
 _LOCK_FILE: Final = "keys.lock"
 _OTHERS: Final = 0o077
 _LARGEST: Final = 1 << 20
-_WARNING: Final = "# Secret: whoever reads this file can act as its owner. Mode 0600.\n"
+#: Fields of a grant, which may be shown.
+_PUBLIC: Final = frozenset({"principal", "role", "generation"})
+_WARNING: Final = "# Secret: a reader of this file can act as its owner. Mode 0600.\n"
 
 
 def key_home() -> Path:
@@ -61,18 +63,18 @@ def read_secret(home: Path) -> ClusterSecret | None:
 
 
 def make_secret(home: Path) -> ClusterSecret:
-    """Return the cluster's secret, drawn now if this directory has none.
+    """Return the cluster's secret; create it if this directory has none.
 
-    Two masters that start at once get the same one.
+    Two masters that start at the same time get the same secret.
 
     Raises:
         ConfigError: the file is invalid, others can read it, or it cannot be written.
     """
     with _locked(home):
-        return read_secret(home) or _draw_secret(home)
+        return read_secret(home) or _create_secret(home)
 
 
-def _draw_secret(home: Path) -> ClusterSecret:
+def _create_secret(home: Path) -> ClusterSecret:
     secret = ClusterSecret(os.urandom(KEY_BYTES))
     _write_secret(home, secret)
     return secret
@@ -90,7 +92,7 @@ def rotate(home: Path, directory: Path) -> list[Path]:
         directory: for the key files; created if it is missing.
 
     Returns:
-        The key files. They are written first, so that no principal is without a key.
+        Paths of the key files, which are written before the secret is replaced.
 
     Raises:
         ConfigError: a file is invalid, others can read it, or it cannot be written. Then the former
@@ -111,7 +113,7 @@ def rotate(home: Path, directory: Path) -> list[Path]:
 
 
 def read_grants(home: Path) -> list[Grant]:
-    """Return the grants, revoked ones left out; [] without a file.
+    """Return the grants that are not revoked; [] without a file.
 
     Raises:
         ConfigError: the file is invalid, or others can read it.
@@ -135,7 +137,7 @@ def add_grant(home: Path, principal: Principal, role: Role) -> Grant:
 
 
 def revoke(home: Path, principals: Collection[Principal]) -> None:
-    """End the keys of principals, of all or of none.
+    """Revoke the keys of all given principals; on an error, of none.
 
     Raises:
         ConfigError: one of them has no key, the file is invalid, others can read it, or it cannot
@@ -173,7 +175,8 @@ def _all_grants(home: Path) -> list[tuple[Grant, bool]]:
     rows = fields.get("principals", [])
     if not isinstance(rows, list):
         raise ConfigError(f"{path}: principals: must be a list")
-    return [(_grant_in(row, path), row.get("revoked") is True) for row in rows]
+    # Every value but `false` ends a grant, such as the text "true" of an editor.
+    return [(_grant_in(row, path), row.get("revoked", False) is not False) for row in rows]
 
 
 def _write_grants(home: Path, entries: list[tuple[Grant, bool]]) -> None:
@@ -220,16 +223,16 @@ def read_key(path: Path) -> PrincipalKey:
 
 
 def find_key(kind: str, name: str, home: Path, explicit: str = "") -> PrincipalKey | None:
-    """Return the key with which a process of this user speaks; None: there is none.
+    """Return the key that a slave or command of this user uses; None: there is none.
 
     Args:
         kind: "host" or "user".
-        name: of the host; for a user "" accepts the key of every user.
+        name: of the host; "": the only key file of this kind, of any user.
         home: directory of this user's keys.
         explicit: path of a key file; "": search `home`, then use the cluster's secret.
 
     Raises:
-        ConfigError: a file is invalid, or there are keys of several users.
+        ConfigError: a file is invalid, or several files are of this kind and name.
     """
     if explicit:
         return read_key(Path(explicit))
@@ -241,18 +244,19 @@ def find_key(kind: str, name: str, home: Path, explicit: str = "") -> PrincipalK
     if len(found) > 1:
         names = ", ".join(f"{path.name} ({key.grant.principal})" for path, key in found.items())
         raise ConfigError(
-            f"{home} has several keys for this: {names}; name the file of one in ROSRM_KEY"
+            f"{home} has several key files for a {kind}: {names}; name the file to use in ROSRM_KEY"
         )
     if found:
         return next(iter(found.values()))
     secret = read_secret(home)
     if secret is None:
         return None
-    principal = principal_of(f"{kind}:{name or _user()}")
+    principal = principal_of(f"{kind}:{name or user_name()}")
     return secret.key_of(own_grant(principal))
 
 
-def _user() -> str:
+def user_name() -> str:
+    """Return the account name of the user of this program."""
     try:
         import pwd  # noqa: PLC0415 - only where a key is derived
 
@@ -283,7 +287,10 @@ def _grant_in(fields: Any, path: Path) -> Grant:
         role = Role(fields["role"])
         generation = fields["generation"]
     except (KeyError, TypeError, ValueError, ConfigError) as error:
-        raise ConfigError(f"{path}: invalid entry {fields!r}: {error}") from None
+        shown = fields  # a key file has its key here, too
+        if isinstance(fields, dict):
+            shown = {name: value for name, value in fields.items() if name in _PUBLIC}
+        raise ConfigError(f"{path}: invalid entry {shown!r}: {error}") from None
     if (role is Role.HOST) is not (principal.kind == "host"):
         raise ConfigError(f"{path}: {principal} cannot have the role {role.value}")
     if not isinstance(generation, int) or not 1 <= generation < 1 << 32:
@@ -320,10 +327,12 @@ def _read(path: Path) -> dict[str, Any] | None:
         if mode & _OTHERS:
             raise ConfigError(
                 f"the key file {path} has mode {mode:04o}, so that others can read or change it; "
-                f"run `chmod 600 {path}`. If others may have read it, replace the key: `rosrm key "
-                f"add` again at the master"
+                f"run `chmod 600 {path}`. If others may have read it, replace the key: run `rosrm "
+                f"key add` again on the machine of the master"
             )
-        content = file.read(_LARGEST)
+        content = file.read(_LARGEST + 1)
+    if len(content) > _LARGEST:  # its beginning alone might lack the end of a grant
+        raise ConfigError(f"the key file {path} has more than {_LARGEST} bytes")
     try:
         fields = yaml.safe_load(content)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
@@ -339,25 +348,28 @@ def _text(fields: Mapping[str, Any]) -> str:
 
 def _write(path: Path, fields: Mapping[str, Any]) -> None:
     """Write a file that only its owner can read, whole or not at all, and onto the disk."""
+    content = _text(fields).encode()
+    if len(content) > _LARGEST:
+        raise ConfigError(f"{path} cannot be written: it would have more than {_LARGEST} bytes")
     try:
-        os.close(atomic_file.replace(str(path), _text(fields).encode(), os.O_SYNC))
+        os.close(atomic_file.replace(str(path), content, os.O_SYNC))
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
 
 
 @contextlib.contextmanager
 def _locked(home: Path) -> Iterator[None]:
-    """Create the directory of keys if it is missing, and keep other processes from changing it.
+    """Create the directory of keys if it is missing, and lock it for this process.
 
-    Otherwise two commands at a time would lose one of two grants.
+    Without the lock, one of two commands at the same time could overwrite the grant of the other.
     """
     try:
         make_private_directory(home)
         lock = open_private(str(home / _LOCK_FILE), os.O_RDWR | os.O_CREAT)
     except OSError as error:
         raise ConfigError(
-            f"the directory of keys {home} cannot be used: {error.strerror}; another one can be "
-            f"named in ROSRM_KEYS"
+            f"the directory of keys {home} cannot be used: {error.strerror}; ROSRM_KEYS can name "
+            f"another directory"
         ) from None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)

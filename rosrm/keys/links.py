@@ -1,24 +1,30 @@
-"""A link between a principal and the master: seals what one side says, opens what the other says.
+"""Links: one end of the messages between two parties under one key.
 
-A request is bound to the run of its receiver, and an answer to its request. So neither can be used
-again after a restart of the receiver, or for another request.
+A link seals the messages of its own side, and opens those of the other side. A request is bound to
+the run of its receiver, and an answer to its request. So a recorded request cannot be used after a
+restart of the receiver, nor a recorded answer for another request.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import OrderedDict
-from dataclasses import dataclass
-from typing import Final, Protocol
+from collections.abc import Callable
+from typing import Final, NamedTuple, Protocol
 
 from rosrm.keys.sealing import Direction, Opener, Sealer, channel_key
 
-#: Runs of the other side whose newest counters are remembered: of a user, one for each command.
+#: Pairs of run and channel whose newest counters are stored. Each command of a user is a run.
 _RUNS: Final = 256
 
+#: Openers by run of the sender and channel, the least recently used first.
+_Openers = OrderedDict[tuple[bytes, bytes], Opener]
 
-@dataclass(frozen=True, slots=True)
-class SealedMessage:
+#: Opens the messages of one run on one channel, given by counter, body and context.
+OpenMessage = Callable[[int, bytes, bytes], bytes | None]
+
+
+class SealedMessage(NamedTuple):
     """A message as it is sent.
 
     Attributes:
@@ -33,7 +39,7 @@ class SealedMessage:
 
     @property
     def reference(self) -> bytes:
-        """The bytes to which an answer to this message is bound."""
+        """The associated data of an answer to this message."""
         return self.run + struct.pack("<Q", self.counter)
 
 
@@ -46,12 +52,23 @@ class Link(Protocol):
         Args:
             channel: see `rosrm.keys.sealing.channel_of`.
             plaintext: the message.
-            context: of a request the run of the receiver, b"" while it is unknown; of an answer the
-                `reference` of its request.
+            context: for a request, the run of the receiver; for an answer, the `reference` of its
+                request.
         """
 
-    def open(self, channel: bytes, message: SealedMessage, context: bytes = b"") -> bytes | None:
-        """Return a message of the other side; None: it is not genuine, or a repetition."""
+    def open(
+        self, channel: bytes, message: SealedMessage, context: bytes = b"", *, is_bound: bool = True
+    ) -> bytes | None:
+        """Return a message of the other side; None: it is not genuine, or a repetition.
+
+        Args:
+            is_bound: it is meant for this run of the receiver. Others have no effect, and anyone
+                may have recorded any number of them in former runs. So they are counted apart, and
+                the counters of bound messages are not forgotten for them.
+        """
+
+    def opener(self, channel: bytes, run: bytes) -> OpenMessage:
+        """Return `open` for many messages of a run that has sent a genuine message."""
 
 
 class KeyedLink:
@@ -70,7 +87,8 @@ class KeyedLink:
         self._outward = outward
         self._inward = inward
         self._sealers: dict[bytes, Sealer] = {}
-        self._openers: OrderedDict[tuple[bytes, bytes], Opener] = OrderedDict()
+        self._bound: _Openers = OrderedDict()
+        self._unbound: _Openers = OrderedDict()
 
     def seal(self, channel: bytes, plaintext: bytes, context: bytes = b"") -> SealedMessage:
         """Return a message for the other side."""
@@ -81,39 +99,58 @@ class KeyedLink:
         body = sealer.seal(plaintext, context)
         return SealedMessage(self._run, sealer.counter, body)
 
-    def open(self, channel: bytes, message: SealedMessage, context: bytes = b"") -> bytes | None:
+    def open(
+        self, channel: bytes, message: SealedMessage, context: bytes = b"", *, is_bound: bool = True
+    ) -> bytes | None:
         """Return a message of the other side; None: it is not genuine, or a repetition."""
-        opener = self._openers.get((message.run, channel))
-        if opener is None:
-            opener = Opener(channel_key(self._key, self._inward, message.run, channel))
+        openers = self._bound if is_bound else self._unbound
+        opener = self._opener_in(openers, channel, message.run)
         plaintext = opener.open(message.counter, message.body, context)
         if plaintext is None:
             return None
-        self._remember(message.run, channel, opener)
+        # Only now: a stranger makes nothing be stored.
+        _remember(openers, channel, message.run, opener)
         return plaintext
 
-    def _remember(self, run: bytes, channel: bytes, opener: Opener) -> None:
-        """Remember a run that has sent a genuine message: a stranger makes nothing be stored."""
-        self._openers[run, channel] = opener
-        self._openers.move_to_end((run, channel))
-        if len(self._openers) > _RUNS:
-            self._openers.popitem(last=False)
+    def opener(self, channel: bytes, run: bytes) -> OpenMessage:
+        """Return `open` for many messages of a run that has sent a genuine message."""
+        opener = self._opener_in(self._bound, channel, run)
+        _remember(self._bound, channel, run, opener)
+        return opener.open
+
+    def _opener_in(self, openers: _Openers, channel: bytes, run: bytes) -> Opener:
+        known = openers.get((run, channel))
+        return known or Opener(channel_key(self._key, self._inward, run, channel))
+
+
+def _remember(openers: _Openers, channel: bytes, run: bytes, opener: Opener) -> None:
+    openers[run, channel] = opener
+    openers.move_to_end((run, channel))
+    if len(openers) > _RUNS:
+        openers.popitem(last=False)
 
 
 class OpenLink:
-    """A link without keys, for `security: none`: the other side is believed."""
+    """A link without keys, for `security: none`: every message is accepted."""
 
     def __init__(self, run: bytes) -> None:
         self._run = run
         self._counter = 0
 
     def seal(self, channel: bytes, plaintext: bytes, context: bytes = b"") -> SealedMessage:
-        """Return a message for the other side, as it is."""
+        """Return a message for the other side, unchanged."""
         del channel, context
         self._counter += 1
         return SealedMessage(self._run, self._counter, plaintext)
 
-    def open(self, channel: bytes, message: SealedMessage, context: bytes = b"") -> bytes | None:
+    def open(
+        self, channel: bytes, message: SealedMessage, context: bytes = b"", *, is_bound: bool = True
+    ) -> bytes | None:
         """Return a message of the other side."""
-        del channel, context
+        del channel, context, is_bound
         return message.body
+
+    def opener(self, channel: bytes, run: bytes) -> OpenMessage:
+        """Return `open` for many messages of a run."""
+        del channel, run
+        return lambda _counter, body, _context: body

@@ -1,4 +1,4 @@
-"""Principals, their roles, and the requests that each role may send: deny by default."""
+"""Principals, their roles, and the requests that each role may send; all others are denied."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ if TYPE_CHECKING:
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_.~/@-]{1,128}")
 
+#: Setting `security` of a cluster.
+SecurityMode = Literal["keys", "none"]
+
 
 class Role(str, Enum):
-    """What a principal may do.
+    """Rights of a principal.
 
     Attributes:
         meaning: one line for users.
@@ -26,21 +29,23 @@ class Role(str, Enum):
     meaning: str
 
     def __new__(cls, text: str, meaning: str = "") -> Self:
-        """Make a member from its name in a key file and its meaning."""
+        """Create a role from its name in a key file and its meaning."""
         role = str.__new__(cls, text)
         role._value_ = text
         role.meaning = meaning
         return role
 
     VIEWER = "viewer", "reads listings, explanations and events"
-    SUBMITTER = "submitter", "reads too, submits processes, and changes those that it submitted"
+    SUBMITTER = "submitter", "as `viewer`; submits processes, and changes those that it submitted"
     OPERATOR = "operator", "sends every request that users can send, for all processes and hosts"
-    HOST = "host", "speaks for the host of its name, and for no other"
+    HOST = "host", "registers and reports the host of its name, and no other"
+    MASTER = "master", "sends orders to hosts; the role of the master alone, in no key file"
+    BEARER = "bearer", "sends requests of the kind that its ticket allows; in no key file"
 
 
 @dataclass(frozen=True, slots=True)
 class Principal:
-    """Who has a key: a host or a user."""
+    """Holder of a key: a host or a user."""
 
     kind: Literal["host", "user"]
     name: str
@@ -51,10 +56,10 @@ class Principal:
 
 
 def principal_of(text: str) -> Principal:
-    """Return the principal of a text, "host:robot-1" or "user:ada".
+    """Return the principal that a text names, "host:robot-1" or "user:ada".
 
     Raises:
-        ConfigError: the text is none.
+        ConfigError: the text names no principal.
     """
     kind, _, name = text.partition(":")
     if kind == "host" and _NAME.fullmatch(name):
@@ -72,8 +77,8 @@ class Grant:
     """The role of a principal.
 
     Attributes:
-        generation: number of the principal's key: a new key has the next one, 0 is the key that
-            whoever holds the cluster's secret derives for itself.
+        generation: number of the principal's key, from 1; 0: a key without a grant, derived by a
+            program that can read the cluster's secret.
     """
 
     principal: Principal
@@ -85,10 +90,16 @@ _READERS: Final = frozenset({Role.VIEWER, Role.SUBMITTER, Role.OPERATOR})
 _SUBMITTERS: Final = frozenset({Role.SUBMITTER, Role.OPERATOR})
 _OPERATORS: Final = frozenset({Role.OPERATOR})
 _HOSTS: Final = frozenset({Role.HOST})
+_MASTERS: Final = frozenset({Role.MASTER})
+_BEARERS: Final = frozenset({Role.BEARER})
 
-#: The roles that may send a request, by the name of its service. What is missing is refused.
+#: Roles that key files can have.
+GRANTED: Final = (Role.VIEWER, Role.SUBMITTER, Role.OPERATOR, Role.HOST)
+
+#: The roles that may send a request, by the name of its service. Others are refused.
 ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
-    "handshake": frozenset(Role),
+    "handshake": _READERS | _HOSTS,
+    "introduce": _SUBMITTERS | _HOSTS,
     "list": _READERS,
     "explain": _READERS,
     "submit": _SUBMITTERS,
@@ -98,25 +109,18 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "checkpoint": _SUBMITTERS,
     "restore": _SUBMITTERS,
     "prune": _OPERATORS,
-    "read_log": _SUBMITTERS,
     "set_host_state": _OPERATORS,
     "register_host": _HOSTS,
     "leave": _HOSTS,
     "request_process": _HOSTS,
+    # Of slaves:
+    "control": _MASTERS,
+    "read_log": _BEARERS,
+    "store_replica": _BEARERS,
+    "read_snapshot": _BEARERS,
 }
 
 
 def may_send(role: Role, request: str) -> bool:
     """Return True if a role may send a request, given by the name of its service."""
     return role in ALLOWED.get(request, frozenset())
-
-
-def may_act_on(role: Role, principal: Principal, owner: str) -> bool:
-    """Return True if a principal may change a process or read its logs.
-
-    Args:
-        role: of the principal.
-        principal: who asks.
-        owner: text of the principal that submitted the process; "": unknown.
-    """
-    return role is Role.OPERATOR or (role is Role.SUBMITTER and owner == str(principal))

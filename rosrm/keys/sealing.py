@@ -1,17 +1,17 @@
-"""Sealing of messages: ChaCha20-Poly1305 (RFC 8439) under keys that are used for one thing each.
+"""Sealing of messages: ChaCha20-Poly1305 (RFC 8439), with a separate key for each use.
 
 A key belongs to one direction (a principal to the master, or back), one run of the sender and one
-channel (a topic, or the requests or answers of a service). So a message that is moved to another
-channel, receiver or run cannot be opened there, and the sender's counter alone is a nonce that
-never repeats. Messages of one sender on one channel arrive in order. So a counter that is not above
-the last one marks a repetition.
+channel (a topic, or the requests or answers of a service). So a message does not open on another
+channel, at another receiver or for another run, and the sender's counter is a nonce that never
+repeats. Messages of one sender on one channel arrive in order. So a message is repeated if its
+counter is not above the newest one.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
@@ -23,18 +23,18 @@ from nacl.exceptions import CryptoError
 
 from rosrm.keys.derivation import derived
 
-#: Version of the sealing, in the clear in each message.
+#: Version of the sealing, unencrypted in each message.
 FORMAT: Final = 1
 #: Bytes that sealing adds to a message: the tag of Poly1305.
 OVERHEAD: Final = 16
-#: Bytes that name a run of a sender: random, drawn at its start.
+#: Random bytes that identify a run of a sender, generated at its start.
 RUN_BYTES: Final = 16
-#: The first counter is 1, and the last one is this: a sender then starts a new run.
+#: Largest counter. The first is 1.
 LAST_COUNTER: Final = 2**64 - 1
 
 
 class Direction(str, Enum):
-    """Between whom a key is used."""
+    """Direction of the messages of a key."""
 
     TO_MASTER = "to the master"
     FROM_MASTER = "from the master"
@@ -58,8 +58,8 @@ def channel_key(principal_key: bytes, direction: Direction, run: bytes, channel:
     """Return the key of one channel.
 
     Args:
-        principal_key: of the principal that speaks with the master or with a peer.
-        direction: from which side the messages come.
+        principal_key: of a principal, ticket, instance or handoff.
+        direction: of the messages.
         run: of the sender, `RUN_BYTES`.
         channel: see `channel_of`.
     """
@@ -78,7 +78,7 @@ class Sealer:
         counter: of the last message.
     """
 
-    _key: bytes
+    _key: bytes = field(repr=False)
     counter: int = 0
 
     def seal(self, plaintext: bytes, context: bytes = b"") -> bytes:
@@ -86,7 +86,7 @@ class Sealer:
 
         Args:
             plaintext: the message.
-            context: bytes that the receiver has to know to open the message.
+            context: associated data, which the receiver needs to open the message.
         """
         self.counter += 1
         return crypto_aead_chacha20poly1305_ietf_encrypt(
@@ -102,11 +102,11 @@ class Opener:
         newest: counter of the newest message that was opened.
     """
 
-    _key: bytes
+    _key: bytes = field(repr=False)
     newest: int = 0
 
     def open(self, counter: int, sealed: bytes, context: bytes = b"") -> bytes | None:
-        """Return the plaintext; None: the message is a repetition, or not the sender's."""
+        """Return the plaintext; None: the message is repeated, or not genuine."""
         if not self.newest < counter <= LAST_COUNTER or len(sealed) < OVERHEAD:
             return None
         try:

@@ -1,56 +1,114 @@
-"""Security of one part of rosrm: with whom it may speak, and the links to them."""
+"""Security of a master, slave or client: its peers, and the keys of their messages."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Protocol
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+from nacl.bindings import crypto_sign, crypto_sign_open
+from nacl.exceptions import CryptoError
 
 from rosrm.errors import ConfigError
 from rosrm.keys.cluster import ClusterSecret, PrincipalKey, Principals, own_grant
+from rosrm.keys.derivation import derived
+from rosrm.keys.handoffs import HandoffKeys, instance_key, new_link
 from rosrm.keys.links import KeyedLink, Link, OpenLink
-from rosrm.keys.roles import Grant, principal_of
+from rosrm.keys.roles import Grant, Principal, Role, principal_of
 from rosrm.keys.sealing import RUN_BYTES, Direction
+from rosrm.keys.tickets import Ticket, ticket_of
+
+#: Bytes of a signature.
+SIGNATURE_BYTES: Final = 64
+#: Run of a peer that is not known yet.
+UNKNOWN_RUN: Final = bytes(RUN_BYTES)
+#: Principal of a master as a client of another master.
+_MASTER: Final = Principal("user", "rosrm-master")
+#: Valid tickets of one bearer that a slave accepts: at most two for each of a thousand processes.
+_MOST_TICKETS: Final = 4096
+#: The same for all peers of a part without security.
+_MOST_PEERS: Final = 20_000
 
 
 def new_run() -> bytes:
-    """Return a random number for a run of a part."""
+    """Return the random number of a new run."""
     return os.urandom(RUN_BYTES)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Peer:
-    """The other side of a conversation, under the key of one principal.
+    """The other side of a link.
 
     Attributes:
-        principal: whose key seals the conversation, on both sides.
+        name: principal or ticket whose key seals the messages of both sides.
         generation: of the key.
-        link: seals what this side says and opens what the peer says.
-        grant: rights of the peer; of the master those of the principal itself.
+        link: seals messages for the peer, and opens messages of the peer.
+        grant: rights of the peer.
+        ticket: ticket of the peer; None: the peer is a principal or the master.
+        run: newest known run of the peer, to which messages for the peer are bound.
     """
 
-    principal: str
+    name: str
     generation: int
     link: Link
     grant: Grant
+    ticket: Ticket | None = None
+    run: bytes = field(default=UNKNOWN_RUN)
 
 
 class Security(Protocol):
-    """Interface of the security of one part.
+    """Interface of the security of a master, slave or client.
 
     Attributes:
         run: random number of this part's run.
+        described: text for users, for example "the key of host:robot-1".
+        tickets_from: lowest version of the tickets that are in force.
     """
 
     run: bytes
+    described: str
+    tickets_from: int
 
-    def peer(self, principal: str, generation: int) -> Peer | None:
-        """Return whoever may speak under a principal's key; None: nobody may."""
+    def peer(self, name: str, generation: int) -> Peer | None:
+        """Return the peer with the key of this name and generation; None: there is no valid one."""
+
+    def remember(self, peer: Peer) -> None:
+        """Store a peer whose message was genuine; a stranger is never stored."""
+
+    def signature(self, content: bytes) -> bytes:
+        """Return the signature of a message to all receivers; b"" if this is not the master."""
+
+    def is_signed(self, content: bytes, signature: bytes) -> bool:
+        """Return True if the master signed a message."""
+
+
+class Member(Security, Protocol):
+    """Interface of the security of a slave or client, which has one master.
+
+    Attributes:
+        master: the master.
+    """
+
+    master: Peer
+
+    def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
+        """Return the slave for which this part is the bearer of a ticket.
+
+        Args:
+            ticket: text of the ticket.
+            key: of the ticket.
+            run: of the slave.
+        """
+
+    def instance_key(self, process: str, number: int) -> bytes | None:
+        """Return the key of an instance on this host; None: with `security: none`."""
 
 
 class MemberSecurity:
-    """Security of a slave or client: it speaks with the master under its own key.
+    """Security of a slave or client, which has a key and one master.
 
     Attributes:
         run: random number of this part's run.
@@ -59,18 +117,70 @@ class MemberSecurity:
 
     def __init__(self, key: PrincipalKey, run: bytes | None = None) -> None:
         self.run = run or new_run()
-        grant = key.grant
+        self.tickets_from = 0
+        self._key = key
+        whom = str(key.grant.principal)
+        self.described = f"the key of {whom}"
         link = KeyedLink(key.key, self.run, Direction.TO_MASTER, Direction.FROM_MASTER)
-        self.master = Peer(str(grant.principal), grant.generation, link, grant)
+        grant = Grant(key.grant.principal, Role.MASTER, key.grant.generation)
+        self.master = Peer(whom, key.grant.generation, link, grant)
+        self._bearers: dict[Principal, OrderedDict[str, Peer]] = {}
 
-    def peer(self, principal: str, generation: int) -> Peer | None:
-        """Return the master, if a message is sealed by the key that is shared with it."""
-        mine = (self.master.principal, self.master.generation)
-        return self.master if (principal, generation) == mine else None
+    def peer(self, name: str, generation: int) -> Peer | None:
+        """Return the master, or the bearer of a ticket for this slave."""
+        if (name, generation) == (self.master.name, self.master.generation):
+            return self.master
+        ticket = ticket_of(name)
+        if ticket is None or not ticket.is_valid(time.monotonic_ns()):
+            return None
+        held: Mapping[str, Peer] = self._bearers.get(ticket.bearer, {})
+        return held.get(name) or (self._bearer_of(ticket) if self._has_room(held) else None)
+
+    def _has_room(self, held: Mapping[str, Peer]) -> bool:
+        """Return True if a bearer may use another ticket.
+
+        No valid ticket is forgotten, because its recorded requests would then open again.
+        """
+        return len(held) < _MOST_TICKETS or _is_void(next(iter(held.values())))
+
+    def _bearer_of(self, ticket: Ticket) -> Peer:
+        link = new_link(ticket.key(self._key.key), Direction.FROM_PEER, Direction.TO_PEER)
+        return Peer(ticket.text(), 0, link, _bearer_grant(ticket), ticket)
+
+    def remember(self, peer: Peer) -> None:
+        """Keep a bearer whose request was genuine, as long as its ticket is valid."""
+        if peer.ticket is None:
+            return
+        held = self._bearers.setdefault(peer.ticket.bearer, OrderedDict())
+        held[peer.name] = peer
+        while held and _is_void(next(iter(held.values()))):
+            held.popitem(last=False)
+
+    def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
+        """Return the slave to which a ticket of this part introduces.
+
+        The master may give the same ticket twice. So each link has a run of its own, because two
+        links with the run of this part would use the same nonces.
+        """
+        link = new_link(key, Direction.TO_PEER, Direction.FROM_PEER)
+        return Peer(ticket, 0, link, self.master.grant, run=run)
+
+    def instance_key(self, process: str, number: int) -> bytes | None:
+        """Return the key of an instance on this host."""
+        return instance_key(self._key.key, process, number)
+
+    def signature(self, content: bytes) -> bytes:
+        """Return b"": only the master signs."""
+        del content
+        return b""
+
+    def is_signed(self, content: bytes, signature: bytes) -> bool:
+        """Return True if the master signed a message."""
+        return _is_signed(content, signature, self._key.master)
 
 
 class MasterSecurity:
-    """Security of the master: it speaks with every principal that has a valid grant.
+    """Security of the master: its peers are the principals with a valid grant.
 
     Attributes:
         run: random number of this run of the master.
@@ -80,49 +190,199 @@ class MasterSecurity:
         self, secret: ClusterSecret, grants: Iterable[Grant] = (), run: bytes | None = None
     ) -> None:
         self.run = run or new_run()
-        self._secret = secret
+        self.tickets_from = 0
+        self.described = "keys"
         self._peers: dict[tuple[str, int], Peer] = {}
-        self.replace_grants(grants)
+        # Links by key, also of ended grants. A key may become valid again, with another role or a
+        # secret from a backup, and a new link would use the same nonces again.
+        self._links: dict[bytes, Link] = {}
+        self._secret = secret
+        self.replace(secret, grants)
 
-    def replace_grants(self, grants: Iterable[Grant]) -> None:
-        """Replace the valid grants; principals that keep theirs keep their links."""
-        self._principals = Principals(self._secret, grants)
+    def replace(self, secret: ClusterSecret, grants: Iterable[Grant]) -> None:
+        """Replace secret and grants; drop the links of principals whose grant has changed."""
+        self.tickets_from += 1
+        changed = self._peers and secret != self._secret
+        self._secret = secret
+        self._signing_key = bytes(secret.signing_key) + bytes(secret.signing_key.verify_key)
+        self._principals = Principals(grants)
         self._peers = {
             known: peer for known, peer in self._peers.items()
-            if self._principals.key_of(peer.grant.principal, peer.generation) is not None
+            if not changed and self.has_access(peer)
         }  # fmt: skip
 
-    def peer(self, principal: str, generation: int) -> Peer | None:
+    def has_access(self, peer: Peer) -> bool:
+        """Return True while key and rights of a peer are valid."""
+        grant = self._principals.valid_grant(peer.grant.principal, peer.generation)
+        return grant == peer.grant and self._link_of(peer.grant) is peer.link
+
+    def peer(self, name: str, generation: int) -> Peer | None:
         """Return a principal with a valid grant of this generation."""
-        known = self._peers.get((principal, generation))
+        known = self._peers.get((name, generation))
         if known is not None:
             return known
         try:
-            key = self._principals.key_of(principal_of(principal), generation)
+            grant = self._principals.valid_grant(principal_of(name), generation)
         except ConfigError:
             return None
-        if key is None:
-            return None
-        link = KeyedLink(key.key, self.run, Direction.FROM_MASTER, Direction.TO_MASTER)
-        peer = self._peers[principal, generation] = Peer(principal, generation, link, key.grant)
-        return peer
+        return None if grant is None else Peer(name, generation, self._link_of(grant), grant)
+
+    def _link_of(self, grant: Grant) -> Link:
+        key = self._secret.shared_key(grant)
+        known = self._links.get(key)
+        return known or KeyedLink(key, self.run, Direction.FROM_MASTER, Direction.TO_MASTER)
+
+    def remember(self, peer: Peer) -> None:
+        """Keep a principal whose message was genuine."""
+        if self._peers.get((peer.name, peer.generation)) is not peer:
+            self._peers[peer.name, peer.generation] = peer
+            self._links[self._secret.shared_key(peer.grant)] = peer.link
+
+    def introduction(self, host: Peer, ticket: Ticket) -> bytes:
+        """Return the key of the bearer of a ticket for a host."""
+        return ticket.key(self._secret.shared_key(host.grant))
+
+    def client(self) -> MemberSecurity:
+        """Return the security of this master as a client of another one with the same secret."""
+        grant = own_grant(_MASTER)
+        return MemberSecurity(self._secret.key_of(grant))
+
+    def snapshot_key(self, process: str) -> bytes:
+        """Return the key that encrypts the replicas of the snapshots of a process."""
+        return derived(self._secret.secret, "state", process)
+
+    def handoff_keys(self, host_of: Callable[[str, int], str | None]) -> HandoffKeys:
+        """Return the keys of handoffs.
+
+        Args:
+            host_of: returns the host of an instance, given by process and number; None: unknown.
+        """
+
+        def host_key(process: str, number: int) -> bytes | None:
+            host = host_of(process, number)
+            return None if host is None else self._secret.shared_key(self._grant_of_host(host))
+
+        return HandoffKeys(lambda: self._secret.secret, host_key)
+
+    def _grant_of_host(self, host: str) -> Grant:
+        """Return the grant by which a host spoke last, or will speak after this master's start."""
+        principal = Principal("host", host)
+        granted, own = self._principals.grant_of(principal), own_grant(principal)
+        has_spoken = (str(principal), granted.generation) in self._peers
+        own_alone = not has_spoken and (str(principal), own.generation) in self._peers
+        return own if own_alone else granted
+
+    def signature(self, content: bytes) -> bytes:
+        """Return the signature of a message to all receivers."""
+        return crypto_sign(content, self._signing_key)[:SIGNATURE_BYTES]
+
+    def is_signed(self, content: bytes, signature: bytes) -> bool:
+        """Return True if a master with the same secret signed a message."""
+        return _is_signed(content, signature, self._signing_key[32:])
 
 
 class NoSecurity:
-    """`security: none`: everybody is believed to be the principal that a message names.
+    """`security: none`: every message is accepted under the principal that it names.
+
+    Args:
+        principal: of this slave or client; None: this is the master.
+        run: random number of this part's run; None: a new one.
 
     Attributes:
         run: random number of this part's run.
+        master: the master, for a slave or client.
     """
 
-    def __init__(self, run: bytes | None = None) -> None:
+    def __init__(self, principal: Principal | None = None, run: bytes | None = None) -> None:
         self.run = run or new_run()
+        self.tickets_from = 0
+        self.described = "none"
         self._link = OpenLink(self.run)
+        self._peers: OrderedDict[tuple[str, int], Peer] = OrderedDict()
+        name = "" if principal is None else str(principal)  # no message has the name ""
+        grant = Grant(principal or Principal("user", ""), Role.MASTER, 0)
+        self.master = Peer(name, 0, self._link, grant)
 
-    def peer(self, principal: str, generation: int) -> Peer | None:
+    def peer(self, name: str, generation: int) -> Peer | None:
         """Return the principal with all rights of its kind; None: the name is invalid."""
+        if (name, generation) == (self.master.name, self.master.generation):
+            return self.master
+        known = self._peers.get((name, generation))
+        if known is not None:
+            return known
+        ticket = ticket_of(name)
+        if ticket is not None:
+            return Peer(name, 0, self._link, _bearer_grant(ticket), ticket)
         try:
-            grant = own_grant(principal_of(principal))
+            return Peer(name, generation, self._link, own_grant(principal_of(name)))
         except ConfigError:
             return None
-        return Peer(principal, generation, self._link, grant)
+
+    def remember(self, peer: Peer) -> None:
+        """Store a peer, up to a bound."""
+        self._peers[peer.name, peer.generation] = peer
+        self._peers.move_to_end((peer.name, peer.generation))
+        if len(self._peers) > _MOST_PEERS:
+            self._peers.popitem(last=False)
+
+    def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
+        """Return the slave for which this part is the bearer of a ticket."""
+        del key
+        return Peer(ticket, 0, self._link, self.master.grant, run=run)
+
+    def instance_key(self, process: str, number: int) -> None:
+        """Return no key."""
+        del process, number
+
+    def introduction(self, host: Peer, ticket: Ticket) -> bytes:
+        """Return no key."""
+        del host, ticket
+        return b""
+
+    def client(self) -> NoSecurity:
+        """Return the security of this master as a client of another one."""
+        return NoSecurity(_MASTER)
+
+    def snapshot_key(self, process: str) -> bytes:
+        """Return no key."""
+        del process
+        return b""
+
+    def handoff_keys(self, host_of: Callable[[str, int], str | None]) -> None:
+        """Return no keys."""
+        del host_of
+
+    def has_access(self, peer: Peer) -> bool:
+        """Return True."""
+        del peer
+        return True
+
+    def signature(self, content: bytes) -> bytes:
+        """Return no signature."""
+        del content
+        return b""
+
+    def is_signed(self, content: bytes, signature: bytes) -> bool:
+        """Return True."""
+        del content, signature
+        return True
+
+
+#: Security of the master.
+Authority = MasterSecurity | NoSecurity
+
+
+def _is_void(peer: Peer) -> bool:
+    return peer.ticket is None or not peer.ticket.is_valid(time.monotonic_ns())
+
+
+def _bearer_grant(ticket: Ticket) -> Grant:
+    return Grant(ticket.bearer, Role.BEARER, 0)
+
+
+def _is_signed(content: bytes, signature: bytes, key: bytes) -> bool:
+    try:
+        crypto_sign_open(signature + content, key)
+    except CryptoError:
+        return False
+    return True

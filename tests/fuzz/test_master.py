@@ -114,7 +114,7 @@ GENERAL = [
     happened.SnapshotsReported, happened.CancelRequested, happened.RestartRequested,
     happened.CheckpointRequested, happened.RestoreRequested, happened.HostStateRequested,
     happened.PruneRequested, happened.OrderAnswered, happened.AssignmentWithdrawn,
-    happened.HandoffReported, happened.PeerRefused, happened.TimePassed,
+    happened.HandoffReported, happened.PeerRefused, happened.KeyRevoked, happened.TimePassed,
 ]  # fmt: skip
 EVENTS = st.one_of(
     *(values_of(kind, {**KNOWN, "name": names}) for kind in GENERAL),

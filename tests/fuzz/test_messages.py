@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.errors import Refused
+from rosrm.keys.security import NoSecurity
 from rosrm.model.codec import to_plain
 from rosrm.ros import convert
 from rosrm.ros.master import services
@@ -26,6 +27,7 @@ WORDS = st.sampled_from(
     ["", "service", "job", "auto", "graph", "never", "always", "wait", "keep", "running", "held",
      "memory", "p", "run", "cordon"]
 ) | texts | json_values.map(json.dumps)  # fmt: skip
+SENDER = NoSecurity().peer("user:ada", 0)
 FLOAT32S = st.sampled_from([0.0, 0.5, 1.0, float("nan"), float("inf"), -float("inf"), 3e38, -1.0])
 
 
@@ -70,11 +72,11 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "snapshot": (msg.SnapshotReport, convert.snapshot_from_msg),
     "restart": (msg.RestartPolicy, convert.restart_from_msg),
     "order": (srv.ControlHost.Request, order_from_msg),
-    "submit": (srv.Submit.Request, lambda one: services._submitted(one, 1)),
-    "cancel": (srv.Cancel.Request, lambda one: services._cancelled(one, 1)),
-    "migrate": (srv.Migrate.Request, lambda one: services._migrated(one, 1)),
-    "host state": (srv.SetHostState.Request, lambda one: services._host_set(one, 1)),
-    "prune": (srv.Prune.Request, lambda one: services._pruned(one, 1)),
+    "submit": (srv.Submit.Request, lambda one: services._submitted(one, 1, SENDER)),
+    "cancel": (srv.Cancel.Request, lambda one: services._cancelled(one, 1, SENDER)),
+    "migrate": (srv.Migrate.Request, lambda one: services._migrated(one, 1, SENDER)),
+    "host state": (srv.SetHostState.Request, lambda one: services._host_set(one, 1, SENDER)),
+    "prune": (srv.Prune.Request, lambda one: services._pruned(one, 1, SENDER)),
     "event row": (msg.Event, convert.event_from_msg),
     "plugin row": (msg.PluginState, convert.plugin_row_from_msg),
     "host row": (msg.HostState, convert.host_row_from_msg),

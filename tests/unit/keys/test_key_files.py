@@ -1,7 +1,8 @@
-"""Files of keys: who may read them, and what is in them."""
+"""Key files: their owners, modes and content."""
 
 from __future__ import annotations
 
+import base64
 import os
 import stat
 from concurrent.futures import ThreadPoolExecutor
@@ -13,11 +14,12 @@ from rosrm.errors import ConfigError
 from rosrm.keys import key_files
 from rosrm.keys.cluster import OWN, Principals
 from rosrm.keys.roles import Principal, Role, principal_of
+from rosrm.keys.sealing import Opener, Sealer
 
 ROBOT, ADA = Principal("host", "robot-1"), Principal("user", "ada")
 
 
-def test_the_secret_is_drawn_once_and_is_its_owners_alone(tmp_path: Path) -> None:
+def test_the_secret_is_created_once_and_only_its_owner_can_read_it(tmp_path: Path) -> None:
     """Many processes that start at once share one secret, in a file of mode 0600."""
     home = tmp_path / "keys"
     with ThreadPoolExecutor(8) as pool:
@@ -37,7 +39,7 @@ def test_grants_of_commands_at_the_same_time_are_all_kept(tmp_path: Path) -> Non
 
 
 def test_each_change_of_grants_or_secret_changes_their_version(tmp_path: Path) -> None:
-    """A running master looks at the version, and reads the files again after a change."""
+    """A running master compares the version, and reads the files again after a change."""
     changes = [
         lambda: key_files.make_secret(tmp_path),
         lambda: key_files.add_grant(tmp_path, ROBOT, Role.HOST),
@@ -79,21 +81,22 @@ def test_a_directory_of_keys_that_cannot_be_used_is_refused(tmp_path: Path, faul
         key_files.make_secret(home)
 
 
-def test_a_key_file_opens_what_its_grant_allows_until_it_is_revoked(tmp_path: Path) -> None:
-    """A new key ends the former one, and a revoked one has no successor of its number."""
+def test_a_key_file_is_valid_until_its_grant_is_revoked(tmp_path: Path) -> None:
+    """A new key ends the former one; the generation of a revoked key is not used again."""
     secret = key_files.make_secret(tmp_path)
     first = key_files.add_grant(tmp_path, ROBOT, Role.HOST)
     path = tmp_path / "robot-1.key"
     key_files.write_key(path, secret.key_of(first))
     held = key_files.read_key(path)
-    known = Principals(secret, key_files.read_grants(tmp_path)).key_of(ROBOT, held.grant.generation)
-    assert known == held
+    assert held == secret.key_of(first)
+    known = Principals(key_files.read_grants(tmp_path))
+    assert known.valid_grant(ROBOT, held.grant.generation) == held.grant
     before = key_files.grants_version(tmp_path)
     second = key_files.add_grant(tmp_path, ROBOT, Role.HOST)
     assert key_files.grants_version(tmp_path) != before
-    valid = Principals(secret, key_files.read_grants(tmp_path))
-    assert valid.key_of(ROBOT, first.generation) is None
-    assert valid.key_of(ROBOT, second.generation) is not None
+    valid = Principals(key_files.read_grants(tmp_path))
+    assert valid.valid_grant(ROBOT, first.generation) is None
+    assert valid.valid_grant(ROBOT, second.generation) == second
     key_files.revoke(tmp_path, [ROBOT])
     with pytest.raises(ConfigError, match="no key of host:robot-1"):
         key_files.revoke(tmp_path, [ROBOT])
@@ -108,7 +111,8 @@ def test_a_process_finds_its_own_key(tmp_path: Path) -> None:
     own = key_files.find_key("host", "robot-1", tmp_path)
     assert own is not None
     assert (own.grant.principal, own.grant.generation) == (ROBOT, OWN)
-    assert Principals(secret).key_of(ROBOT, OWN) == own
+    assert Principals().valid_grant(ROBOT, OWN) == own.grant
+    assert secret.key_of(own.grant) == own
     key = secret.key_of(key_files.add_grant(tmp_path, ROBOT, Role.HOST))
     path = tmp_path / "any name.key"
     key_files.write_key(path, key)
@@ -119,7 +123,7 @@ def test_a_process_finds_its_own_key(tmp_path: Path) -> None:
     assert me.grant.role is Role.OPERATOR
 
 
-def test_keys_of_two_users_are_not_guessed_at(tmp_path: Path) -> None:
+def test_keys_of_two_users_are_refused_without_a_choice(tmp_path: Path) -> None:
     """The message names both files and the variable that chooses."""
     secret = key_files.make_secret(tmp_path)
     for name in ("ada", "bob"):
@@ -132,7 +136,7 @@ def test_keys_of_two_users_are_not_guessed_at(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o644, 0o660])
 def test_a_file_that_others_can_open_is_refused(tmp_path: Path, mode: int) -> None:
-    """As by ssh; the message says how to mend it."""
+    """As by ssh; the message names the remedy."""
     key_files.make_secret(tmp_path)
     path = tmp_path / key_files.CLUSTER_FILE
     path.chmod(mode)
@@ -143,7 +147,7 @@ def test_a_file_that_others_can_open_is_refused(tmp_path: Path, mode: int) -> No
 def test_a_link_a_pipe_and_a_file_of_another_user_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """None is followed or waited for."""
+    """No link is followed, and opening a pipe does not block."""
     key_files.make_secret(tmp_path)
     path = tmp_path / key_files.CLUSTER_FILE
     with monkeypatch.context() as patch:
@@ -168,12 +172,52 @@ def test_a_link_a_pipe_and_a_file_of_another_user_are_refused(
     ],
 )  # fmt: skip
 def test_an_invalid_secret_is_refused(tmp_path: Path, content: str) -> None:
-    """Never a traceback."""
+    """The error is a `ConfigError`."""
     path = tmp_path / key_files.CLUSTER_FILE
     path.touch(mode=0o600)
     path.write_text(content)
     with pytest.raises(ConfigError, match=r"cluster\.key"):
         key_files.read_secret(tmp_path)
+
+
+@pytest.mark.parametrize("value", ["true", "yes", "'true'", "1", "2026-11-23", ""])
+def test_a_grant_with_any_mark_is_revoked(tmp_path: Path, value: str) -> None:
+    """Operators edit the file, too; only `false` leaves a grant valid."""
+    path = tmp_path / key_files.GRANTS_FILE
+    path.touch(mode=0o600)
+    row = "principal: user:a, role: viewer, generation: 1, revoked:"
+    path.write_text(f"principals: [{{{row} {value}}}, {{{row} false}}]")
+    assert len(key_files.read_grants(tmp_path)) == 1
+
+
+def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path, monkeypatch) -> None:
+    """A grant without its last line would no longer be revoked."""
+    key_files.add_grant(tmp_path, ADA, Role.VIEWER)
+    key_files.revoke(tmp_path, [ADA])
+    whole = (tmp_path / key_files.GRANTS_FILE).read_bytes()
+    monkeypatch.setattr(key_files, "_LARGEST", whole.index(b"  revoked"))
+    with pytest.raises(ConfigError, match="has more than"):
+        key_files.read_grants(tmp_path)
+    monkeypatch.setattr(key_files, "_LARGEST", len(whole))
+    with pytest.raises(ConfigError, match=r"cannot be written: .* more than"):
+        key_files.add_grant(tmp_path, ROBOT, Role.HOST)
+    assert (tmp_path / key_files.GRANTS_FILE).read_bytes() == whole
+
+
+def test_no_error_or_repr_shows_a_key(tmp_path: Path) -> None:
+    """A slave logs the error about its key file, and logs have more readers than key files."""
+    secret = key_files.make_secret(tmp_path)
+    held = secret.key_of(key_files.add_grant(tmp_path, ROBOT, Role.HOST))
+    path = tmp_path / "robot-1.key"
+    key_files.write_key(path, held)
+    text = path.read_text()
+    path.write_text(text.replace("role: host", "role: robot"))
+    with pytest.raises(ConfigError, match="'robot' is not a valid Role") as refused:
+        key_files.read_key(path)
+    assert "host:robot-1" in str(refused.value)
+    assert base64.b64encode(held.key).decode() not in str(refused.value)
+    shown = repr((held, Sealer(held.key), Opener(held.key)))
+    assert repr(held.key)[2:-1] not in shown
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ def master(run: bytes = bytes(RUN_BYTES)) -> KeyedLink:
 
 @pytest.mark.parametrize("ends", [(member(), master()), (OpenLink(b"a"), OpenLink(b"b"))])
 def test_an_answer_belongs_to_its_request(ends: tuple[Link, Link]) -> None:
-    """A request and its answer, each bound to what came before it."""
+    """A request is bound to a run, and an answer to its request."""
     user, server = ends
     request = user.seal(CHANNELS[0], b"submit this", b"run of the master")
     assert server.open(CHANNELS[0], request, b"run of the master") == b"submit this"
@@ -48,8 +48,40 @@ def test_a_message_opens_only_where_it_was_sent() -> None:
     assert master().open(CHANNELS[0], request, b"run") == b"x"
 
 
+@pytest.mark.parametrize("ends", [(member(), master()), (OpenLink(b"a"), OpenLink(b"b"))])
+def test_an_opener_opens_all_messages_of_a_run(ends: tuple[Link, Link]) -> None:
+    """The master opens readings in this way."""
+    slave, server = ends
+    sent = [slave.seal(CHANNELS[0], text, b"run") for text in (b"one", b"two")]
+    opened = server.opener(CHANNELS[0], sent[0].run)
+    assert [opened(one.counter, one.body, b"run") for one in sent] == [b"one", b"two"]
+
+
+def test_an_opener_and_the_link_open_each_message_once() -> None:
+    """They share the newest counter, also after the link has made another opener."""
+    slave, server = member(), master()
+    first, second = (slave.seal(CHANNELS[0], text) for text in (b"one", b"two"))
+    opened = server.opener(CHANNELS[0], first.run)
+    assert opened(first.counter, first.body, b"") == b"one"
+    assert server.open(CHANNELS[0], first) is None
+    assert server.open(CHANNELS[0], second) == b"two"
+    assert opened(second.counter, second.body, b"") is None
+    again = server.opener(CHANNELS[0], first.run)
+    assert again(second.counter, second.body, b"") is None
+
+
+def test_recordings_of_former_runs_make_no_counter_be_forgotten() -> None:
+    """A stranger may have recorded any number of them, and repeats them all at once."""
+    end, sent = master(), member().seal(CHANNELS[0], b"x", b"this run")
+    assert end.open(CHANNELS[0], sent, b"this run") == b"x"
+    for _ in range(300):
+        recorded = member(os.urandom(RUN_BYTES)).seal(CHANNELS[0], b"y", b"former run")
+        assert end.open(CHANNELS[0], recorded, b"former run", is_bound=False) == b"y"
+    assert end.open(CHANNELS[0], sent, b"this run") is None
+
+
 class Conversation(RuleBasedStateMachine):
-    """Members start again, send, and a stranger repeats, delays and changes all that it sees."""
+    """A principal restarts and sends; a stranger repeats, delays and changes all its messages."""
 
     @initialize()
     def begin(self) -> None:

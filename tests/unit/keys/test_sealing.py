@@ -39,7 +39,7 @@ def test_the_format_is_that_of_the_test_vectors() -> None:
 
 @given(st.lists(st.binary(max_size=300), max_size=8), st.binary(max_size=40))
 def test_messages_are_opened_once_and_in_order(messages: list[bytes], context: bytes) -> None:
-    """Each message opens as it was; a repeated or an overtaken one does not."""
+    """Each message opens unchanged; a repeated or late message does not open."""
     sealer, opener = Sealer(KEY), Opener(KEY)
     sent = [(message, sealer.seal(message, context), sealer.counter) for message in messages]
     for message, sealed, counter in sent:
@@ -51,7 +51,7 @@ def test_messages_are_opened_once_and_in_order(messages: list[bytes], context: b
 
 @given(st.data())
 def test_a_changed_message_does_not_open(data: st.DataObject) -> None:
-    """A bit, the counter, the context or the length that differs; the true message still opens."""
+    """A bit, the counter, the context or the length differs; the genuine message still opens."""
     message, context = data.draw(st.binary(max_size=60)), data.draw(st.binary(max_size=20))
     sealer, opener = Sealer(KEY), Opener(KEY)
     sealed = sealer.seal(message, context)

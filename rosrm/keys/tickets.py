@@ -1,0 +1,76 @@
+"""Tickets: permission to send requests of one kind to a slave, without the key of its host.
+
+The master sends the bearer the text of a ticket, and a key that is derived from the key of the
+slave's host and that text. Each request contains the text, and the slave derives the same key from
+it. So the master sends nothing to the slave, and the slave stores nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final, NamedTuple
+
+from rosrm.errors import ConfigError
+from rosrm.keys.derivation import derived
+from rosrm.keys.roles import Principal, principal_of
+
+#: Seconds for which a ticket is valid.
+TICKET_LIFE: Final = 60.0
+
+_PREFIX: Final = "ticket:"
+_NUMBER: Final = re.compile(r"[0-9]{1,20}")
+_LIFE_NS: Final = int(TICKET_LIFE * 1e9)
+
+
+class Ticket(NamedTuple):
+    """Permission for requests to one service of one slave.
+
+    Attributes:
+        until: time of the slave's monotonic clock at which the ticket expires, ns.
+        version: of the keys with which the master made it. When a key is revoked, the tickets of
+            earlier versions are void.
+        service: name of the slave's service, for example "read_log".
+        process: the process of all requests.
+        bearer: the principal that got the ticket.
+    """
+
+    until: int
+    version: int
+    service: str
+    process: str
+    bearer: Principal
+
+    def is_valid(self, now: int) -> bool:
+        """Return True if a ticket is in force at a time of the slave's clock, ns.
+
+        That clock begins again when the host boots. So a ticket from before, which seems to be
+        valid for longer than any ticket, is void.
+        """
+        return now <= self.until <= now + _LIFE_NS
+
+    def text(self) -> str:
+        """Return the ticket as text for messages."""
+        return f"{_PREFIX}{self.until}:{self.version}:{self.service}:{self.process}:{self.bearer}"
+
+    def key(self, host_key: bytes) -> bytes:
+        """Return the key of the bearer, from the key of the slave's host."""
+        return derived(host_key, "ticket", self.text())
+
+
+def ticket_of(text: str) -> Ticket | None:
+    """Return the ticket of a text; None: the text is none.
+
+    A ticket has exactly one text, because the counters of its messages belong to the text. With a
+    second one, such as "007" for 7, a stranger could repeat its messages.
+    """
+    until, _, rest = text.removeprefix(_PREFIX).partition(":")
+    version, _, rest = rest.partition(":")
+    service, _, rest = rest.partition(":")
+    process, _, bearer = rest.partition(":")
+    if not (text.startswith(_PREFIX) and _NUMBER.fullmatch(until) and _NUMBER.fullmatch(version)):
+        return None
+    try:
+        ticket = Ticket(int(until), int(version), service, process, principal_of(bearer))
+    except ConfigError:
+        return None
+    return ticket if ticket.text() == text else None
