@@ -6,7 +6,7 @@ orders.py               orders of the master to a slave
 event_kinds.py          the kinds of events in the event record
 records.py              records and intents, and the protocol of a journal
 rows.py                 rows of listings
-requester.py            who sends a request, and on which processes it may act
+requester.py            sender of a request, and its rights on processes
 ros_settings.py         ROS settings of a part: domain, discovery, transports, interface
 codec.py                conversion of values to JSON and back
 durations.py            bound of all times

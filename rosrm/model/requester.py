@@ -1,4 +1,4 @@
-"""Requester: who sends a request to the master, and on which processes it may act."""
+"""Requester: the sender of a request to the master, and its rights on processes."""
 
 from __future__ import annotations
 
@@ -23,5 +23,5 @@ class Requester:
         return self.is_operator or (self.name != "" and self.name == owner)
 
 
-#: Operator without a name: requests in simulations, and in recordings that do not name one.
+#: Operator without a name, for simulations, and for recordings without names of requesters.
 OPERATOR: Final = Requester(is_operator=True)

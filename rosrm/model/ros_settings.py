@@ -80,7 +80,7 @@ class RosSettings:
             )
 
     def _check_interface(self) -> None:
-        """Raise `ConfigError` for an interface beside a setting by which Fast DDS ignores it."""
+        """Raise `ConfigError` if Fast DDS would ignore the interface because of another setting."""
         joined = self._in_force()
         interface = self.interface_in_force()
         conflict = ""

@@ -140,6 +140,8 @@ class Listing:
         uptime: seconds since the start of the master.
         last_sequence: sequence of the newest event.
         trouble: why the master accepts no new work now; "": it accepts work.
+        security: "keys", or "none": messages need no key.
+        strangers: messages without a valid key, as a sentence; "": none in the last hour.
     """
 
     master: str
@@ -150,6 +152,8 @@ class Listing:
     plugins: Sequence[PluginRow] = ()
     events: Sequence[EventRow] = ()
     trouble: str = ""
+    security: str = "keys"
+    strangers: str = ""
 
 
 @dataclass(frozen=True, slots=True)

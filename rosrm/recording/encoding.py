@@ -63,8 +63,8 @@ _ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
 )
 #: Bits of an order's number to its series, in recordings of rosrm 0.1.0.
 _SERIES_OF_0_1_0: Final = MappingProxyType({41: "replication", 42: "capability", 43: "periodic"})
-#: Events with other names in recordings of rosrm 0.1.0: by former name the name, the field, and its
-#: former name.
+#: Events that recordings of rosrm 0.1.0 name differently: former name of the event to its name, a
+#: field, and the former name of that field.
 _RENAMED: Final = MappingProxyType(
     {
         "HostRegistered": ("HostRegistered", "snapshots", "kept"),

@@ -159,7 +159,7 @@ class SnapshotsReported:
 
 @dataclass(frozen=True, slots=True)
 class SubmissionReceived:
-    """A client submits processes, and owns them from now on: all are accepted, or none."""
+    """A user submits processes, and becomes their owner: all are accepted, or none."""
 
     request: int
     specs: tuple[ProcessSpec, ...]
@@ -316,6 +316,14 @@ class PeerRefused:
 
 
 @dataclass(frozen=True, slots=True)
+class KeyRevoked:
+    """The key of a slave was revoked: the network layer drops all further messages of it."""
+
+    host_id: int
+    incarnation: int
+
+
+@dataclass(frozen=True, slots=True)
 class TimePassed:
     """Time passed without another event; deadlines are checked."""
 
@@ -343,5 +351,6 @@ Event = (
     | HandoffReported
     | SourceStranded
     | PeerRefused
+    | KeyRevoked
     | TimePassed
 )

@@ -18,7 +18,7 @@ _ROUNDING: Final = 1e-9
 
 
 def check_quota(state: MasterState, specs: Iterable[ProcessSpec], by: Requester) -> None:
-    """Refuse to queue processes of a requester that would exceed its quota together."""
+    """Refuse processes that would together exceed the quota of their requester."""
     quota = _quota_of(state, by)
     if not quota:
         return
@@ -27,13 +27,13 @@ def check_quota(state: MasterState, specs: Iterable[ProcessSpec], by: Requester)
         for process in state.processes.values()
         if process.principal == by.name and not process.phase.is_terminal
     )
-    in_use, asked = _usage(state, live), _usage(state, specs)
+    in_use, requested = _usage(state, live), _usage(state, specs)
     exceeded = [
         f"{resource}: {_text(resource, in_use[resource])} in use, "
-        f"{_text(resource, asked[resource])} more asked for, {_text(resource, limit)} allowed"
+        f"{_text(resource, requested[resource])} more requested, {_text(resource, limit)} allowed"
         for resource, limit in quota.items()
         # Negated, because every comparison with NaN is false.
-        if not in_use[resource] + asked[resource] <= limit * (1.0 + _ROUNDING)
+        if not in_use[resource] + requested[resource] <= limit * (1.0 + _ROUNDING)
     ]
     if exceeded:
         raise RequestRefused(

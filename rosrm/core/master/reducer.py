@@ -24,6 +24,7 @@ HandoffReported         notes the reported phase of a handoff's source or destin
 SourceStranded          lets a silent source resume whose handoff is not under way
 AssignmentWithdrawn     returns the process to its place in the queue
 PeerRefused             records the refusal
+KeyRevoked              gives the host no work; its silence does the rest
 TimePassed              checks every deadline: silence, delivery, steps, hysteresis
 ======================  =========================================================================
 """
@@ -56,6 +57,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.UsagesReceived: registration.usages_received,
         happened.SnapshotsReported: replication.snapshots_reported,
         happened.PeerRefused: registration.peer_refused,
+        happened.KeyRevoked: registration.key_revoked,
         happened.StatusesReceived: lifecycle.statuses_received,
         happened.AssignmentWithdrawn: lifecycle.assignment_withdrawn,
         happened.SubmissionReceived: requests.submission_received,

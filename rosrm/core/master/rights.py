@@ -1,4 +1,4 @@
-"""Rights of requesters on processes: an owner may act on its own processes, an operator on all."""
+"""Rights on processes: an owner may act on its own processes, an operator on all."""
 
 from __future__ import annotations
 

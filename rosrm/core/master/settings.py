@@ -33,7 +33,7 @@ class CoreSettings:
         keep_ended: number of the newest terminal processes that are not garbage-collected.
         max_hosts: most hosts, also of those that left or are lost.
         max_processes: most processes that have not ended.
-        quotas: principal, or `DEFAULT_QUOTA`, to its limits: "processes", and base units of
+        quotas: limits by principal, or `DEFAULT_QUOTA`: "processes", and base units of
             "memory" and "cpu". A missing limit is that of the default.
     """
 

@@ -239,6 +239,22 @@ def test_a_silent_host_is_suspect_and_gets_no_work() -> None:
     assert cluster.where("q") == ["a"]
 
 
+def test_a_host_whose_key_was_revoked_gets_no_work() -> None:
+    """The master keeps its processes until the lease ends, because the slave obeys its fences."""
+    cluster = Cluster("a").with_processes(process("before"))
+    cluster.tell(happened.KeyRevoked(1, cluster.machines["a"].incarnation + 1))
+    assert not cluster.recorded("peer_refused")  # another run of the slave, with a new key
+    cluster.tell(happened.KeyRevoked(1, cluster.machines["a"].incarnation))
+    assert "host:a was refused: its key was revoked" in cluster.recorded("peer_refused")[0]
+    cluster.submit(process("after"))
+    assert cluster.queue() == ["after"]
+    assert cluster.phase("before") == "running"
+    cluster.cut("a", seconds=2.0)
+    assert cluster.restart_slave("a").accepted
+    cluster.settle()
+    assert cluster.queue() == []
+
+
 def test_a_host_with_a_long_period_is_not_silent() -> None:
     """The host is suspect after three of its own periods, and its lease grows by the same time."""
     cluster = Cluster(Machine("slow", period=4.0), "quick", suspect=1.0, lease=10.0)

@@ -45,15 +45,15 @@ def jobs(number: int, first: int = 0, **fields: float) -> list[ProcessSpec]:
         ({"default": {"processes": 2}, "user:root": {"memory": 1e12}}, ROOT, 9),
     ],
 )
-def test_whose_quota_holds(quotas: Quotas, by: Requester, allowed: int) -> None:
-    """A limit of the user's own entry, else of the default; of operators only their own entry."""
+def test_the_quota_of_a_user(quotas: Quotas, by: Requester, allowed: int) -> None:
+    """A limit of the user's own entry, else of the default; for operators, only of their own."""
     cluster = Cluster("a", quotas=quotas)
     accepted = sum(submit(cluster, by, one).accepted for one in jobs(9))
     assert accepted == allowed
 
 
 def test_a_submission_beyond_a_quota_is_refused_as_a_whole() -> None:
-    """The message has the user, the limit, what is in use and what was asked for."""
+    """The message has the user, the limit, the amount in use and the requested amount."""
     cluster = Cluster("a", quotas={"default": {"processes": 3, "memory": 1e9, "cpu": 2.5}})
     two = [process(f"p{at}", needs={"memory": 400e6, "cpu": 1.0}) for at in range(2)]
     assert submit(cluster, ADA, *two).accepted
@@ -62,9 +62,9 @@ def test_a_submission_beyond_a_quota_is_refused_as_a_whole() -> None:
     reply = submit(cluster, ADA, *more)
     assert (reply.accepted, reply.code) == (False, "quota")
     assert reply.message == (
-        "user:ada would exceed its quota of processes: 2 in use, 2 more asked for, 3 allowed; "
-        "memory: 800 MB in use, 300 MB more asked for, 1.0 GB allowed; "
-        "cpu: 2 cores in use, 1 cores more asked for, 2.5 cores allowed. Cancel processes, or ask "
+        "user:ada would exceed its quota of processes: 2 in use, 2 more requested, 3 allowed; "
+        "memory: 800 MB in use, 300 MB more requested, 1.0 GB allowed; "
+        "cpu: 2 cores in use, 1 cores more requested, 2.5 cores allowed. Cancel processes, or ask "
         "an operator for a larger quota (`quotas` in cluster.yaml). Nothing was queued"
     )
     assert cluster.intents["process"] == before
@@ -109,7 +109,7 @@ def test_needs_are_declared_or_learned_or_the_default() -> None:
 
 
 def test_the_journal_is_restored_beyond_a_quota() -> None:
-    """A smaller quota refuses new processes alone."""
+    """A smaller quota refuses only new processes."""
     cluster = Cluster("a", quotas={"default": {"processes": 5}})
     submit(cluster, ADA, *jobs(5))
     object.__setattr__(cluster.settings, "quotas", {"default": {"processes": 1}})
@@ -128,7 +128,7 @@ def test_needs_that_add_up_to_the_limit_are_within_it() -> None:
 
 @pytest.mark.parametrize("cpu", [math.nan, math.inf, 1e308])
 def test_needs_that_are_no_amount_are_beyond_every_quota(cpu: float) -> None:
-    """The network layer refuses them; the core counts on nothing."""
+    """The network layer refuses them, and so does the core."""
     cluster = Cluster("a", quotas={"default": {"cpu": 32.0}})
     assert submit(cluster, ADA, *[job(name, needs={"cpu": cpu}) for name in "pq"]).code == "quota"
 

@@ -1,4 +1,4 @@
-"""Owners of processes: who may act on them, in each request, and across restarts of the master."""
+"""Owners of processes: their rights in each request, and after restarts of the master."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_the_name_of_an_ended_process_stays_with_its_owner() -> None:
 
 
 def test_a_restart_by_an_operator_keeps_the_owner() -> None:
-    """The owner is who submitted the process."""
+    """The owner is the user that submitted the process."""
     cluster = Cluster("a")
     submit(cluster, ADA, job("p"))
     cluster.finish("p")

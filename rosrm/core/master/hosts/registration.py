@@ -292,3 +292,15 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
 def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:
     """Record a message that was refused at the network edge."""
     state.record(now, EventKind.PEER_REFUSED, f"{event.who} was refused: {event.reason}")
+
+
+def key_revoked(state: MasterState, event: happened.KeyRevoked, now: float) -> None:
+    """Give a host no more work: its slave could not fetch the assignment."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is not None:
+        state.hosts.withdraw_request(host)
+        state.record(
+            now, EventKind.PEER_REFUSED,
+            f"host:{host.name} was refused: its key was revoked; its messages are dropped",
+            host=host.name,
+        )  # fmt: skip

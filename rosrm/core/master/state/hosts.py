@@ -217,6 +217,11 @@ class HostTable(HostColumns):
             self.asking[host.column] = True
             self.changed()
 
+    def withdraw_request(self, host: Host) -> None:
+        """Note that a host no longer requests work."""
+        self.asking[host.column] = False
+        self.changed()
+
     def set_condition(self, host: Host, condition: HostCondition) -> None:
         """Set the condition of a host."""
         self.condition[host.column] = condition

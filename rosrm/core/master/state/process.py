@@ -158,7 +158,7 @@ class Process:
 
     Attributes:
         order: place in the queue; unchanged when the process returns to the queue.
-        principal: principal that submitted it and so owns it, "user:ada"; "": unknown.
+        principal: owner, the user that submitted the process, "user:ada"; "": unknown.
         since: start of its phase by this master's clock; earlier than the master's own start if the
             phase is from the journal.
         wall: unix time of the start of its phase.
