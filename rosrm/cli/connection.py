@@ -18,6 +18,7 @@ from rosrm.model.ros_settings import RosSettings
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
+    from rosrm.keys.roles import SecurityMode
     from rosrm.model.rows import Listing
     from rosrm.ros.master_connection import MasterClient
 
@@ -43,7 +44,9 @@ def master(ctx: typer.Context, domain: int | None) -> Iterator[Client]:
     """Create a client of the master for one command."""
     from rosrm.client.client import Client  # noqa: PLC0415 - `rosrm --help` has no use for it
 
-    with Client(connection=connect(ros_settings(ctx, domain)), notify=note) as client:
+    cluster = ctx.obj.cluster if isinstance(ctx.obj, CommonOptions) else None
+    security = connecting.security_mode(cluster)
+    with Client(connection=connect(ros_settings(ctx, domain), security), notify=note) as client:
         yield client
 
 
@@ -58,7 +61,9 @@ def print_trouble(snapshot: Listing) -> None:
         note(snapshot.trouble)
 
 
-def connect(settings: RosSettings) -> MasterClient:
+def connect(settings: RosSettings, security: SecurityMode | None = None) -> MasterClient:
     """Find the master within `REPORT_WITHIN` of the start, but for at least `SHORTEST_SEARCH`."""
     timeout = max(SHORTEST_SEARCH, REPORT_WITHIN - (time.monotonic() - BEGUN))
-    return connecting.connect(settings, timeout=timeout, joined=early.take(settings), begun=BEGUN)
+    return connecting.connect(
+        settings, timeout=timeout, security=security, joined=early.take(settings), begun=BEGUN
+    )

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
-from rosrm.client.connecting import connect, ros_settings, row_of
+from rosrm.client.connecting import connect, ros_settings, row_of, security_mode
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.errors import Refused
 from rosrm.model.ros_settings import RosSettings
@@ -50,7 +50,8 @@ class Client:
 
     Args:
         domain: ROS domain; replaces ROS_DOMAIN_ID and the domain of `cluster`.
-        cluster: path of a cluster.yaml whose `ros` section says how to join ROS.
+        cluster: path of a cluster.yaml whose `ros` section says how to join ROS, and whose
+            `security` decides if this client uses a key.
         ros: all settings with which to join ROS, in place of `domain` and `cluster`.
         timeout: seconds for finding the master; a request is given as many, and at least 10.
         notify: takes a sentence when the master is silent, when it answers again, and when a part
@@ -58,9 +59,9 @@ class Client:
         connection: to the master, in place of all that finds one; the client closes it.
 
     Raises:
-        NoMaster: no master answered in time.
+        NoMaster: no master answered in time, or this user has no key.
         Refused: the master is of another version.
-        ConfigError: ROS cannot use a setting, or `cluster` is wrong.
+        ConfigError: ROS cannot use a setting, `cluster` is wrong, or a key file is invalid.
         RosrmError: ROS 2 cannot be imported.
     """
 
@@ -69,7 +70,9 @@ class Client:
         ros: RosSettings | None = None, timeout: float = 3.0, notify: Notify = _warn,
         connection: MasterClient | None = None,
     ) -> None:  # fmt: skip
-        self._master = connection or connect(ros or ros_settings(domain, cluster), timeout=timeout)
+        self._master = connection or connect(
+            ros or ros_settings(domain, cluster), timeout=timeout, security=security_mode(cluster)
+        )
         self._notify = notify
 
     # --- requests ------------------------------------------------------------------------

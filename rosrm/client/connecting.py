@@ -14,7 +14,8 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.wording import no_such
 
 if TYPE_CHECKING:
-    from rosrm.config.settings import ClusterConfig, SecurityMode
+    from rosrm.config.settings import ClusterConfig
+    from rosrm.keys.roles import SecurityMode
     from rosrm.ros.master_connection import MasterClient
     from rosrm.ros.participant import Participant
 
@@ -39,7 +40,7 @@ def ros_settings(
 
 
 def security_mode(cluster: str | os.PathLike[str] | None = None) -> SecurityMode:
-    """Return the security of a client: that of the file, or else ROSRM_SECURITY, or else "keys".
+    """Return the security of a client: of the file, else of ROSRM_SECURITY, else "keys".
 
     Args:
         cluster: a cluster.yaml; None: that of ROSRM_CLUSTER.
@@ -64,19 +65,21 @@ def _cluster_file(cluster: str | os.PathLike[str] | None) -> ClusterConfig | Non
 
 
 def connect(
-    settings: RosSettings, *, timeout: float, joined: Participant | None = None,
-    begun: float | None = None,
+    settings: RosSettings, *, timeout: float, security: SecurityMode | None = None,
+    joined: Participant | None = None, begun: float | None = None,
 ) -> MasterClient:  # fmt: skip
     """Find the master.
 
     Args:
         settings: with which to join ROS.
         timeout: seconds for finding the master.
+        security: of the client; None: that of the environment, as `security_mode` returns it.
         joined: a participant with these settings, which the connection then owns.
         begun: monotonic time since which the user waits, for the message; None: since now.
 
     Raises:
-        NoMaster: none answered in time.
+        ConfigError: a key file is invalid, or others can read it.
+        NoMaster: none answered in time, or this user has no key.
         Refused: the master is of another version.
         RosrmError: ROS 2 cannot be imported.
     """
@@ -92,7 +95,10 @@ def connect(
             "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
         ) from None
     name = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
-    return MasterClient.connect(settings, name=name, timeout=timeout, joined=joined, begun=begun)
+    return MasterClient.connect(
+        settings, name=name, timeout=timeout, security=security or security_mode(), joined=joined,
+        begun=begun,
+    )  # fmt: skip
 
 
 def row_of(kind: str, name: str, rows: Mapping[str, Row]) -> Row:

@@ -72,12 +72,12 @@ def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -
 
 
 def _check_users(quotas: Node | None, problems: Problems) -> None:
-    """Note each quota whose key is no name of a user."""
+    """Add a problem for each quota whose key is no name of a user."""
     for name, quota in (quotas.items if quotas else {}).items():
         try:
             principal_of(f"user:{name}")
         except ConfigError:
-            fault = f"quotas: {name!r} names no user; for user:ada write ada"
+            fault = f"quotas: {name!r} is no name of a user; for user:ada write ada"
             problems.add(quota.key_place or quota.place, fault)
 
 

@@ -13,7 +13,7 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.markers import NullIsEmpty, OptionsByName, PlainWord, RosSection
 from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings
@@ -27,6 +27,7 @@ from rosrm.extensions.units import (
     Quantity,
     Seconds,
 )
+from rosrm.keys.roles import SecurityMode
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import EMPTY
@@ -39,7 +40,7 @@ _CORE: Final = CoreSettings()
 Options = Annotated[Mapping[str, Any], NullIsEmpty()]
 Ros = Annotated[RosSettings, RosSection()]
 Scope = Literal["machine", "cgroup", "slice"]
-SecurityMode = Literal["keys", "none"]
+Word = TypeVar("Word", bound=str)
 
 
 def default_state(name: str, role: str) -> Path:
@@ -54,24 +55,25 @@ def default_scope() -> Scope:
     Raises:
         ConfigError: the variable has a value that is not allowed.
     """
-    scopes: Mapping[str, Scope] = {"": "machine", "machine": "machine", "cgroup": "cgroup"}
-    word = os.environ.get("ROSRM_SCOPE", "")
-    if word not in scopes:
-        raise ConfigError(f"ROSRM_SCOPE={word!r}; allowed: machine, cgroup")
-    return scopes[word]
+    words: Mapping[str, Scope] = {"machine": "machine", "cgroup": "cgroup"}
+    return _word_in("ROSRM_SCOPE", words, "machine")
 
 
 def default_security() -> SecurityMode:
-    """Return the default security of a part: ROSRM_SECURITY, or "keys".
+    """Return the default of `security`: ROSRM_SECURITY, or else "keys".
 
     Raises:
         ConfigError: the variable has a value that is not allowed.
     """
-    modes: Mapping[str, SecurityMode] = {"": "keys", "keys": "keys", "none": "none"}
-    word = os.environ.get("ROSRM_SECURITY", "")
-    if word not in modes:
-        raise ConfigError(f"ROSRM_SECURITY={word!r}; allowed: keys, none")
-    return modes[word]
+    words: Mapping[str, SecurityMode] = {"keys": "keys", "none": "none"}
+    return _word_in("ROSRM_SECURITY", words, "keys")
+
+
+def _word_in(variable: str, words: Mapping[str, Word], default: Word) -> Word:
+    text = os.environ.get(variable, "") or default
+    if text not in words:
+        raise ConfigError(f"{variable}={text!r}; allowed: {', '.join(words)}")
+    return words[text]
 
 
 # --- cluster.yaml -----------------------------------------------------------------------------
@@ -230,12 +232,12 @@ class ClusterConfig:
     Attributes:
         name: name of the cluster and its master.
         ros: domain, discovery and transports.
-        security: "keys": only holders of keys are heard; "none": every participant is.
+        security: "keys": the master accepts only messages of principals with a key; "none": all.
         state: state directory of the master; by default under XDG_STATE_HOME.
         scoring: policy that orders the hosts that fit.
         migration: strategies and limits of migrations.
         queue: order of the queue.
-        quotas: limits by name of a user; "default" holds for users without an entry, and for
+        quotas: limits by name of a user; "default" applies to users without an entry, and to
             limits that an entry does not give.
         defaults: default needs of processes.
         liveness: time limits for silent hosts.
@@ -356,7 +358,7 @@ class HostConfig:
     Attributes:
         host: name of the host; each name has at most one live slave.
         ros: domain, discovery and transports.
-        security: "keys" or "none", as the master's.
+        security: "keys" or "none"; the same as that of the master.
         state: state directory of the slave; by default under XDG_STATE_HOME.
         labels: labels that processes may require, prefer or avoid.
         scope: scope of the probes: the machine, the cgroup of the slave, or the process trees of

@@ -1,8 +1,8 @@
-"""Disclosure: what of a process only its owner and operators may read.
+"""Removal of details that only the owner of a process and operators may read.
 
-Environment and parameters never leave the master, except towards the host of the process. A host
-may quote them in the details of a reason, such as the PATH in which a program was not found.
-Details are the further lines of a text.
+The master sends environment and parameters only to the host of the process. The host may quote them
+in the details of a reason, such as the PATH in which a program was not found. Details are all lines
+of a text after the first.
 """
 
 from __future__ import annotations

@@ -23,6 +23,8 @@ _MOST_STATUSES: Final = 10_000
 _DROPPED: Final = (
     happened.TimePassed, happened.UsagesReceived, happened.PeerRefused, happened.SourceStranded,
 )  # fmt: skip
+#: Events of which only the newest of each host is kept.
+_NEWEST: Final = (happened.ProcessRequested, happened.SnapshotsReported, happened.KeyRevoked)
 
 
 @dataclass(slots=True)
@@ -55,7 +57,7 @@ class JournalStall:
                 note_readings(state, event, self.core_now)
             elif isinstance(event, happened.HostRegistered | happened.ClientRequest):
                 reply(Reply(event.request, False, "journal", self.refusal))
-            elif isinstance(event, happened.ProcessRequested | happened.SnapshotsReported):
+            elif isinstance(event, _NEWEST):
                 self._newest[type(event), event.host_id] = event  # replaces older ones
             elif not isinstance(event, _DROPPED):
                 self._keep(event)

@@ -122,6 +122,34 @@ class MasterQueries:
         shown = disclosed(plain, details=details)
         return json.dumps({**shown, "reason": reason if details else first_line(reason)})
 
+    # --- for introductions ---------------------------------------------------------------
+
+    def host_of(self, process: str, number: int) -> str | None:
+        """Return the host of an instance; None: there is no such instance."""
+        instance = self._state.instances.get(number)
+        if instance is None or instance.id.process != process:
+            return None
+        return instance.host.name
+
+    def may_read_log(self, process: str, by: Requester) -> bool:
+        """Return True if a user may read the logs of a process; of a removed one an operator."""
+        known = self._state.processes.get(process)
+        return by.may_act_on("" if known is None else known.principal)
+
+    def has_held(self, process: str, host: str) -> bool:
+        """Return True if an instance of a process runs on a host, or ended there last."""
+        known = self._state.processes.get(process)
+        if known is None:
+            return False
+        return host == known.ended_on or any(
+            one.host.name == host for one in self._state.instances_of(known)
+        )
+
+    def number_of(self, host: str) -> int | None:
+        """Return the number of a host; None: there is no host of that name."""
+        known = self._state.hosts.by_name.get(host)
+        return None if known is None else known.host_id
+
 
 def _failing_rows(host: Host) -> list[PluginRow]:
     """Return the failing plugins of a host; a probe is named by the resource that it reads."""

@@ -35,6 +35,9 @@ from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy, Scor
 from rosrm.extensions.declared_fields import Declared
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.keys.finding import master_security
+from rosrm.keys.security import Member
+from rosrm.master.grants_watch import GrantsWatch
 from rosrm.master.journal_stall import JournalStall
 from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import MasterQueries
@@ -47,6 +50,7 @@ from rosrm.ros.master.endpoint import MasterEndpoint
 from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.master_connection import find_master
 from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedEndpoints
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.version import __version__
@@ -138,8 +142,11 @@ class MasterRuntime:
             opened.callback(self._journal.close)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_stop_signals(self._stop)
+            security = master_security(config.security)
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
+            self._endpoints = SealedEndpoints(self._participant, security)
+            self._grants = GrantsWatch(security)
             self._refuse_second()
             opened.callback(self._end_record)
             self._state = self._restored(policy, strategies)
@@ -147,7 +154,11 @@ class MasterRuntime:
             self._closing = opened.pop_all()
 
     def _refuse_second(self) -> None:
-        first = find_master(self._participant, f"master {self._config.name}", _DISCOVERY)
+        me = self._config.name
+        security: Member = self._endpoints.security.client()
+        first = find_master(
+            SealedEndpoints(self._participant, security), f"master {me}", _DISCOVERY
+        )
         if first is not None:
             raise Refused(
                 f"a master runs already on {self._config.ros.describe()}: {first.master!r}, pid "
@@ -225,7 +236,7 @@ class MasterRuntime:
             core_now=lambda: self._core_now(self._now()),
             trouble=lambda: self._held.refusal if self._held is not None else "",
         )  # fmt: skip
-        return MasterEndpoint(self._participant, identity, reading, control)
+        return MasterEndpoint(self._endpoints, identity, reading, control)
 
     def _now(self) -> float:
         return time.monotonic()
@@ -270,6 +281,8 @@ class MasterRuntime:
         self._stopping = self._stopping or signal.Signals(number).name
 
     def _tick(self, now: float) -> None:
+        if self._grants.has_changed(now):
+            self._endpoint.shut_revoked()
         self._endpoint.poll_readings()
         self._endpoint.links.expire(now)
         self._endpoint.events.append(happened.TimePassed())

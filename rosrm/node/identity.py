@@ -32,7 +32,7 @@ class NodeIdentity:
         keep: directory of its snapshots; "" if none are written.
         keep_every: greatest age of a snapshot, seconds.
         epoch_file: where the slave writes the newest epoch of the master; "": nowhere.
-        key: secret that the node shares with its master; None: the cluster has no security.
+        key: of the instance, shared with the master; None: with `security: none`.
     """
 
     process: str
@@ -65,7 +65,8 @@ def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
     """Return the identity set by a slave; None if rosrm did not start this process.
 
     Raises:
-        ValueError: the key of the instance is damaged; without it the node would believe everyone.
+        ValueError: the key of the instance is damaged. Without a key the node would accept all
+            messages.
     """
     process, _, number = environment.get("ROSRM_INSTANCE", "").rpartition("#")
     topic = environment.get("ROSRM_STATE_CONFIG", "")
@@ -88,7 +89,7 @@ def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
 
 
 def _key(text: str) -> bytes | None:
-    """Return the key of the instance; None: the cluster has no security."""
+    """Return the key of the instance; None: with `security: none`."""
     if not text:
         return None
     try:

@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any, Final, NamedTuple
 
 from rosrm.errors import Refused
+from rosrm.ros import sealed_codec
 from rosrm_msgs import msg
 
 #: Most letters of a text, and most entries of a sequence.
@@ -23,7 +24,7 @@ LARGEST_MESSAGE: Final = 1 << 26
 LARGEST_SPEC: Final = 1 << 20
 
 _OTHER_LETTERS: Final = {
-    "Sealed.principal": 160,
+    "Sealed.principal": sealed_codec.MOST_LETTERS,
     "KeyValue.value": 1 << 20,
     "ProcessSpec.command": 1 << 17,
     "ProcessSpec.arguments": 1 << 17,
@@ -51,6 +52,8 @@ _OTHER_ENTRIES: Final = {
     "StoreReplica_Request.data": 1 << 20,
     "ReadSnapshot_Response.data": 1 << 20,
     "ReadLog_Response.content": 1 << 20,
+    "Introduce_Response.key": 32,
+    "Introduce_Response.run": 16,
 }
 
 

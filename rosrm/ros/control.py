@@ -17,7 +17,8 @@ from typing import Any, Final
 
 from rosrm.errors import Refused
 from rosrm.ros.bounds import MOST_LETTERS, check_bounds
-from rosrm.ros.participant import OpenRequest, Participant, failed_response
+from rosrm.ros.participant import Participant, failed_response
+from rosrm.ros.sealed import SealedEndpoints, SealedRequest
 from rosrm.version import PROTOCOL_VERSION
 from rosrm.wording import sendable
 from rosrm_msgs.msg import Answer, Envelope, MasterBeat
@@ -87,7 +88,7 @@ class RequestGate:
         self._max_age = max_age
         self._answers: OrderedDict[str, Any] = OrderedDict()
         self._admitted: dict[str, int] = {}
-        self._waiting: dict[str, deque[OpenRequest]] = {}
+        self._waiting: dict[str, deque[SealedRequest]] = {}
 
     def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
         """Return the refusal of a request, or None.
@@ -137,7 +138,7 @@ class RequestGate:
         """Return True if a request of this id was admitted before; its age then does not matter."""
         return envelope.request_id in self._answers
 
-    def repeated(self, envelope: Envelope, request: OpenRequest) -> bool:
+    def repeated(self, envelope: Envelope, request: SealedRequest) -> bool:
         """Return True for a repeated request: it gets the same answer, once there is one."""
         known = self._answers.get(envelope.request_id)
         if known is None:
@@ -162,6 +163,10 @@ class RequestGate:
 _PENDING: Final = object()
 
 
+#: Called with a request, its sealed form (with the sender), and the function that answers it.
+Handle = Callable[[Any, SealedRequest, Callable[[Any], None]], None]
+
+
 class ControlServer:
     """Offers services behind a gate.
 
@@ -170,26 +175,24 @@ class ControlServer:
     """
 
     def __init__(
-        self, participant: Participant, gate: RequestGate,
+        self, endpoints: SealedEndpoints[Any], gate: RequestGate,
         epoch: Callable[[], int | None] = lambda: None,
     ) -> None:  # fmt: skip
-        self._participant = participant
+        self._endpoints = endpoints
         self._gate = gate
         self._epoch = epoch
 
-    def offer(
-        self, service_type: Any, name: str, handle: Callable[[Any, Callable[[Any], None]], None], *,
-        remember: bool = True,
-    ) -> None:  # fmt: skip
+    def offer(self, service_type: Any, name: str, handle: Handle, *, remember: bool = True) -> None:
         """Offer a service.
 
         Args:
-            handle: called with an admitted request and the means to answer it.
+            handle: called with an admitted request, its sealed form with the sender, and the
+                function that answers it.
             remember: keep the answer for repetitions (not for long polls).
         """
         gate = self._gate
 
-        def take(request: Any, open_request: OpenRequest) -> None:
+        def take(request: Any, open_request: SealedRequest) -> None:
             known = gate.knows(request.envelope)
             answer = None if known else gate.refusal(request.envelope, self._epoch())
             if answer is not None:
@@ -203,11 +206,12 @@ class ControlServer:
                     gate.remember(request.envelope, response)
                 open_request.answer(response)
 
-            fault = self._participant.guard.call(handle, request, respond)
+            guard = self._endpoints.participant.guard
+            fault = guard.call(handle, request, open_request, respond)
             if fault and not open_request.answered:
                 respond(failed_response(service_type, fault))
 
-        self._participant.serve(service_type, name, take)
+        self._endpoints.serve(service_type, name, take)
 
 
 def _bounded(response: Any) -> Any:

@@ -16,7 +16,7 @@ _PROFILES: Final = Path(__file__).parent / "profiles"
 _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
 _UDP: Final = "UDPv4"
 
-#: Parts of a profile that replace the builtin transports by one with a single interface.
+#: Part of a profile with a UDP transport on one interface, and the part that selects it.
 _TRANSPORT: Final = """\
   <transport_descriptors><transport_descriptor>
     <transport_id>rosrm_interface</transport_id>
@@ -61,15 +61,15 @@ def announcing(environment: MutableMapping[str, str], pace: Pace, *, udp: bool) 
 
 @contextlib.contextmanager
 def bound(environment: MutableMapping[str, str], pace: Pace, interface: str) -> Iterator[None]:
-    """Bind a participant to one network interface, as `announcing` for UDP alone.
+    """Bind a participant to one network interface, as `announcing` with `udp`.
 
-    Fast DDS reads one profile in the life of a process: the first participant decides. A profile of
-    the user does not apply to the participant.
+    Fast DDS reads its profile once, for the first participant of a process. The profile replaces a
+    profile of the user.
 
     Args:
         environment: of this process.
         pace: frequency of the announcements.
-        interface: its name or IPv4 address.
+        interface: name or IPv4 address of the interface.
     """
     with tempfile.NamedTemporaryFile("w", prefix="rosrm-", suffix=".xml") as file:
         file.write(_bound_profile(pace, interface))

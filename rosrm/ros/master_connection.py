@@ -11,13 +11,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rosrm.errors import NoMaster, Refused
+from rosrm.keys.finding import user_security
+from rosrm.keys.roles import SecurityMode
+from rosrm.keys.security import Member
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import Listing, LogPart
 from rosrm.model.values import ProcessSpec
-from rosrm.ros import convert, names, qos
+from rosrm.ros import convert, names
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.control import ControlClient, check_answer
+from rosrm.ros.introductions import introduction_of, introduction_request
 from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedClient, SealedEndpoints
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import srv
 
@@ -88,16 +93,18 @@ def is_unsure(answer: Any, epoch: int) -> bool:
     return answer.code == "stale" or answer.epoch not in (_UNKNOWN_EPOCH, epoch)
 
 
-def find_master(
-    participant: Participant, who: str, timeout: float
-) -> srv.Handshake.Response | None:
+Endpoints = SealedEndpoints[Member]
+
+
+def find_master(endpoints: Endpoints, who: str, timeout: float) -> srv.Handshake.Response | None:
     """Find a master and shake hands; return its description of itself, None: no answer in time.
 
     `who` is the role and name of the caller.
     """
     deadline = time.monotonic() + timeout
+    participant, master = endpoints.participant, endpoints.security.master
     path = names.Names(participant.settings.namespace)(names.HANDSHAKE)
-    client = participant.node.create_client(srv.Handshake, path, qos_profile=qos.SERVICE)
+    client = endpoints.client(srv.Handshake, path, master, first_contact=True)
     try:
         if not wait_for_service(participant, client, deadline):
             return None
@@ -107,7 +114,7 @@ def find_master(
         )
         return _ask_until_answered(participant, client, request, deadline, _GREET_AGAIN).answer
     finally:
-        participant.node.destroy_client(client)
+        client.destroy()
 
 
 def _ask_until_answered(
@@ -129,16 +136,15 @@ def _ask_until_answered(
     return answers
 
 
-def _greet(
-    participant: Participant, name: str, timeout: float, begun: float
-) -> srv.Handshake.Response:
+def _greet(endpoints: Endpoints, name: str, timeout: float, begun: float) -> srv.Handshake.Response:
     """Return the master's greeting; raises `NoMaster` or `Refused`."""
-    hello = find_master(participant, f"client {name}", timeout)
-    settings = participant.settings
+    hello = find_master(endpoints, f"client {name}", timeout)
+    settings = endpoints.participant.settings
     if hello is None:
         raise NoMaster(
             f"no master answered within {time.monotonic() - begun:.1f} s ({settings.describe()}, "
-            f"namespace {settings.namespace}). {_to_check(settings)}"
+            f"namespace {settings.namespace}, {endpoints.security.described}). "
+            f"{_to_check(settings)} `rosrm key check` shows the keys"
         )
     if not hello.accepted:
         raise Refused(hello.message, "version")
@@ -154,6 +160,14 @@ def _to_check(settings: RosSettings) -> str:
     return f"Is {master}?"
 
 
+@dataclass(slots=True)
+class _Slave:
+    """Client of a slave, and the monotonic second until which its ticket is used."""
+
+    client: SealedClient
+    until: float = -math.inf
+
+
 class MasterClient:
     """A connection to the master; a context manager.
 
@@ -162,20 +176,23 @@ class MasterClient:
     """
 
     def __init__(
-        self, participant: Participant, hello: srv.Handshake.Response, name: str, timeout: float
+        self, endpoints: Endpoints, hello: srv.Handshake.Response, name: str, timeout: float
     ) -> None:
-        self._participant = participant
+        self._endpoints = endpoints
+        self._participant = participant = endpoints.participant
         self._master = hello
         self._last_contact = time.monotonic()
         self._timeout = timeout
         self._names = names.Names(participant.settings.namespace)
         self._control = ControlClient(participant, f"client {name}")
-        self._clients: dict[str, Any] = {}
+        self._clients: dict[str, SealedClient] = {}
+        self._slaves: dict[tuple[str, str], _Slave] = {}
 
     @classmethod
     def connect(
         cls, settings: RosSettings, *, name: str, timeout: float = 3.0,
-        joined: Participant | None = None, begun: float | None = None,
+        security: SecurityMode = "keys", joined: Participant | None = None,
+        begun: float | None = None,
     ) -> MasterClient:  # fmt: skip
         """Find the master and connect.
 
@@ -183,21 +200,24 @@ class MasterClient:
             settings: for joining ROS.
             name: of this client, for the master's messages.
             timeout: seconds for discovery; a request has the same time, at least 10 s.
+            security: "keys" or "none", as the master's.
             joined: an existing participant, which the client then owns.
             begun: start of the user's wait (monotonic seconds), for the message; None: now.
 
         Raises:
-            NoMaster: none answered; the message says where it was searched.
+            ConfigError: a key file is invalid, or others can read it.
+            NoMaster: none answered, or this user has no key.
             Refused: the master has another version.
         """
         begun = time.monotonic() if begun is None else begun
         participant = joined or Participant(settings, names.client_node())
         try:
-            hello = _greet(participant, name, timeout, begun)
+            endpoints = SealedEndpoints(participant, user_security(security, timeout))
+            hello = _greet(endpoints, name, timeout, begun)
         except BaseException:
             participant.close()
             raise
-        return cls(participant, hello, name, max(timeout, _REQUEST))
+        return cls(endpoints, hello, name, max(timeout, _REQUEST))
 
     # --- requests ------------------------------------------------------------------------
 
@@ -256,10 +276,10 @@ class MasterClient:
             plugins=bool(plugins), failing=plugins == "failing", events=events, process=process,
             host=host, after_sequence=after, max_events=newest,
         )  # fmt: skip
-        answer = self._call(srv.List, self._names(names.LIST), request, _MASTER)
+        answer = self._call(srv.List, names.LIST, request)
         return Listing(
             master=answer.master, uptime=answer.uptime, last_sequence=answer.last_sequence,
-            trouble=answer.trouble,
+            trouble=answer.trouble, security=answer.security, strangers=answer.strangers,
             hosts=[convert.host_row_from_msg(row) for row in answer.host_list],
             processes=[convert.process_row_from_msg(row) for row in answer.process_list],
             plugins=[convert.plugin_row_from_msg(row) for row in answer.plugin_list],
@@ -269,7 +289,7 @@ class MasterClient:
     def explain(self, name: str) -> Mapping[str, Any]:
         """Return the reasons for a process's placement, or for its wait."""
         request = srv.Explain.Request(protocol_version=PROTOCOL_VERSION, process=name)
-        answer = self._call(srv.Explain, self._names(names.EXPLAIN), request, _MASTER)
+        answer = self._call(srv.Explain, names.EXPLAIN, request)
         story: Mapping[str, Any] = json.loads(answer.explanation)
         return story
 
@@ -290,8 +310,7 @@ class MasterClient:
             protocol_version=PROTOCOL_VERSION, process=process, number=number, offset=offset,
             max_bytes=max_bytes, tail=tail, since=since,
         )  # fmt: skip
-        path = self._names.of_host(host, names.READ_LOG)
-        answer = self._call(srv.ReadLog, path, request, f"the slave of {host}")
+        answer = self._call_slave(host, process, request)
         marks = zip(answer.mark_times, answer.mark_offsets, answer.mark_pids, strict=True)
         return LogPart(
             answer.number, tuple(answer.numbers), bytes(answer.content), answer.offset,
@@ -303,7 +322,7 @@ class MasterClient:
     def _envelope(self) -> Any:
         """Return a request's envelope; renew the beat before the master would reject it as old."""
         if time.monotonic() - self._last_contact > 1.0:
-            hello = find_master(self._participant, self._control.sender, self._timeout)
+            hello = find_master(self._endpoints, self._control.sender, self._timeout)
             if hello is None:
                 raise self._silent(_MASTER)
             self._master, self._last_contact = hello, time.monotonic()
@@ -315,7 +334,7 @@ class MasterClient:
         for is_repeated in (False, True):
             request.envelope = self._envelope()
             try:
-                return str(self._call(kind, self._names(name), request, _MASTER).answer.message)
+                return str(self._call(kind, name, request).answer.message)
             except Refused as refusal:
                 if is_repeated or refusal.code != "stale":
                     raise
@@ -336,33 +355,83 @@ class MasterClient:
             f"{trouble}{unknown}{'' if trouble else f'. {check}'}"
         )
 
-    def _client(self, kind: Any, name: str, who: str) -> Any:
-        path = name if name.startswith("/") else self._names(name)
+    def _client(self, kind: Any, name: str) -> SealedClient:
+        """Return a client of a service of the master."""
+        path = self._names(name)
         client = self._clients.get(path)
         if client is None:
-            client = self._participant.node.create_client(kind, path, qos_profile=qos.SERVICE)
+            master = self._endpoints.security.master
+            client = self._endpoints.client(kind, path, master, first_contact=True)
             self._clients[path] = client
-            if not wait_for_service(self._participant, client, time.monotonic() + self._timeout):
-                raise self._silent(who)
+            self._discover(client, _MASTER)
         return client
 
-    def _call(self, kind: Any, path: str, request: Any, who: str) -> Any:
+    def _discover(self, client: SealedClient, who: str) -> None:
+        if not wait_for_service(self._participant, client, time.monotonic() + self._timeout):
+            raise self._silent(who)
+
+    def _call_slave(self, host: str, process: str, request: srv.ReadLog.Request) -> Any:
+        """Send a request for a log to a slave, with a ticket."""
+        who = f"the slave of {host}"
+        for is_repeated in (False, True):
+            slave = self._introduced(host, process)
+            self._discover(slave.client, who)
+            try:
+                return self._answered(slave.client, srv.ReadLog, request, who)
+            except Refused as refusal:
+                if is_repeated or refusal.code != "stale":
+                    raise
+                slave.until = -math.inf  # the slave has restarted: its ticket has the former run
+        raise AssertionError("the second request is answered, or refused")
+
+    def _introduced(self, host: str, process: str) -> _Slave:
+        """Return the client of a slave for the logs of a process, with a valid ticket."""
+        now = time.monotonic()
+        known = self._slaves.get((host, process))
+        if known is not None and now < known.until:
+            return known
+        request = introduction_request(host, names.READ_LOG, process)
+        try:
+            response = self._call(srv.Introduce, names.INTRODUCE, request)
+        except Refused as refusal:
+            if refusal.code != "silent":
+                raise
+            raise NoMaster(f"{refusal}. Is `rosrm slave` running there?") from refusal
+        slave, until = introduction_of(response, self._endpoints.security, now)
+        if known is None:
+            path = self._names.of_host(host, names.READ_LOG)
+            known = _Slave(self._endpoints.client(srv.ReadLog, path, slave))
+            self._slaves[host, process] = known
+        known.client.peer, known.until = slave, until
+        return known
+
+    def _call(self, kind: Any, name: str, request: Any) -> Any:
+        """Send a request to the master until it is answered."""
+        client = self._client(kind, name)
+        try:
+            return self._answered(client, kind, request, _MASTER)
+        except Refused as refusal:
+            if refusal.code != "stale" or hasattr(request, "envelope"):
+                raise
+            # Another run of the master answered, and its run is stored now. A read-only request may
+            # be repeated.
+            return self._answered(client, kind, request, _MASTER)
+
+    def _answered(self, client: SealedClient, kind: Any, request: Any, who: str) -> Any:
         """Send a request until an answer comes; the receiver repeats a lost answer.
 
         Every request may be repeated: it only reads, or carries an id by which it is recognised.
         One that exceeds its bounds is not sent: `Refused` names the field.
         """
         check_bounds(request)
-        client = self._client(kind, path, who)
         deadline = time.monotonic() + self._timeout
         answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
         response = answers.answer
+        acts = hasattr(request, "envelope")  # read-only requests have none
         if response is None:
-            # Requests that only read have no envelope.
-            acts = hasattr(request, "envelope")
             unknown = ". It is not known whether it was done" if acts else ""
             raise self._silent(who, self._trouble(kind), unknown)
-        if answers.sent > 1 and is_unsure(response.answer, self._master.epoch):
+        if acts and answers.sent > 1 and is_unsure(response.answer, self._master.epoch):
             raise Refused(
                 f"{who} was silent when it was asked first, and has forgotten it since: it is not "
                 f"known whether it was done. Look at `rosrm ps`, and ask again if need be",
@@ -376,7 +445,7 @@ class MasterClient:
         if kind is srv.List:
             return ""
         request = srv.List.Request(protocol_version=PROTOCOL_VERSION)
-        client, deadline = self._client(srv.List, names.LIST, _MASTER), time.monotonic() + _AGAIN
+        client, deadline = self._client(srv.List, names.LIST), time.monotonic() + _AGAIN
         answers = _ask_until_answered(self._participant, client, request, deadline, _GREET_AGAIN)
         answer = answers.answer
         trouble = answer.trouble if answer is not None else ""

@@ -1,4 +1,4 @@
-"""Network interfaces of this machine."""
+"""Check of the setting `ros.interface` against the interfaces of this machine."""
 
 from __future__ import annotations
 

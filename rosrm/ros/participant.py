@@ -140,8 +140,8 @@ class Participant:
     ) -> None:
         """Offer a service with deferred responses.
 
-        `handle` is called with each request and the means to answer it. If it raises before it has
-        answered, the request is answered as failed.
+        `handle` is called with each request and the means to answer it. If it raises, the request
+        is not answered, so that a stranger learns nothing.
         """
         # The executor passes the callback's result to `send_response` with the header that an
         # answer needs. So the callback returns the request, and `take` receives both.
@@ -152,10 +152,7 @@ class Participant:
 
         def take(request: Any, header: Any) -> None:
             self._executed += 1
-            opened = OpenRequest(send, header)
-            fault = self.guard.call(_call_bounded, handle, request, opened)
-            if fault and not opened.answered:
-                self.guard.call(opened.answer, failed_response(service_type, fault))
+            self.guard.call(handle, request, OpenRequest(send, header))
 
         service.send_response = take
 

@@ -31,6 +31,9 @@ LAYOUT: Final = np.dtype(
     ]
 )  # fmt: skip
 
+#: Where a serialised message has the number of its host.
+HOST_ID: Final = slice(8, 12)
+
 ACCEPTING: Final = 1
 #: Bits 8 to 15 of the flags: cycles without news since the message before.
 _QUIET_SHIFT: Final = 8

@@ -1,31 +1,45 @@
-"""Sealed topics and services: the entities that carry the messages of rosrm's own parts.
+"""Sealed topics and services: the ROS entities of master, slaves and clients.
 
-Each message travels in a `rosrm_msgs/Sealed`, below the names that the channels of
-`rosrm.keys.sealing` contain. A message that does not open is dropped, counted and answered by
-nothing. So a stranger learns nothing, stores nothing, and uses no request up: an answer that does
-not open leaves the request open for the true one.
+Each message is in the body of a `rosrm_msgs/Sealed`. A message that does not open is dropped and
+counted, without an answer. So a stranger learns nothing, and nothing is stored for it. If an answer
+does not open, its request stays open for the genuine answer. Messages of the master to all
+receivers are signed, in a `rosrm_msgs/Signed`, and not encrypted.
 """
 
 from __future__ import annotations
 
+import struct
 from array import array
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
+from rosrm.errors import Refused
 from rosrm.keys.links import SealedMessage
+from rosrm.keys.roles import may_send
 from rosrm.keys.sealing import FORMAT, channel_of
-from rosrm.keys.security import Peer, Security
+from rosrm.keys.security import SIGNATURE_BYTES, Peer, Security
 from rosrm.ros import qos
+from rosrm.ros.bounds import check_bounds
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
-from rosrm.ros.sealed_topic import UNKNOWN_RUN, topic_channel, type_name
+from rosrm.ros.sealed_codec import MOST_LETTERS, Envelope, decode, encode
+from rosrm.ros.sealed_topic import topic_channel, type_name
 from rosrm_msgs import msg, srv
 
 #: Refusal of a request that was meant for another run of the receiver.
 _OTHER_RUN: Final = "the request is for another run of the receiver; nothing was done"
+#: Refusal of a request whose sender may have lost its key since it got the ticket.
+_OLD_TICKET: Final = "keys have changed since the ticket was made; ask the master for a new one"
+
+#: Runs of masters whose newest signed message is remembered.
+_MOST_RUNS: Final = 64
+#: Most bytes of the body of a sealed message.
+_LARGEST: Final = 1 << 24
+
+SecurityT = TypeVar("SecurityT", bound=Security)
 
 
 def request_channel(service_type: Any, name: str) -> bytes:
@@ -39,77 +53,128 @@ def answer_channel(service_type: Any, name: str) -> bytes:
 
 
 def sealed(
-    peer: Peer, channel: bytes, message: Any, receiver_run: bytes, context: bytes = b""
-) -> tuple[msg.Sealed, SealedMessage]:
-    """Return a message as it is sent, and what an answer to it refers to."""
-    plain = serialize_message(message)
-    done = peer.link.seal(channel, plain, context or receiver_run)
+    peer: Peer, channel: bytes, message: Any, answered: SealedMessage | None = None
+) -> Envelope:
+    """Return a sealed message.
+
+    Args:
+        peer: receiver of the message.
+        channel: see `rosrm.keys.sealing.channel_of`.
+        message: ROS message to seal.
+        answered: the request that the message answers; None: the message is no answer.
+    """
+    run = peer.run if answered is None else answered.run
+    context = run if answered is None else answered.reference
+    done = peer.link.seal(channel, serialize_message(message), context)
+    return Envelope(FORMAT, peer.name, peer.generation, done.run, run, done.counter, done.body)
+
+
+def envelope_to_msg(envelope: Envelope) -> msg.Sealed:
+    """Return the ROS message of an envelope, for services."""
     return msg.Sealed(
-        format=FORMAT, principal=peer.principal, generation=peer.generation,
-        run=array("B", done.run), receiver_run=array("B", receiver_run), counter=done.counter,
-        body=array("B", done.body),
-    ), done  # fmt: skip
+        format=envelope.format, principal=envelope.principal, generation=envelope.generation,
+        run=array("B", envelope.run), receiver_run=array("B", envelope.receiver_run),
+        counter=envelope.counter, body=array("B", envelope.body),
+    )  # fmt: skip
 
 
-def received(message: msg.Sealed) -> SealedMessage:
-    """Return the sealed part of a message as it arrived."""
-    return SealedMessage(bytes(message.run), message.counter, bytes(message.body))
+def envelope_from_msg(message: msg.Sealed) -> Envelope:
+    """Return the envelope in a ROS message."""
+    return Envelope(
+        message.format, message.principal, message.generation, bytes(message.run),
+        bytes(message.receiver_run), message.counter, bytes(message.body),
+    )  # fmt: skip
+
+
+def _sealed_part(envelope: Envelope) -> SealedMessage:
+    return SealedMessage(envelope.run, envelope.counter, bytes(envelope.body))
+
+
+def _plain(kind: Any, content: bytes) -> Any:
+    """Return a message from its CDR form; raise `Refused` if it exceeds its bounds."""
+    message = deserialize_message(content, kind)
+    check_bounds(message)
+    return message
+
+
+def _signed_content(channel: bytes, message: msg.Signed) -> bytes:
+    """Return the bytes that a signature covers."""
+    counter = struct.pack("<Q", message.counter)
+    return channel + bytes(message.run) + counter + bytes(message.body)
 
 
 class SealedRequest:
     """A genuine request; `answer` may be called once, at any time.
 
     Attributes:
-        peer: who sent it.
+        peer: sender of the request.
         run: of the sender.
-        answered: the answer is sent.
     """
 
     def __init__(
-        self, opened: OpenRequest, peer: Peer, channel: bytes, reference: SealedMessage
+        self, opened: OpenRequest, peer: Peer, channel: bytes, request: SealedMessage
     ) -> None:
         self._opened = opened
         self._channel = channel
-        self._reference = reference
+        self._request = request
         self.peer = peer
-        self.run = reference.run
+        self.run = request.run
 
     @property
     def answered(self) -> bool:
-        """Return True after the answer."""
+        """Return True if the request was answered."""
         return self._opened.answered
+
+    def check_process(self, process: str) -> None:
+        """Raise `Refused` if the sender has no ticket for a process."""
+        ticket = self.peer.ticket
+        if ticket is None or ticket.process != process:
+            raise Refused(
+                f"{self.peer.grant.principal} has no ticket of the master for {process!r}",
+                "denied",
+            )
 
     def answer(self, response: Any) -> None:
         """Send the response."""
-        reference = self._reference
-        message, _ = sealed(self.peer, self._channel, response, reference.run, reference.reference)
-        self._opened.answer(srv.Sealed.Response(message=message))
+        envelope = sealed(self.peer, self._channel, response, self._request)
+        self._opened.answer(srv.Sealed.Response(message=envelope_to_msg(envelope)))
 
 
-class SealedEndpoints:
-    """Creates the sealed entities of one part.
+class SealedEndpoints(Generic[SecurityT]):
+    """Creates the sealed entities of a master, slave or client.
 
     Args:
-        security: with whom this part speaks.
         refused: called with the name of a topic or service for each message that does not open.
+
+    Attributes:
+        participant: owner of the entities.
+        security: keys and peers of this master, slave or client.
     """
 
     def __init__(
-        self, participant: Participant, security: Security, refused: Callable[[str], None]
-    ) -> None:
-        self._participant = participant
-        self._security = security
-        self._refused = refused
+        self, participant: Participant, security: SecurityT,
+        refused: Callable[[str], None] = lambda _: None,
+    ) -> None:  # fmt: skip
+        self.participant = participant
+        self.security = security
+        self.refused = refused
 
-    def _open(self, channel: bytes, name: str, message: msg.Sealed) -> tuple[Peer, bytes] | None:
-        """Return the sender and the plain message; None: it is refused."""
-        if message.format == FORMAT:
-            peer = self._security.peer(message.principal, message.generation)
-            if peer is not None:
-                plain = peer.link.open(channel, received(message), bytes(message.receiver_run))
-                if plain is not None:
-                    return peer, plain
-        self._refused(name)
+    def _open(
+        self, channel: bytes, name: str, envelope: Envelope | None
+    ) -> tuple[Peer, bytes] | None:
+        """Return the sender and the plain message; None: the message does not open."""
+        peer = None
+        if envelope is not None and _is_possible(envelope):
+            peer = self.security.peer(envelope.principal, envelope.generation)
+        if envelope is not None and peer is not None:
+            run = envelope.receiver_run
+            plain = peer.link.open(
+                channel, _sealed_part(envelope), run, is_bound=run == self.security.run
+            )
+            if plain is not None:
+                self.security.remember(peer)
+                return peer, plain
+        self.refused(name)
         return None
 
     # --- services ------------------------------------------------------------------------
@@ -118,75 +183,135 @@ class SealedEndpoints:
         self, service_type: Any, name: str, handle: Callable[[Any, SealedRequest], None], *,
         first_contact: bool = False,
     ) -> None:  # fmt: skip
-        """Offer a service.
+        """Offer a service to all peers whose role allows its requests.
 
         Args:
             handle: called with each genuine request and the means to answer it. If it raises before
                 it has answered, the request is answered as failed.
-            first_contact: accept requests of peers that do not know this run yet.
+            first_contact: accept requests of peers that do not know the run of this part.
         """
-        requests = request_channel(service_type, name)
-        answers = answer_channel(service_type, name)
-        guard = self._participant.guard
+        requests, answers = request_channel(service_type, name), answer_channel(service_type, name)
+        service = name.rpartition("/")[2]
+        guard = self.participant.guard
 
         def take(request: srv.Sealed.Request, opened: OpenRequest) -> None:
-            found = self._open(requests, name, request.message)
+            envelope = envelope_from_msg(request.message)
+            found = self._open(requests, name, envelope)
             if found is None:
                 return
             peer, plain = found
-            genuine = SealedRequest(opened, peer, answers, received(request.message))
-            if not first_contact and bytes(request.message.receiver_run) != self._security.run:
+            genuine = SealedRequest(opened, peer, answers, _sealed_part(envelope))
+            refusal = _denial(peer, service)
+            if refusal:
+                genuine.answer(failed_response(service_type, refusal, "denied"))
+            elif not first_contact and envelope.receiver_run != self.security.run:
                 genuine.answer(failed_response(service_type, _OTHER_RUN, "stale"))
-                return
-            fault = guard.call(
-                lambda: handle(deserialize_message(plain, service_type.Request), genuine)
-            )
-            if fault and not genuine.answered:
-                genuine.answer(failed_response(service_type, fault))
+            elif peer.ticket is not None and peer.ticket.version < self.security.tickets_from:
+                genuine.answer(failed_response(service_type, _OLD_TICKET, "stale"))
+            else:
+                fault = guard.call(lambda: handle(_plain(service_type.Request, plain), genuine))
+                if fault and not genuine.answered:
+                    genuine.answer(failed_response(service_type, fault))
 
-        self._participant.serve(srv.Sealed, name, take)
+        self.participant.serve(srv.Sealed, name, take)
 
-    def client(self, service_type: Any, name: str, peer: Peer) -> SealedClient:
-        """Return a client of a service."""
-        return SealedClient(
-            self._participant, service_type, name, peer, lambda: self._refused(name)
-        )
+    def client(
+        self, service_type: Any, name: str, peer: Peer, *, first_contact: bool = False
+    ) -> SealedClient:
+        """Return a client of a service of `peer`.
+
+        Args:
+            first_contact: store the run in each answer as the run of `peer`.
+        """
+        made = SealedClient(self.participant, service_type, name, peer, lambda: self.refused(name))
+        made.first_contact = first_contact
+        return made
 
     # --- topics --------------------------------------------------------------------------
 
     def publisher(
         self, message_type: Any, name: str, profile: QoSProfile, peer: Peer
     ) -> SealedPublisher:
-        """Return a publisher of messages for one peer."""
-        publisher = self._participant.node.create_publisher(msg.Sealed, name, profile)
+        """Return a publisher of messages for `peer`."""
+        publisher = self.participant.node.create_publisher(msg.Sealed, name, profile)
         return SealedPublisher(publisher, topic_channel(message_type, name), peer)
 
     def subscribe(
-        self, message_type: Any, name: str, profile: QoSProfile,
-        take: Callable[[Any, Peer], None],
-    ) -> Any:  # fmt: skip
+        self, message_type: Any, name: str, profile: QoSProfile, take: Callable[[Any, Peer], None]
+    ) -> Any:
         """Subscribe to messages for this run; return the subscription."""
         channel = topic_channel(message_type, name)
 
-        def open_and_take(message: msg.Sealed) -> None:
-            found = self._open(channel, name, message)
-            if found is not None and bytes(message.receiver_run) == self._security.run:
-                take(deserialize_message(found[1], message_type), found[0])
+        def open_and_take(data: bytes) -> None:
+            envelope = decode(data)
+            found = self._open(channel, name, envelope)
+            if envelope and found and envelope.receiver_run == self.security.run:
+                take(_plain(message_type, found[1]), found[0])
 
-        return self._participant.node.create_subscription(
-            msg.Sealed, name, self._participant.counted(open_and_take), profile
+        return self.participant.node.create_subscription(
+            msg.Sealed, name, self.participant.counted(open_and_take), profile, raw=True
+        )
+
+    # --- signed topics of the master -------------------------------------------------------
+
+    def announcer(self, message_type: Any, name: str, profile: QoSProfile) -> SignedPublisher:
+        """Return a publisher of signed messages."""
+        publisher = self.participant.node.create_publisher(msg.Signed, name, profile)
+        return SignedPublisher(publisher, topic_channel(message_type, name), self.security)
+
+    def follow(
+        self, message_type: Any, name: str, profile: QoSProfile, take: Callable[[Any, bytes], None]
+    ) -> Any:
+        """Subscribe to signed messages; `take` is called with each message and the master's run."""
+        channel = topic_channel(message_type, name)
+        newest: dict[bytes, int] = {}
+
+        def check_and_take(message: msg.Signed) -> None:
+            run = bytes(message.run)
+            if message.counter <= newest.get(run, 0):
+                return  # before the signature, whose check takes longer than all else
+            if message.format != FORMAT or not self.security.is_signed(
+                _signed_content(channel, message), bytes(message.signature)
+            ):
+                self.refused(name)
+                return
+            newest.pop(run, None)  # so that the run that sends is forgotten last
+            newest[run] = message.counter
+            if len(newest) > _MOST_RUNS:
+                del newest[next(iter(newest))]
+            take(_plain(message_type, bytes(message.body)), run)
+
+        return self.participant.node.create_subscription(
+            msg.Signed, name, self.participant.counted(check_and_take), profile
         )
 
 
-class SealedPublisher:
-    """Publisher of messages for one peer.
+def _is_possible(envelope: Envelope) -> bool:
+    """Return True for a message of this format within its bounds."""
+    return (
+        envelope.format == FORMAT
+        and len(envelope.principal) <= MOST_LETTERS
+        and len(envelope.body) <= _LARGEST
+    )
 
-    Attributes:
-        receiver_run: run of the peer; `UNKNOWN_RUN` until it is known.
-    """
+
+def _denial(peer: Peer, service: str) -> str:
+    """Return the reason why a peer may not send a request; "": it may."""
+    if peer.ticket is not None and peer.ticket.service != service:
+        return f"the ticket is for {peer.ticket.service!r}, not for {service!r}"
+    role = peer.grant.role
+    if may_send(role, service):
+        return ""
+    return (
+        f"{peer.grant.principal} has the role {role.value}, which may not send {service!r}; ask an "
+        f"operator"
+    )
+
+
+class SealedPublisher:
+    """Publisher of messages for one peer."""
 
     def __init__(self, publisher: Any, channel: bytes, peer: Peer) -> None:
-        self.receiver_run = UNKNOWN_RUN
         self._publisher = publisher
         self._channel = channel
         self._peer = peer
@@ -194,35 +319,57 @@ class SealedPublisher:
 
     def publish(self, message: Any) -> None:
         """Send a message."""
-        self._publisher.publish(sealed(self._peer, self._channel, message, self.receiver_run)[0])
+        self._publisher.publish(encode(sealed(self._peer, self._channel, message)))
+
+
+class SignedPublisher:
+    """Publisher of signed messages of the master."""
+
+    def __init__(self, publisher: Any, channel: bytes, security: Security) -> None:
+        self._publisher = publisher
+        self._channel = channel
+        self._security = security
+        self._counter = 0
+
+    def publish(self, message: Any) -> None:
+        """Send a message."""
+        self._counter += 1
+        signed = msg.Signed(
+            format=FORMAT, run=array("B", self._security.run), counter=self._counter,
+            body=array("B", serialize_message(message)),
+        )  # fmt: skip
+        signature = self._security.signature(_signed_content(self._channel, signed))
+        signed.signature = array("B", signature.ljust(SIGNATURE_BYTES, b"\0"))
+        self._publisher.publish(signed)
 
 
 class SealedClient:
-    """Client of a sealed service, with the methods of rclpy's that rosrm uses.
+    """Client of a sealed service, with those methods of rclpy's client that rosrm uses.
 
     Args:
-        peer: the server.
         refused: called for each answer that does not open.
 
     Attributes:
-        receiver_run: run of the server; `UNKNOWN_RUN` until it is known.
+        peer: the server; replaced when this client gets a new ticket.
+        first_contact: store the run in each answer as the run of the server.
     """
 
     def __init__(
         self, participant: Participant, service_type: Any, name: str, peer: Peer,
         refused: Callable[[], None],
     ) -> None:  # fmt: skip
-        self.receiver_run = UNKNOWN_RUN
         self._participant = participant
-        self._peer = peer
+        self.peer = peer
+        self.first_contact = False
         self._refused = refused
         self._response_type = service_type.Response
         self._requests = request_channel(service_type, name)
         self._answers = answer_channel(service_type, name)
-        self._sent: WeakKeyDictionary[Any, SealedMessage] = WeakKeyDictionary()
+        self._sent: WeakKeyDictionary[Any, tuple[Peer, SealedMessage]] = WeakKeyDictionary()
         self._client = participant.node.create_client(srv.Sealed, name, qos_profile=qos.SERVICE)
         self._pending_of = self._client.get_pending_request
-        # The executor completes the future that this method returns with any answer of its number.
+        # The executor completes the future that this method returns with the first answer of its
+        # number, which may be forged. So the method returns an object that checks the answer.
         self._client.get_pending_request = self._answer_to
         self.guarded = participant.guard.call
         self.service_is_ready = self._client.service_is_ready
@@ -230,22 +377,26 @@ class SealedClient:
 
     def call_async(self, request: Any) -> Any:
         """Send a request; return the future of its answer."""
-        message, reference = sealed(self._peer, self._requests, request, self.receiver_run)
+        envelope = sealed(self.peer, self._requests, request)
+        message = envelope_to_msg(envelope)
         future = self._client.call_async(srv.Sealed.Request(message=message))
-        self._sent[future] = reference
+        self._sent[future] = self.peer, _sealed_part(envelope)
         return future
 
     def _answer_to(self, sequence: int) -> _Answer:
         return _Answer(self, self._pending_of(sequence))
 
     def complete(self, future: Any, response: srv.Sealed.Response) -> None:
-        """Complete a request by an answer, if the answer is the server's."""
-        message = received(response.message)
-        plain = self._peer.link.open(self._answers, message, self._sent[future].reference)
+        """Complete a request by an answer, if the answer is genuine."""
+        message = _sealed_part(envelope_from_msg(response.message))
+        peer, sent = self._sent[future]
+        plain = peer.link.open(self._answers, message, sent.reference)
         if plain is None:
             self._refused()
             return
-        future.set_result(deserialize_message(plain, self._response_type))
+        if self.first_contact:
+            peer.run = message.run
+        future.set_result(_plain(self._response_type, plain))
 
     def destroy(self) -> None:
         """Destroy the client."""
@@ -253,7 +404,7 @@ class SealedClient:
 
 
 class _Answer:
-    """Stands for the future of a request until an answer opens."""
+    """Stand-in for the future of a request, which accepts only a genuine answer."""
 
     def __init__(self, client: SealedClient, future: Any) -> None:
         self._client = client
@@ -261,5 +412,5 @@ class _Answer:
         self._set_executor = future._set_executor  # noqa: SLF001 - the executor calls it
 
     def set_result(self, response: srv.Sealed.Response) -> None:
-        """Complete the request, if the answer is the server's."""
+        """Complete the request, if the answer is genuine."""
         self._client.guarded(self._client.complete, self._future, response)

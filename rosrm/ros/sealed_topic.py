@@ -1,4 +1,4 @@
-"""Topics whose messages are all sealed under one link; light enough for the nodes of handoffs."""
+"""Topics whose messages are sealed by one link; imported by nodes only in a handoff."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def topic_channel(message_type: Any, name: str) -> bytes:
 
 
 class SealedTopic:
-    """One topic under one link.
+    """One topic whose messages are sealed by one link.
 
     Args:
         link: to the other side, or to both other parties of a handoff.
-        principal: text that names the key of the link.
+        principal: text that names the key of the link, see `rosrm.keys.names`.
         message_type: of the plain messages.
         name: of the topic, fully qualified.
     """
@@ -47,7 +47,7 @@ class SealedTopic:
         self.name = name
 
     def seal(self, plain: bytes) -> bytes:
-        """Return a serialised message as it is sent."""
+        """Return the CDR form of a sealed message, from a serialised message."""
         done = self._link.seal(self._channel, plain, UNKNOWN_RUN)
         self._own_run = done.run
         return encode(
@@ -55,11 +55,11 @@ class SealedTopic:
         )
 
     def open(self, data: bytes) -> bytes | None:
-        """Return a serialised message; None: it is not genuine, a repetition, or of this side."""
+        """Return a serialised message; None: it is not genuine, repeated, or of this side."""
         found = decode(data)
         if found is None or (found.format, found.principal) != (FORMAT, self._principal):
             return None
-        if found.run == self._own_run:  # a link of peers would open it
+        if found.run == self._own_run:  # both directions of a handoff have one key
             return None
         message = SealedMessage(found.run, found.counter, bytes(found.body))
         return self._link.open(self._channel, message, found.receiver_run)
@@ -72,7 +72,7 @@ class SealedTopic:
         try:
             return deserialize_message(plain, self._message_type)
         except Exception:  # noqa: BLE001 - rclpy's error for bytes that are no message
-            return None  # without security, a message is not known to be genuine
+            return None  # with `security: none`, anyone may have sent the bytes
 
     def publisher(self, node: Any, profile: QoSProfile, **named: Any) -> SealedWriter:
         """Create a publisher; `named` is passed to the node's method."""
@@ -81,7 +81,7 @@ class SealedTopic:
     def subscription(
         self, node: Any, profile: QoSProfile, take: Callable[[bytes], None], **named: Any
     ) -> Any:
-        """Create a subscription, which passes on each message as `open` and `read` take it."""
+        """Create a subscription; `take` gets the argument of `open` and `read`."""
         return node.create_subscription(
             msg.Sealed, self.name, take, profile, raw=True, **named
         )  # fmt: skip

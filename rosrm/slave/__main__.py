@@ -15,13 +15,15 @@ import sys
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import Registry
 from rosrm.runtime.bootstrap import Handover, run
+from rosrm.slave.own_key import wait_for_security
 from rosrm.slave.runtime import SlaveRuntime
 
 
 def serve(handover: Handover) -> int:
     """Load the plugins and run the slave; return the exit code."""
     config = HostConfig.from_json(handover.settings)
-    return SlaveRuntime(config, Registry.load(handover.plugins)).run()
+    registry = Registry.load(handover.plugins)
+    return SlaveRuntime(config, registry, wait_for_security(config)).run()
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
+from rosrm.keys.security import Member
 from rosrm.model.orders import RunExecutor, SetRestartPolicy
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
@@ -38,6 +39,7 @@ from rosrm.model.values import (
 )
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalWatermark
@@ -81,13 +83,17 @@ Settled = Callable[[str], None]
 class SlaveRuntime:
     """One slave.
 
+    Args:
+        security: of the slave, with its key.
+
     Raises:
         Refused: another slave runs on this state directory.
         SupervisorError: the supervisor cannot be started or reached.
     """
 
-    def __init__(self, config: HostConfig, registry: Registry) -> None:
+    def __init__(self, config: HostConfig, registry: Registry, security: Member) -> None:
         self._config = config
+        self._security = security
         self._incarnation = _random_number()
         self._stopping = ""
         self._accepting = False
@@ -128,6 +134,7 @@ class SlaveRuntime:
             self._starter = Starter(
                 config, self._snapshots, self._state, self._supervisor, self._endpoint,
                 self._replication, graph, sessions, launchers, take=self._take,
+                instance_key=lambda one: security.instance_key(one.process, one.number),
             )  # fmt: skip
             self._ending = Shutdown(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
@@ -165,8 +172,9 @@ class SlaveRuntime:
             config.ros, f"rosrm_slave_{token(config.host)}", pace="steady"
         )
         opened.callback(self._participant.close)
+        self._endpoints = SealedEndpoints(self._participant, self._security)
         self._endpoint = SlaveEndpoint(
-            self._participant, self._description(absent), self._state, take=self._take,
+            self._endpoints, self._description(absent), self._state, take=self._take,
             snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
             seen=JournalWatermark(config.state / "journal_seen"),
         )  # fmt: skip
@@ -186,14 +194,14 @@ class SlaveRuntime:
         self._epoch_note = EpochNote(config.state / EPOCH_NOTE)
         self._replication = ReplicationService(
             self._snapshots, config.host, config.keep,
-            ReplicationEndpoint(self._participant, config.host),
+            ReplicationEndpoint(self._endpoints, config.host),
             post=self._post, publish=self._endpoint.publish_snapshots,
         )  # fmt: skip
         duties = Duties(
             self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
             self._execute, self._read_log,
         )  # fmt: skip
-        SlaveServices(self._participant, duties, config.host, max_age, lambda: self._endpoint.epoch)
+        SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
     @property
     def _snapshots(self) -> Path:

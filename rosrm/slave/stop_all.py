@@ -16,7 +16,9 @@ from dataclasses import replace
 
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import Registry
+from rosrm.keys.finding import host_security
 from rosrm.runtime.bootstrap import Handover, run
+from rosrm.slave.own_key import security_without_key
 from rosrm.slave.runtime import SlaveRuntime
 
 
@@ -25,7 +27,9 @@ def serve(handover: Handover) -> int:
     config = HostConfig.from_json(handover.settings)
     # Without probes, so that a broken probe cannot prevent the end; readings are not needed.
     ending = replace(config, on_stop="stop", probes={})
-    return SlaveRuntime(ending, Registry.load(handover.plugins)).stop_all()
+    host = config.host
+    security = host_security(config.security, host) or security_without_key(host)
+    return SlaveRuntime(ending, Registry.load(handover.plugins), security).stop_all()
 
 
 if __name__ == "__main__":

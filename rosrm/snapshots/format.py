@@ -19,7 +19,7 @@ _MOST_BLOCKS: Final = 1000
 MOST_CYCLES: Final = 1 << 62
 
 _MAGIC: Final = b"rosrmKS1"
-#: Magic of an encrypted replica: its one block is an encrypted snapshot.
+#: Magic of an encrypted replica, whose blocks are a nonce and an encrypted snapshot.
 _ENCRYPTED: Final = b"rosrmKE1"
 #: Magic, instance, sequence, bytes of the name, blocks.
 _FIXED: Final = struct.Struct("<8sQQII")

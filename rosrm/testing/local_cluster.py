@@ -123,7 +123,7 @@ class LocalCluster:
     def start_slave(self, host: HostConfig) -> Part:
         """Start a slave, or start it again."""
         state = self.directory / "hosts" / host.host
-        settings = replace(host, ros=self.ros, state=state)
+        settings = replace(host, ros=self.ros, state=state, security=self.cluster.security)
         part = self._start(host.host, "rosrm.slave", settings.to_json())
         self.slaves[host.host] = part
         return part
@@ -170,7 +170,9 @@ class LocalCluster:
         while self._client is None:
             self._check_parts()
             try:
-                self._client = MasterClient.connect(self.ros, name="local cluster", timeout=3.0)
+                self._client = MasterClient.connect(
+                    self.ros, name="local cluster", security=self.cluster.security
+                )
             except NoMaster:
                 if time.monotonic() >= deadline:
                     raise

@@ -27,21 +27,21 @@ _STANDARD_OUTPUT: Final = 1
 
 @key.callback()
 def _group() -> None:
-    """Manage the keys of hosts and users: on the machine of the master, but for `check`."""
+    """Manage the keys of hosts and users, on the machine of the master (`check`: on any)."""
 
 
 @key.command()
 def init() -> None:
-    """Draw the cluster's secret, unless this user has one already.
+    """Create the cluster's secret, unless this user has one already.
 
-    `rosrm master` does this too. Whoever can read the file has all rights in the cluster.
+    `rosrm master` does this, too. A program that can read the file has all rights in the cluster.
     """
     from rosrm.keys import key_files
 
     home = key_files.key_home()
     known = key_files.read_secret(home) is not None
     key_files.make_secret(home)
-    echo(f"{home / key_files.CLUSTER_FILE}: {'exists already' if known else 'drawn'}")
+    echo(f"{home / key_files.CLUSTER_FILE}: {'exists already' if known else 'created'}")
 
 
 @key.command()
@@ -51,8 +51,8 @@ def add(
         str | None,
         typer.Option(
             "--role", metavar="ROLE",
-            help="Of a user: viewer (reads), submitter (changes its own processes) or operator "
-            "(everything).  [default: submitter]",
+            help="Role of a user: viewer (reads), submitter (changes its own processes) or "
+            "operator (everything).  [default: submitter]",
         ),
     ] = None,
     out: Annotated[
@@ -65,31 +65,31 @@ def add(
 ) -> None:  # fmt: skip
     """Make a new key for a host or user, and write its key file.
 
-    An earlier key of the same principal ends at once. Copy the file to ~/.config/rosrm/ on that
-    host. Use --out in a directory that others can read: with `> FILE` the shell creates the file
-    before its mode is 0600.
+    An earlier key of the same principal ends at once. Copy the file to ~/.config/rosrm/ of the user
+    that will use it. In a directory that others can read use --out: with `> FILE` the shell creates
+    the file before its mode is 0600.
     """
     from rosrm.keys import key_files
-    from rosrm.keys.roles import Role, principal_of
+    from rosrm.keys.roles import GRANTED, Role, principal_of
 
-    whom = principal_of(principal)
-    allowed = [Role.HOST] if whom.kind == "host" else [one for one in Role if one is not Role.HOST]
+    named = principal_of(principal)
+    allowed = [one for one in GRANTED if (one is Role.HOST) is (named.kind == "host")]
     names = [one.value for one in allowed]
-    chosen = role or ("host" if whom.kind == "host" else "submitter")
+    chosen = role or ("host" if named.kind == "host" else "submitter")
     if chosen not in names:
-        raise ConfigError(f"{whom} cannot have the role {chosen!r}; allowed: {', '.join(names)}")
+        raise ConfigError(f"{named} cannot have the role {chosen!r}; allowed: {', '.join(names)}")
     secret = _secret()
     if out is None:
         _make_output_private()
-    grant = key_files.add_grant(key_files.key_home(), whom, Role(chosen))
+    grant = key_files.add_grant(key_files.key_home(), named, Role(chosen))
     made = secret.key_of(grant)
     if out is None:
         echo(key_files.text_of(made).rstrip())
     else:
         key_files.write_key(out, made)
     echo(
-        f"rosrm: {whom} has a new key (role {chosen}). Copy the file to ~/.config/rosrm/ of its "
-        f"user, with mode 0600",
+        f"rosrm: {named} has a new key (role {chosen}). Copy the file to ~/.config/rosrm/ of the "
+        f"user that will use it, with mode 0600",
         err=True,
     )
 
@@ -115,14 +115,14 @@ def list_keys() -> None:
         rows.add_row(str(grant.principal), grant.role.value, str(grant.generation))
     console().print(rows)
     echo(
-        f"{counted(len(grants), 'key', 'keys')}; this user of this machine has all rights by "
+        f"{counted(len(grants), 'key', 'keys')}; this user has all rights in the cluster, by "
         f"{home / key_files.CLUSTER_FILE}"
     )
 
 
 @key.command()
 def revoke(principals: Annotated[list[str], _PRINCIPAL]) -> None:
-    """End the keys of hosts or users; a running master refuses them within a second."""
+    """Revoke the keys of hosts or users; a running master refuses them within a second."""
     from rosrm.keys import key_files
     from rosrm.keys.roles import principal_of
 
@@ -141,10 +141,10 @@ def rotate(
         ),
     ],
 ) -> None:  # fmt: skip
-    """Draw a new secret for the cluster, and write new key files for all principals.
+    """Create a new secret for the cluster, and write new key files for all principals.
 
     All former keys end when the master reads the new secret, within a second. Copy each file to its
-    host or user.
+    host or user, and restart all slaves.
     """
     from rosrm.keys import key_files
 

@@ -31,6 +31,8 @@ def status_form(snapshot: Listing) -> dict[str, Any]:
         "uptime": snapshot.uptime,
         "last_sequence": snapshot.last_sequence,
         "trouble": snapshot.trouble,
+        "security": snapshot.security,
+        "strangers": snapshot.strangers,
         "hosts": Counter(row.state for row in snapshot.hosts),
         "processes": Counter(row.state for row in snapshot.processes),
         "failing_plugins": forms(snapshot.plugins),

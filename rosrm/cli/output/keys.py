@@ -1,4 +1,4 @@
-"""Report of `rosrm key check`: keys of this user, and what they do not protect."""
+"""Report of `rosrm key check`: keys of this user, and what keys do not protect."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rosrm.wording import counted
 _NOT_PROTECTED: Final = (
     "topics and services of the applications",
     "names, sizes and times of rosrm's messages",
-    "delivery: floods and forged packets of DDS can delay messages",
+    "delivery: flooding and forged packets of DDS can delay messages",
 )
 
 
 @dataclass
 class KeyReport:
-    """Facts, and faults that the user should remove.
+    """Facts, and faults that the user should correct.
 
     Attributes:
         rows: label and text of each fact.
@@ -35,7 +35,7 @@ class KeyReport:
     faults: list[str] = field(default_factory=list)
 
     def add_fault(self, text: str) -> None:
-        """Add a fault, unless it is known."""
+        """Add a fault, unless the report has it."""
         if text not in self.faults:
             self.faults.append(text)
 
@@ -146,11 +146,12 @@ def _check_validity(report: KeyReport, home: Path, key: PrincipalKey) -> None:
         secret = key_files.read_secret(home)
         if secret is None:
             return
-        valid = Principals(secret, key_files.read_grants(home))
+        valid = Principals(key_files.read_grants(home))
     except ConfigError as error:
         report.add_fault(str(error))
         return
-    if valid.key_of(key.grant.principal, key.grant.generation) != key:
+    grant = valid.valid_grant(key.grant.principal, key.grant.generation)
+    if grant is None or secret.key_of(grant) != key:
         report.add_fault(
             f"the key of {key.grant.principal} is not valid in the cluster of this machine: it was "
             f"revoked or replaced, or is of another cluster"

@@ -25,6 +25,12 @@ def render(snapshot: Listing) -> RenderableType:
 
 def _lines(snapshot: Listing) -> Iterator[RenderableType]:
     yield Text(f"master     {snapshot.master}, up {duration(snapshot.uptime)}")
+    if snapshot.security == "none":
+        yield Text(
+            "security   none: every participant of this ROS domain has all rights", style="red"
+        )
+    if snapshot.strangers:
+        yield Text(f"strangers  {snapshot.strangers}", style="yellow")
     yield Text(f"hosts      {_counted(row.state for row in snapshot.hosts)}{_set(snapshot.hosts)}")
     yield Text(f"processes  {_counted(row.state for row in snapshot.processes)}")
     if snapshot.hosts:

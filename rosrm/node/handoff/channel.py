@@ -30,12 +30,12 @@ NO_PUBLISHER_EVENTS: Final = PublisherEventCallbacks(use_default_callbacks=False
 
 
 class Channel:
-    """The topics of one handoff: reports of its progress to each other and the master, the state.
+    """The topics of one handoff: the reports of its nodes, and the state of the source.
 
     Args:
         plain: gives access to rclpy's own methods of the node.
         links: of this node.
-        config: the master's message that names the handoff.
+        config: message of the master with the channel and key of the handoff.
         instance: this node's own number.
         peer: instance number of the other side.
         take_report: receives each report of the other side.
@@ -43,8 +43,8 @@ class Channel:
     Attributes:
         links: as given.
         name: topic of the reports.
-        destination: instance number that names the handoff.
-        topic: makes a topic under the key of the handoff, from message type and name.
+        destination: instance number of the destination, which identifies the handoff.
+        topic: returns a topic under the key of the handoff, from message type and name.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Channel:
         )
 
     def publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> SealedWriter:
-        """Return a publisher of a part of the state, or of its marks, for this handoff alone."""
+        """Return a publisher of a part of the state, or of its marks, only for this handoff."""
         return self._publisher_of(self.topic(message_type, topic), profile)
 
     def _publisher_of(self, topic: SealedTopic, profile: QoSProfile) -> SealedWriter:

@@ -129,7 +129,7 @@ class Destination:
         self, topic: SealedTopic, profile: QoSProfile, opened: Callable[[bytes], Any],
         take: Callable[[Any], None],
     ) -> None:  # fmt: skip
-        """Subscribe to a topic of the source; `opened` returns None for a message of a stranger."""
+        """Subscribe to a topic of the source; `opened` returns None for a forged message."""
         if self._ended:
             return
 
@@ -173,13 +173,14 @@ class Destination:
                 self._go_on()
 
     def _catch_up(self) -> bool:
-        """Take all received messages: with one a round, a shadow would lag behind a fast source.
+        """Process all received messages; return True if one of them is genuine.
 
-        Return True if one of them was the source's.
+        With one message a round, a shadow would lag behind a fast source.
         """
         any_genuine = False
         for subscription, take in self._followed:
-            for data, _ in waiting(subscription):
+            # At the end the subscriptions are destroyed.
+            for data, _ in () if self._ended else waiting(subscription):
                 if self._ended:
                     return any_genuine
                 any_genuine = take(data) or any_genuine

@@ -1,7 +1,7 @@
 """Links of a node with its master, and with the parties of a handoff.
 
-The session imports this module with the first message for its node, because it loads the library of
-the ciphers (0.8 MiB), and most nodes are never moved.
+The session imports this module when the first message for its node arrives, because the module
+loads PyNaCl (0.8 MiB), and most nodes are never moved.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class NodeLinks:
     """Links of one instance.
 
     Attributes:
-        configs: messages of the master about handoffs.
-        questions: of a silent source to the master.
+        configs: topic of the master's messages about handoffs.
+        questions: topic of the reports of a silent source to the master.
     """
 
     def __init__(self, identity: NodeIdentity) -> None:
@@ -37,7 +37,7 @@ class NodeLinks:
         self.questions = SealedTopic(link, name, HandoffReport, names.stranded_sources)
 
     def of_handoff(self, config: StateConfig) -> Callable[[Any, str], SealedTopic]:
-        """Return a function that makes a topic of a handoff, from message type and name.
+        """Return a function that returns a topic of a handoff, from message type and name.
 
         Raises:
             ValueError: the master has sent no key, although this node has one.

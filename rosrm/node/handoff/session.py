@@ -111,7 +111,7 @@ class HandoffSession:
             return
         config = self._opened_links().configs.read(data)
         if config is None:
-            self._refuse("it is not of this node's master, or it is a repetition")
+            self._refuse("it is not of this node's master, or it is repeated")
         else:
             self._configured(config)
 

@@ -43,7 +43,7 @@ class StateTopic:
         self._publish: Callable[[bytes], None] = lambda _: None
 
     def show_to(self, publish: Callable[[bytes], None]) -> None:
-        """Let `publish` send the part from now on: to another successor, which has nothing yet."""
+        """Use `publish` from now on; the next call publishes the part for the new successor."""
         self._publish, self._published = publish, None
 
     def publish(self) -> None:

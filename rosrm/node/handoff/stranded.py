@@ -22,8 +22,8 @@ class StrandedSource:
     """Asks the master every `ASK_EVERY` seconds, as long as the node is silent.
 
     A source may be silent without a handoff: the master was replaced by one that does not know of
-    it, or messages were forged, in a cluster without security. A master that knows of the handoff
-    leaves the question unanswered.
+    it, or messages were forged in a cluster with `security: none`. A master that knows of the
+    handoff does not answer.
 
     Args:
         channel: of the handoff for which the source is silent.

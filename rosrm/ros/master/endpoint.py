@@ -18,14 +18,17 @@ from typing import Final
 
 from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
+from rosrm.keys.security import Authority
 from rosrm.ros import names, qos
+from rosrm.ros.introductions import ticket_version
 from rosrm.ros.master.handoff import HandoffEndpoint
 from rosrm.ros.master.refusals import Refusals
 from rosrm.ros.master.rivals import RivalWatch
 from rosrm.ros.master.services import MasterIdentity, MasterServices, Queries
 from rosrm.ros.master.slave_links import HostLinks
+from rosrm.ros.master.strangers import Strangers
 from rosrm.ros.master.subscriptions import SlaveSubscriptions
-from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedEndpoints
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
 
@@ -46,45 +49,50 @@ class MasterEndpoint:
     """
 
     def __init__(
-        self, participant: Participant, identity: MasterIdentity, queries: Queries,
+        self, endpoints: SealedEndpoints[Authority], identity: MasterIdentity, queries: Queries,
         control: ControlSettings,
     ) -> None:  # fmt: skip
+        participant, security = endpoints.participant, endpoints.security
         self._identity = identity
         self._guard = participant.guard
         self.events: list[happened.Event] = []
         self.incarnation = identity.incarnation
         refuse = Refusals(self.events.append)
+        strangers = Strangers(refuse)
+        endpoints.refused = strangers.note
+        self._security = security
         self.links = HostLinks(
-            participant, f"master {identity.name}", identity.epoch, control.order_retry,
+            endpoints, f"master {identity.name}", identity.epoch, control.order_retry,
             self.events.append,
         )  # fmt: skip
         self.handoffs = HandoffEndpoint(
-            participant, identity.name, identity.epoch, self.events.append, refuse
-        )
-        self._subscriptions = SlaveSubscriptions(
-            participant, self.links, self.events.append, refuse
-        )
+            participant, identity.name, identity.epoch, self.events.append, refuse,
+            keys=security.handoff_keys(queries.host_of),
+        )  # fmt: skip
+        self._subscriptions = SlaveSubscriptions(endpoints, self.links, self.events.append, refuse)
         self.rivals = RivalWatch(
-            participant, identity.name, identity.incarnation,
+            endpoints, identity,
             lambda who, reason: refuse("master_beat", who, reason),
         )  # fmt: skip
-        self._open_topics(participant)
+        self._open_topics(endpoints)
         self.services = MasterServices(
-            participant, self.links, identity, queries,
-            control=control, own_name=self.rivals.own_name, handle=self.events.append,
-            refuse=refuse,
+            endpoints, self.links, identity, queries,
+            control=control, handle=self.events.append,
+            refuse=refuse, strangers=strangers.sentence,
         )  # fmt: skip
 
-    def _open_topics(self, participant: Participant) -> None:
-        node, path = participant.node, names.Names(participant.settings.namespace)
+    def _open_topics(self, endpoints: SealedEndpoints[Authority]) -> None:
+        path = names.Names(endpoints.participant.settings.namespace)
         topic = path(names.MASTER_BEAT)
-        node.create_subscription(
-            msg.MasterBeat, topic, participant.counted(self.rivals.take_beat), qos.BEAT
-        )
-        self._beats = node.create_publisher(msg.MasterBeat, topic, qos.BEAT)
-        self._loads = node.create_publisher(msg.Event, path(names.MASTER_LOAD), qos.LOAD)
+        endpoints.follow(msg.MasterBeat, topic, qos.BEAT, self.rivals.take_beat)
+        self._beats = endpoints.announcer(msg.MasterBeat, topic, qos.BEAT)
+        self._loads = endpoints.announcer(msg.Event, path(names.MASTER_LOAD), qos.LOAD)
         self._load_at = 0.0
         self._oldest: list[float] = []
+
+    def shut_revoked(self) -> None:
+        """End the conversations with slaves whose key is no longer valid."""
+        self.links.shut_revoked(self._security.has_access)
 
     def poll_readings(self) -> None:
         """Take new readings, even when no other event occurs; called in every tick."""
@@ -118,6 +126,7 @@ class MasterEndpoint:
                 protocol_version=PROTOCOL_VERSION, name=identity.name, hostname=identity.hostname,
                 pid=identity.pid, epoch=identity.epoch, incarnation=identity.incarnation,
                 beat=time.monotonic_ns(), uptime=uptime, journal=journal,
+                tickets_from=ticket_version(identity.epoch, self._security),
                 silent_hosts=list(silent_hosts),
             )
         )  # fmt: skip

@@ -6,7 +6,7 @@ import time
 from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rclpy.serialization import serialize_message
@@ -30,7 +30,7 @@ from rosrm_msgs import msg
 #: Most questions of silent sources that are answered at once, and a second. Each asks again.
 _QUESTIONS: Final = 20
 _QUESTIONS_PER_SECOND: Final = 5.0
-#: Most sources whose newest question is remembered.
+#: Most sources for which the counter of the newest question is stored.
 _MOST_ASKERS: Final = 256
 
 
@@ -39,12 +39,12 @@ class _Handoff:
     """One handoff.
 
     Attributes:
-        key: of the handoff; b"" without security.
-        receivers: `state_config` for each of its instances that has a key.
-        subscription: to its reports.
+        key: of the handoff; b"" with `security: none`.
+        receivers: topic `state_config` for each instance of the handoff that has a key.
+        subscription: to the reports of the handoff.
     """
 
-    key: bytes
+    key: bytes = field(repr=False)
     receivers: Sequence[SealedTopic]
     subscription: Any
 
@@ -56,7 +56,7 @@ class HandoffEndpoint:
         cluster: the master's name.
         take: called with each event.
         refuse: called with the kind of message, its refused sender and the reason.
-        keys: of instances and handoffs; None: the cluster has no security.
+        keys: of instances and handoffs; None: with `security: none`.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class HandoffEndpoint:
             self._take(SourceStranded(report.instance, report.destination))
 
     def _question_in(self, data: bytes) -> Any:
-        """Return the question of an instance about itself; None: it is not genuine."""
+        """Return the question of a silent source; None: it is not genuine."""
         envelope = decode(data)
         asker = None if envelope is None else named_instance(envelope.principal)
         if asker is None:
@@ -177,7 +177,7 @@ class HandoffEndpoint:
         report = None if topic is None else topic.read(data)
         if topic is None or report is None or report.instance != asker[1]:
             return None
-        self._askers[asker] = topic  # otherwise a recorded question could be repeated
+        self._askers[asker] = topic  # its counter: otherwise a recorded question could be repeated
         self._askers.move_to_end(asker)
         if len(self._askers) > _MOST_ASKERS:
             self._askers.popitem(last=False)

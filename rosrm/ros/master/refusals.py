@@ -11,8 +11,8 @@ from rosrm.core.master import events as happened
 
 #: Kind of a refused message. A sender chooses its own name, but not the kind.
 Kind = Literal[
-    "handoff", "handshake", "snapshot_reports", "master_beat", "process_status", "process_usage",
-    "resource_info",
+    "handoff", "handshake", "snapshot_reports", "master_beat", "other_host", "process_status",
+    "process_usage", "resource_info", "stranger",
 ]  # fmt: skip
 #: Takes the kind of a refused message, its sender and the reason.
 Refuse = Callable[[Kind, str, str], None]

@@ -1,7 +1,8 @@
 """Search for another running master, by its beats and its answer to a handshake.
 
-A beat alone proves no master, because any participant can send one. So a master whose beat arrives
-is asked for a handshake, and only one that answers as the same run counts.
+A beat alone does not prove that a master runs, because a recorded beat can be sent again, and with
+`security: none` any participant can send one. So this master sends a handshake when it receives a
+beat, and counts only a master that answers with the same run.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
+from rosrm.keys.security import Authority, Member
 from rosrm.model.durations import LONGEST
-from rosrm.ros import names, qos
+from rosrm.ros import names
 from rosrm.ros.control import ControlClient, master_identity, version_refusal
-from rosrm.ros.participant import Participant
+from rosrm.ros.master.services import MasterIdentity
+from rosrm.ros.sealed import SealedClient, SealedEndpoints
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import msg, srv
 
@@ -26,35 +29,32 @@ class RivalWatch:
     """Finds another master of this namespace.
 
     All masters of a namespace offer the same service, so this master must not answer its own
-    question: it recognises it by `own_name`.
+    question: it recognises it by its name as a client.
 
     Args:
-        master: name of this master.
-        incarnation: of its run.
+        identity: of this master.
         refuse: receives the sender of a refused beat, and the reason.
 
     Attributes:
         found: newest beat of another master that answered; None: none since the last one was taken.
-        own_name: name under which this master asks for a handshake.
     """
 
     def __init__(
-        self, participant: Participant, master: str, incarnation: int,
+        self, endpoints: SealedEndpoints[Authority], identity: MasterIdentity,
         refuse: Callable[[str, str], None],
     ) -> None:  # fmt: skip
-        self._participant = participant
-        self._incarnation = incarnation
+        self._endpoints = endpoints
+        self._identity = identity
         self._refuse = refuse
         self.found: msg.MasterBeat | None = None
-        self.own_name = f"{master} {incarnation}"
         self._newest: msg.MasterBeat | None = None
         self._ask_at = -math.inf
-        self._control = ControlClient(participant, f"master {master}")
-        self._client: Any = None
+        self._control = ControlClient(endpoints.participant, f"master {identity.name}")
+        self._client: SealedClient | None = None
 
-    def take_beat(self, beat: msg.MasterBeat) -> None:
+    def take_beat(self, beat: msg.MasterBeat, _run: bytes) -> None:
         """Take a beat; ask its sender for a handshake if it is another master."""
-        if beat.incarnation == self._incarnation:
+        if beat.incarnation == self._identity.incarnation:
             return
         fault = version_refusal(beat.protocol_version, "another master")
         if not fault and not 0.0 <= beat.uptime <= LONGEST:
@@ -71,7 +71,7 @@ class RivalWatch:
     def _ask(self, beat: msg.MasterBeat, now: float) -> None:
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role="master",
-            name=self.own_name,
+            name=self._identity.as_client,
         )  # fmt: skip
 
         def answered(answer: srv.Handshake.Response | None) -> None:
@@ -83,12 +83,12 @@ class RivalWatch:
 
         self._control.call(self._made_client(), request, now + _PATIENCE, answered)
 
-    def _made_client(self) -> Any:
+    def _made_client(self) -> SealedClient:
+        security: Member = self._endpoints.security.client()  # its secret may have changed
         if self._client is None:
-            path = names.Names(self._participant.settings.namespace)(names.HANDSHAKE)
-            self._client = self._participant.node.create_client(
-                srv.Handshake, path, qos_profile=qos.SERVICE
-            )
+            path = names.Names(self._endpoints.participant.settings.namespace)(names.HANDSHAKE)
+            self._client = self._endpoints.client(srv.Handshake, path, security.master)
+        self._client.peer = security.master
         return self._client
 
     def expire(self, now: float) -> None:

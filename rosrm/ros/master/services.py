@@ -11,13 +11,24 @@ from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Reply
 from rosrm.errors import JournalError, Refused
+from rosrm.keys.roles import Principal, Role
+from rosrm.keys.security import Authority, Peer
+from rosrm.keys.tickets import TICKET_LIFE, Ticket
 from rosrm.model.requester import Requester
 from rosrm.model.rows import Listing
 from rosrm.ros import convert, names
-from rosrm.ros.control import ControlServer, RequestGate, accepted, refused, version_refusal
+from rosrm.ros.control import (
+    ControlServer,
+    Handle,
+    RequestGate,
+    accepted,
+    refused,
+    version_refusal,
+)
+from rosrm.ros.introductions import ticket_version
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
-from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.ros.sealed import SealedEndpoints, SealedRequest
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm.wording import sanitized
 from rosrm_msgs import srv
@@ -26,6 +37,8 @@ _Respond = Callable[[Any], None]
 
 #: Most letters of the name of a client or peer in records.
 _LONGEST_PEER: Final = 200
+#: Seconds for which an introduction to a newly registered slave waits for its first reading.
+_FIRST_READING: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +51,11 @@ class MasterIdentity:
     epoch: int
     incarnation: int
 
+    @property
+    def as_client(self) -> str:
+        """Name under which this master asks another one for a handshake."""
+        return f"{self.name} {self.incarnation}"
+
 
 class Queries(Protocol):
     """Interface of the master for read-only requests."""
@@ -46,7 +64,19 @@ class Queries(Protocol):
         """Return the requested listings, as far as the requester may read them."""
 
     def explain(self, name: str, by: Requester) -> str | None:
-        """Return the story of a process as JSON; None: there is no process of that name."""
+        """Return the explanation of a process as JSON; None: there is no process of that name."""
+
+    def host_of(self, process: str, number: int) -> str | None:
+        """Return the host of an instance; None: there is no such instance."""
+
+    def may_read_log(self, process: str, by: Requester) -> bool:
+        """Return True if a user may read the logs of a process."""
+
+    def has_held(self, process: str, host: str) -> bool:
+        """Return True if an instance of a process runs on a host, or ended there last."""
+
+    def number_of(self, host: str) -> int | None:
+        """Return the number of a host; None: there is no host of that name."""
 
 
 class MasterServices:
@@ -54,33 +84,34 @@ class MasterServices:
 
     Args:
         control: greatest age of a request, and the beat period for slaves.
-        own_name: name under which this master itself asks for a handshake; not answered.
         refuse: receives refused peers, and reasons.
+        strangers: returns a sentence about messages without a valid key.
     """
 
     def __init__(
-        self, participant: Participant, links: HostLinks, identity: MasterIdentity,
+        self, endpoints: SealedEndpoints[Authority], links: HostLinks, identity: MasterIdentity,
         queries: Queries,
-        *, control: ControlSettings, own_name: str,
-        handle: Callable[[happened.Event], None], refuse: Refuse,
+        *, control: ControlSettings,
+        handle: Callable[[happened.Event], None], refuse: Refuse, strangers: Callable[[], str],
     ) -> None:  # fmt: skip
-        self._participant = participant
-        self._server = ControlServer(participant, RequestGate(time.monotonic_ns, control.max_age))
+        self._endpoints = endpoints
+        self._server = ControlServer(endpoints, RequestGate(time.monotonic_ns, control.max_age))
         self._identity = identity
-        self._own_name = own_name
         self._queries = queries
         self._beat_period = control.beat_period
         self._links = links
         self._handle = handle
         self._refuse = refuse
+        self._strangers = strangers
         self._open: dict[int, Callable[[Reply], None]] = {}
         self._next_request = 1
-        self._offer(names.Names(participant.settings.namespace))
+        self._offer(names.Names(endpoints.participant.settings.namespace))
 
     def _offer(self, path: names.Names) -> None:
-        serve, offer = self._participant.serve, self._server.offer
+        serve, offer = self._endpoints.serve, self._server.offer
         serve(srv.List, path(names.LIST), self._take_list)
         serve(srv.Explain, path(names.EXPLAIN), self._take_explain)
+        serve(srv.Introduce, path(names.INTRODUCE), self._take_introduction)
         offer(srv.RequestProcess, path(names.REQUEST_PROCESS), self._take_poll, remember=False)
         offer(srv.RegisterHost, path(names.REGISTER_HOST), self._take_registration)
         for kind, name, event in (
@@ -96,7 +127,7 @@ class MasterServices:
         ):
             offer(kind, path(name), self._as_event(kind, event))
         # Offered last, and DDS announces in this order: after a handshake all others are usable.
-        serve(srv.Handshake, path(names.HANDSHAKE), self._take_handshake)
+        serve(srv.Handshake, path(names.HANDSHAKE), self._take_handshake, first_contact=True)
 
     # --- answers -------------------------------------------------------------------------
 
@@ -104,7 +135,7 @@ class MasterServices:
         """Answer a request, if it is still open."""
         answer = self._open.pop(command.request, None)
         if answer is not None:
-            self._participant.guard.call(answer, command)
+            self._endpoints.participant.guard.call(answer, command)
 
     def _keep(self, answer: Callable[[Reply], None]) -> int:
         """Store the means to answer a request; return the request's number."""
@@ -113,15 +144,13 @@ class MasterServices:
         self._open[token] = answer
         return token
 
-    def _as_event(
-        self, kind: Any, make: Callable[[Any, int], happened.Event]
-    ) -> Callable[[Any, _Respond], None]:
+    def _as_event(self, kind: Any, make: Callable[[Any, int, Peer], happened.Event]) -> Handle:
         """Return a handler that turns a request into an event and stores the means to answer it."""
 
-        def take(request: Any, respond: _Respond) -> None:
+        def take(request: Any, sealed: SealedRequest, respond: _Respond) -> None:
             token = self._keep(lambda reply: respond(self._response(kind, reply)))
             try:
-                event = make(request, token)
+                event = make(request, token, sealed.peer)
             except Refused as refusal:
                 del self._open[token]
                 respond(kind.Response(answer=refused(refusal.code, str(refusal))))
@@ -144,8 +173,8 @@ class MasterServices:
 
     # --- slaves --------------------------------------------------------------------------
 
-    def _take_handshake(self, request: srv.Handshake.Request, open_request: OpenRequest) -> None:
-        if request.role == "master" and request.name == self._own_name:
+    def _take_handshake(self, request: srv.Handshake.Request, open_request: SealedRequest) -> None:
+        if request.role == "master" and request.name == self._identity.as_client:
             return
         who = sanitized(f"{request.role} {request.name}", _LONGEST_PEER)
         fault = version_refusal(request.protocol_version, who)
@@ -160,9 +189,13 @@ class MasterServices:
             )
         )  # fmt: skip
 
-    def _take_registration(self, request: srv.RegisterHost.Request, respond: _Respond) -> None:
+    def _take_registration(
+        self, request: srv.RegisterHost.Request, sealed: SealedRequest, respond: _Respond
+    ) -> None:
+        slave, run = sealed.peer, sealed.run
         try:
             description = convert.host_from_msg(request.host)
+            _check_name(slave, description.name)
             statuses = tuple(convert.status_from_msg(status) for status in request.instances)
             snapshots = tuple(convert.snapshot_from_msg(state) for state in request.snapshots)
         except Refused as refusal:
@@ -173,21 +206,24 @@ class MasterServices:
             response = self._response(srv.RegisterHost, reply)
             if reply.accepted:
                 response.host_id, response.beat_period = reply.host_id, self._beat_period
-                self._links.renew(reply.host_id, description)
+                self._links.renew(reply.host_id, description, slave, run)
             respond(response)
 
         token, seen = self._keep(answer), int(request.journal_seen)
         self._handle(happened.HostRegistered(token, description, statuses, seen, snapshots))
 
-    def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
+    def _left(self, request: srv.Leave.Request, token: int, slave: Peer) -> happened.Event:
         running = tuple(convert.status_from_msg(status) for status in request.left_running)
-        link = self._links.find(request.host_id, request.incarnation)
-        if link is not None:
-            self._links.left(link)
+        link = self._links.find(request.host_id, request.incarnation, slave)
+        if link is None:
+            raise Refused("register first", "unknown")
+        self._links.left(link)
         return happened.HostLeft(token, request.host_id, request.incarnation, running)
 
-    def _take_poll(self, request: srv.RequestProcess.Request, respond: _Respond) -> None:
-        link = self._links.find(request.host_id, request.incarnation)
+    def _take_poll(
+        self, request: srv.RequestProcess.Request, sealed: SealedRequest, respond: _Respond
+    ) -> None:
+        link = self._links.find(request.host_id, request.incarnation, sealed.peer)
         if link is None:
             answer = refused("unknown", "register first", self._identity.epoch)
             respond(srv.RequestProcess.Response(answer=answer))
@@ -209,15 +245,77 @@ class MasterServices:
     def _drop(self, token: int) -> None:
         self._open.pop(token, None)
 
+    # --- introductions -------------------------------------------------------------------
+
+    def _take_introduction(
+        self, request: srv.Introduce.Request, open_request: SealedRequest
+    ) -> None:
+        def refuse(refusal: Refused) -> None:
+            answer = refused(refusal.code, str(refusal))
+            open_request.answer(srv.Introduce.Response(answer=answer))
+
+        sender = open_request.peer
+        silent = Refused(f"the slave of {request.host} does not report to the master", "silent")
+        try:
+            self._check_introduction(request, sender)
+        except Refused as refusal:
+            refuse(refusal)
+            return
+        number = self._queries.number_of(request.host)
+        link = None if number is None else self._links.registered(number)
+        if link is None:
+            refuse(silent)
+            return
+        # The expiry of the ticket needs the slave's clock, which is in the first reading.
+        self._links.after_first_reading(
+            link, lambda: open_request.answer(self._introduction(request, sender, link)),
+            time.monotonic() + _FIRST_READING, lambda _: refuse(silent),
+        )  # fmt: skip
+
+    def _introduction(
+        self, request: srv.Introduce.Request, sender: Peer, link: HostLink
+    ) -> srv.Introduce.Response:
+        """Return a ticket for one service of one slave."""
+        if link.slave is None:
+            raise Refused(f"the key of host:{request.host} was revoked", "denied")
+        until = int(self._links.reading_stats.beat[link.host_id]) + int(TICKET_LIFE * 1e9)
+        security, whom = self._endpoints.security, sender.grant.principal
+        version = ticket_version(self._identity.epoch, security)
+        ticket = Ticket(until, version, request.service, request.process, whom)
+        key = security.introduction(link.slave.peer, ticket)
+        return srv.Introduce.Response(
+            answer=accepted(epoch=self._identity.epoch), ticket=ticket.text(), key=key,
+            run=link.slave.run,
+        )  # fmt: skip
+
+    def _check_introduction(self, request: srv.Introduce.Request, sender: Peer) -> None:
+        """Raise `Refused` unless the sender may get a ticket for the service and process."""
+        fault = version_refusal(request.protocol_version, "a request for a ticket")
+        if fault:
+            raise Refused(fault, "version")
+        process, who = request.process, sender.grant.principal
+        if sender.grant.role is Role.HOST:
+            is_allowed = request.service in (names.STORE_REPLICA, names.READ_SNAPSHOT)
+            if not is_allowed or not self._queries.has_held(process, who.name):
+                raise Refused(f"{who} has no instance of {process!r}", "denied")
+        elif request.service != names.READ_LOG:
+            raise Refused(f"users get no ticket for {request.service!r}", "denied")
+        elif not self._queries.may_read_log(process, _requester(sender)):
+            raise Refused(
+                f"the logs of {process!r} are for its owner and operators, and {who} is neither: "
+                f"ask one of them",
+                "denied",
+            )
+
     # --- read-only requests --------------------------------------------------------------
 
-    def _take_list(self, request: srv.List.Request, open_request: OpenRequest) -> None:
+    def _take_list(self, request: srv.List.Request, open_request: SealedRequest) -> None:
         fault = version_refusal(request.protocol_version, "a listing")
         if fault:
             open_request.answer(srv.List.Response(answer=refused("version", fault)))
             return
         try:
-            view = self._queries.snapshot(request, _requester(request))
+            view = self._queries.snapshot(request, _requester(open_request.peer))
         except JournalError as trouble:
             open_request.answer(srv.List.Response(answer=refused("journal", str(trouble))))
             return
@@ -225,6 +323,7 @@ class MasterServices:
             srv.List.Response(
                 answer=accepted(epoch=self._identity.epoch), master=view.master,
                 uptime=view.uptime, last_sequence=view.last_sequence, trouble=view.trouble,
+                security=self._endpoints.security.described, strangers=self._strangers(),
                 host_list=[convert.host_row_to_msg(row) for row in view.hosts],
                 process_list=[convert.process_row_to_msg(row) for row in view.processes],
                 plugin_list=[convert.plugin_row_to_msg(row) for row in view.plugins],
@@ -232,9 +331,10 @@ class MasterServices:
             )
         )  # fmt: skip
 
-    def _take_explain(self, request: srv.Explain.Request, open_request: OpenRequest) -> None:
+    def _take_explain(self, request: srv.Explain.Request, open_request: SealedRequest) -> None:
         fault = version_refusal(request.protocol_version, "explain")
-        text = None if fault else self._queries.explain(request.process, _requester(request))
+        by = _requester(open_request.peer)
+        text = None if fault else self._queries.explain(request.process, by)
         if text is None:
             reason = fault or f"no such process: {request.process}; see `rosrm ps`"
             answer = refused("version" if fault else "unknown", reason)
@@ -243,44 +343,51 @@ class MasterServices:
         open_request.answer(srv.Explain.Response(answer=accepted(), explanation=text))
 
 
-def _submitted(request: srv.Submit.Request, token: int) -> happened.Event:
+def _check_name(slave: Peer, name: str) -> None:
+    """Raise `Refused` for a slave that registers under the name of another host."""
+    own = slave.grant.principal
+    if own != Principal("host", name):
+        raise Refused(
+            f"{own} may not register as {name!r}: a slave registers only the host of its key",
+            "denied",
+        )
+
+
+def _submitted(request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
     specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
-    return happened.SubmissionReceived(token, specs, _requester(request))
+    return happened.SubmissionReceived(token, specs, _requester(peer))
 
 
-def _cancelled(request: srv.Cancel.Request, token: int) -> happened.Event:
-    return happened.CancelRequested(token, tuple(request.processes), _requester(request))
+def _cancelled(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.CancelRequested(token, tuple(request.processes), _requester(peer))
 
 
-def _restarted(request: srv.Restart.Request, token: int) -> happened.Event:
-    return happened.RestartRequested(token, tuple(request.processes), _requester(request))
+def _restarted(request: srv.Restart.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.RestartRequested(token, tuple(request.processes), _requester(peer))
 
 
-def _migrated(request: srv.Migrate.Request, token: int) -> happened.Event:
+def _migrated(request: srv.Migrate.Request, token: int, peer: Peer) -> happened.Event:
     host = request.host or None
-    return happened.MigrationRequested(token, request.process, host, _requester(request))
+    return happened.MigrationRequested(token, request.process, host, _requester(peer))
 
 
-def _checkpointed(request: srv.Checkpoint.Request, token: int) -> happened.Event:
-    return happened.CheckpointRequested(token, request.process, _requester(request))
+def _checkpointed(request: srv.Checkpoint.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.CheckpointRequested(token, request.process, _requester(peer))
 
 
-def _restored(request: srv.Restore.Request, token: int) -> happened.Event:
-    return happened.RestoreRequested(token, request.process, _requester(request))
+def _restored(request: srv.Restore.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.RestoreRequested(token, request.process, _requester(peer))
 
 
-def _host_set(request: srv.SetHostState.Request, token: int) -> happened.Event:
-    by = _requester(request)
-    return happened.HostStateRequested(token, request.host, request.action, by)
+def _host_set(request: srv.SetHostState.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.HostStateRequested(token, request.host, request.action, _requester(peer))
 
 
-def _pruned(request: srv.Prune.Request, token: int) -> happened.Event:
+def _pruned(request: srv.Prune.Request, token: int, peer: Peer) -> happened.Event:
     names, hosts = tuple(request.processes), tuple(request.hosts)
-    return happened.PruneRequested(token, names, hosts, _requester(request))
+    return happened.PruneRequested(token, names, hosts, _requester(peer))
 
 
-def _requester(request: Any) -> Requester:
-    """Return the client that sent a request; requests that only read do not name it."""
-    envelope = getattr(request, "envelope", None)
-    sender = "" if envelope is None else envelope.sender.removeprefix("client ")
-    return Requester(sanitized(sender, _LONGEST_PEER), is_operator=True)
+def _requester(peer: Peer) -> Requester:
+    """Return the requester of a request."""
+    return Requester(str(peer.grant.principal), is_operator=peer.grant.role is Role.OPERATOR)

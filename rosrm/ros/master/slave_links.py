@@ -15,13 +15,15 @@ from typing import Any, Final
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign, OrderId, Redeliver, SendOrder, Withdraw
 from rosrm.errors import Refused
+from rosrm.keys.security import Authority, Peer
 from rosrm.model.orders import Order, StartInstance, seconds_of
 from rosrm.model.values import Assignment, HostDescription
-from rosrm.ros import convert, names, qos
+from rosrm.ros import convert, names
 from rosrm.ros.control import ControlClient, accepted, version_refusal
 from rosrm.ros.master.reading_stats import ReadingStats
 from rosrm.ros.orders import order_to_msg
-from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedClient, SealedEndpoints
+from rosrm.ros.sealed_readings import RegisteredSlave, reading_channel
 from rosrm_msgs import srv
 
 #: Most orders and requests that wait for the next reading of one slave.
@@ -48,6 +50,7 @@ class HostLink:
     """Pending orders and assignments of one slave.
 
     Attributes:
+        slave: the registered slave; None: its key was revoked.
         incarnation: of the run that registered last; messages of a former run are ignored.
         deferred: orders and requests that wait for its first beat.
         outbox: assignments for the answer to its open request.
@@ -56,12 +59,17 @@ class HostLink:
     """
 
     host_id: int
-    control: Any
+    slave: RegisteredSlave | None
+    control: SealedClient
     incarnation: int
     deferred: list[_Deferred] = field(default_factory=list)
     outbox: list[Assignment] = field(default_factory=list)
     poll: Callable[[Any], None] | None = None
     forget_poll: Callable[[], None] = lambda: None
+
+    def is_of(self, sender: Peer) -> bool:
+        """Return True if a sender is the slave of this host."""
+        return self.slave is not None and sender.grant == self.slave.peer.grant
 
     def close_poll(self) -> None:
         """Close the open request: it is answered, or its answer can reach no slave."""
@@ -76,21 +84,19 @@ class HostLinks:
         sender: of the orders, for messages.
         order_timeout: seconds beyond an order's own time for its answer.
         handle: receives the events.
-        state_key: returns the key by which the replicas of a process's snapshots are encrypted;
-            b"": they are not encrypted.
     """
 
     def __init__(
-        self, participant: Participant, sender: str, epoch: int, order_timeout: float,
-        handle: Callable[[happened.Event], None], state_key: Callable[[str], bytes] = lambda _: b"",
+        self, endpoints: SealedEndpoints[Authority], sender: str, epoch: int, order_timeout: float,
+        handle: Callable[[happened.Event], None],
     ) -> None:  # fmt: skip
-        self._participant = participant
+        self._endpoints = endpoints
         self._epoch = epoch
         self._order_timeout = order_timeout
         self._handle = handle
-        self._state_key = state_key
-        self._names = names.Names(participant.settings.namespace)
-        self._client = ControlClient(participant, sender)
+        self._names = names.Names(endpoints.participant.settings.namespace)
+        self._readings = reading_channel(self._names(names.RESOURCE_INFO))
+        self._client = ControlClient(endpoints.participant, sender)
         self._links: dict[int, HostLink] = {}
         # Of a thousand links few have pending work, so only those are checked.
         self._waiting: set[int] = set()
@@ -99,20 +105,44 @@ class HostLinks:
 
     # --- registered slaves ---------------------------------------------------------------
 
-    def find(self, host_id: int, incarnation: int) -> HostLink | None:
-        """Return the link of a host, if this is its last registered run."""
+    def find(self, host_id: int, incarnation: int, sender: Peer) -> HostLink | None:
+        """Return the link of a host, if the sender is its slave, in its last registered run."""
         link = self._links.get(host_id)
-        return link if link is not None and link.incarnation == incarnation else None
+        if link is None or link.incarnation != incarnation or not link.is_of(sender):
+            return None
+        return link
 
-    def renew(self, host_id: int, description: HostDescription) -> None:
-        """Create or renew the link of a registered slave; void the queue of a former run."""
+    def is_slave_of(self, host_id: int, sender: Peer) -> bool:
+        """Return True if the sender of a message is the slave of a host."""
         link = self._links.get(host_id)
-        if link is None:
-            path = self._names.of_host(description.name, names.CONTROL)
-            control = self._participant.node.create_client(
-                srv.ControlHost, path, qos_profile=qos.SERVICE
-            )
-            link = self._links[host_id] = HostLink(host_id, control, 0)
+        return link is not None and link.is_of(sender)
+
+    def slave_of(self, host_id: int) -> RegisteredSlave | None:
+        """Return the slave of a host; None: it has not registered, or its key was revoked."""
+        link = self._links.get(host_id)
+        return None if link is None else link.slave
+
+    def registered(self, host_id: int) -> HostLink | None:
+        """Return the link of a registered slave; None: there is none with a valid key."""
+        link = self._links.get(host_id)
+        return None if link is None or link.slave is None else link
+
+    def renew(self, host_id: int, description: HostDescription, peer: Peer, run: bytes) -> None:
+        """Create or renew the link of a registered slave; clear the queue of a former run.
+
+        Args:
+            host_id: number of the host.
+            description: of the host.
+            peer: the slave.
+            run: of the slave.
+        """
+        link = self._links.get(host_id)
+        peer.run = run
+        slave = RegisteredSlave.of(peer, run, self._readings)
+        if link is None or link.slave is None or link.slave.peer is not peer:
+            link = self._new_link(host_id, description.name, slave)
+            self._links[host_id] = link
+        link.slave = slave
         link.close_poll()
         if link.incarnation == description.incarnation:
             # The same run again: assignments that it has not fetched stay valid. But it was
@@ -122,9 +152,32 @@ class HostLinks:
         link.incarnation = description.incarnation
         self.reading_stats.begin(host_id, description.incarnation)
         link.outbox.clear()
+        self._shut(link)
+
+    def _new_link(self, host_id: int, host: str, slave: RegisteredSlave) -> HostLink:
+        former = self._links.get(host_id)
+        if former is not None:  # the slave has another key now
+            self._shut(former)
+            former.control.destroy()
+        path = self._names.of_host(host, names.CONTROL)
+        control = self._endpoints.client(srv.ControlHost, path, slave.peer)
+        return HostLink(host_id, slave, control, 0)
+
+    def _shut(self, link: HostLink) -> None:
+        """Close the open request, and end the orders and requests that wait for the slave."""
+        link.close_poll()
         waiting, link.deferred = link.deferred, []
         for order in waiting:
             order.done(None)
+
+    def shut_revoked(self, has_access: Callable[[Peer], bool]) -> None:
+        """Stop receiving from and sending to slaves without a valid key."""
+        for link in self._links.values():
+            if link.slave is not None and not has_access(link.slave.peer):
+                link.slave = None
+                self._shut(link)
+                self.reading_stats.forget(link.host_id)
+                self._handle(happened.KeyRevoked(link.host_id, link.incarnation))
 
     def left(self, link: HostLink) -> None:
         """Close the open request of a slave that stops in an orderly way."""
@@ -213,18 +266,19 @@ class HostLinks:
     def _keyed(self, assignment: Assignment) -> Assignment:
         """Return an assignment with the key of its snapshots, if its process has snapshots.
 
-        The core and the journal have no keys: only this message does.
+        The key is added only here, so that neither the core nor the journal has keys.
         """
         if not assignment.has_snapshots:
             return assignment
-        return replace(assignment, state_key=self._state_key(assignment.spec.name))
+        key = self._endpoints.security.snapshot_key(assignment.spec.name)
+        return replace(assignment, state_key=key)
 
     # --- orders --------------------------------------------------------------------------
 
     def order(self, command: SendOrder, now: float) -> None:
         """Send an order to a slave; the answer, or its absence in time, becomes an event."""
         link = self._links.get(command.host_id)
-        if link is None:  # expected from the journal, not registered yet
+        if link is None or link.slave is None:  # expected from the journal, or without a key
             why = "the host does not report"
             self._handle(happened.OrderAnswered.missing(command.order_id, why))
             return

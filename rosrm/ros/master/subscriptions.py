@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from rosrm.core.master import events as happened
 from rosrm.errors import Refused
+from rosrm.keys.security import Authority, Peer
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import version_refusal
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLinks
-from rosrm.ros.participant import Participant
 from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
+from rosrm.ros.sealed import SealedEndpoints
+from rosrm.ros.sealed_readings import is_of_unknown_host, open_reading
 from rosrm.wording import sanitized
 from rosrm_msgs import msg
 
@@ -33,28 +35,32 @@ class SlaveSubscriptions:
     """
 
     def __init__(
-        self, participant: Participant, links: HostLinks, handle: Callable[[happened.Event], None],
-        refuse: Refuse,
+        self, endpoints: SealedEndpoints[Authority], links: HostLinks,
+        handle: Callable[[happened.Event], None], refuse: Refuse,
     ) -> None:  # fmt: skip
+        self._endpoints = endpoints
         self._links = links
         self._handle = handle
         self._refuse = refuse
-        node, path = participant.node, names.Names(participant.settings.namespace)
+        participant = endpoints.participant
+        path = names.Names(participant.settings.namespace)
+        self._topic = path(names.RESOURCE_INFO)
         # Thousands of readings arrive: they are taken raw, in batches, without the executor.
-        intake = participant.unwatched_node(f"{node.get_name()}_intake")
-        self._readings = polled_subscription(
-            intake, msg.ResourceInfo, path(names.RESOURCE_INFO), qos.READINGS
-        )
+        intake = participant.unwatched_node(f"{participant.node.get_name()}_intake")
+        self._readings = polled_subscription(intake, msg.SealedReading, self._topic, qos.READINGS)
         for kind, topic, take in (
             (msg.ProcessStatusBatch, names.PROCESS_STATUS, self._take_statuses),
             (msg.ProcessUsage, names.PROCESS_USAGE, self._take_usage),
             (msg.SnapshotReports, names.SNAPSHOT_REPORTS, self._take_snapshots),
         ):
-            node.create_subscription(kind, path(topic), participant.counted(take), qos.STATUSES)
+            endpoints.subscribe(kind, path(topic), qos.STATUSES, self._of_host(take))
 
     def poll_readings(self) -> happened.ReadingsReceived | None:
         """Take all received readings; None: there are none."""
-        taken = [message for message, _ in waiting(self._readings, qos.READINGS.depth)]
+        taken = [
+            opened for sealed, _ in waiting(self._readings, qos.READINGS.depth)
+            if (opened := self._opened(sealed)) is not None
+        ]  # fmt: skip
         if not taken:
             return None
         batch = decode(taken)
@@ -64,6 +70,27 @@ class SlaveSubscriptions:
         for refusal in batch.refusals:
             self._refuse("resource_info", "resource_info", refusal)
         return batch.readings
+
+    def _opened(self, sealed: bytes) -> bytes | None:
+        run, slave_of = self._endpoints.security.run, self._links.slave_of
+        plain = open_reading(sealed, run, slave_of)
+        # After a restart of the master, slaves send readings until they notice the restart.
+        if plain is None and not is_of_unknown_host(sealed, slave_of):
+            self._endpoints.refused(self._topic)
+        return plain
+
+    def _of_host(self, take: Callable[[Any], None]) -> Callable[[Any, Peer], None]:
+        """Wrap a callback: pass on messages about a host only from the slave of this host."""
+
+        def take_own(message: Any, sender: Peer) -> None:
+            if self._links.is_slave_of(message.host_id, sender):
+                take(message)
+            else:
+                who = str(sender.grant.principal)
+                reason = f"{who} is not the slave of host {message.host_id}"
+                self._refuse("other_host", who, reason)
+
+        return take_own
 
     def _take_statuses(self, message: msg.ProcessStatusBatch) -> None:
         who = f"process_status of host {message.host_id}"

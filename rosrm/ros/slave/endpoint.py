@@ -18,11 +18,13 @@ from rosrm.core.slave.master_clock import BeatClock
 from rosrm.core.slave.state import SlaveState
 from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
+from rosrm.keys.security import Member
 from rosrm.model.values import HostDescription, InstanceStatus, SnapshotReport
 from rosrm.ros import convert, names, qos
 from rosrm.ros.bounds import MOST_LETTERS
 from rosrm.ros.control import Call, ControlClient, master_identity, version_refusal
-from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedEndpoints
+from rosrm.ros.sealed_readings import reading_channel, seal_reading
 from rosrm.ros.slave.journal_watermark import JournalWatermark, Watermark
 from rosrm.ros.slave.reporter import Reporter
 from rosrm.version import PROTOCOL_VERSION, __version__
@@ -85,12 +87,13 @@ class SlaveEndpoint:
     """
 
     def __init__(
-        self, participant: Participant, description: HostDescription, state: SlaveState, *,
-        take: Callable[[events.Event], None],
+        self, endpoints: SealedEndpoints[Member], description: HostDescription,
+        state: SlaveState, *, take: Callable[[events.Event], None],
         snapshots: Callable[[], Sequence[SnapshotReport]] = tuple,
         seen: JournalWatermark | None = None,
     ) -> None:  # fmt: skip
-        self._participant = participant
+        self._endpoints = endpoints
+        self._master = endpoints.security.master
         self._state, self._take, self._snapshots = state, take, snapshots
         self._description = description
         self._seen = seen or JournalWatermark()
@@ -117,14 +120,15 @@ class SlaveEndpoint:
         self._poll_at = 0.0
         self._poll_again = _FIRST_POLL_AGAIN
         self._status_sequence = 0
+        participant = endpoints.participant
         self._control = ControlClient(participant, f"slave {description.name}")
         self._names = names.Names(participant.settings.namespace)
         self._join()
 
     def _join(self) -> None:
-        node, path = self._participant.node, self._names
+        endpoints, path, master = self._endpoints, self._names, self._master
         self._clients = {
-            kind: node.create_client(kind, path(name), qos_profile=qos.SERVICE)
+            kind: endpoints.client(kind, path(name), master, first_contact=kind is srv.Handshake)
             for kind, name in (
                 (srv.Handshake, names.HANDSHAKE),
                 (srv.RegisterHost, names.REGISTER_HOST),
@@ -132,24 +136,24 @@ class SlaveEndpoint:
                 (srv.Leave, names.LEAVE),
             )
         }
-        readings = node.create_publisher(
-            msg.ResourceInfo, path(names.RESOURCE_INFO), qos.READING_OUT
+        topic = path(names.RESOURCE_INFO)
+        readings = endpoints.participant.node.create_publisher(
+            msg.SealedReading, topic, qos.READING_OUT
         )
-        description = self._description
-        self._reporter = Reporter(readings.publish, description.incarnation, description.period)
-        self._statuses = node.create_publisher(
-            msg.ProcessStatusBatch, path(names.PROCESS_STATUS), qos.STATUSES
-        )
-        self._usages = node.create_publisher(
-            msg.ProcessUsage, path(names.PROCESS_USAGE), qos.STATUSES
-        )
-        self._snapshot_reports = node.create_publisher(
-            msg.SnapshotReports, path(names.SNAPSHOT_REPORTS), qos.STATUSES
-        )
-        node.create_subscription(
-            msg.MasterBeat, path(names.MASTER_BEAT),
-            self._participant.counted(self._take_beat), qos.BEAT_IN,
+        channel, description = reading_channel(topic), self._description
+        self._reporter = Reporter(
+            lambda reading: readings.publish(seal_reading(master, channel, reading)),
+            description.incarnation, description.period,
         )  # fmt: skip
+        self._statuses, self._usages, self._snapshot_reports = (
+            endpoints.publisher(kind, path(name), qos.STATUSES, master)
+            for kind, name in (
+                (msg.ProcessStatusBatch, names.PROCESS_STATUS),
+                (msg.ProcessUsage, names.PROCESS_USAGE),
+                (msg.SnapshotReports, names.SNAPSHOT_REPORTS),
+            )
+        )
+        endpoints.follow(msg.MasterBeat, path(names.MASTER_BEAT), qos.BEAT_IN, self._take_beat)
 
     # --- finding the master --------------------------------------------------------------
 
@@ -281,7 +285,7 @@ class SlaveEndpoint:
         self._take(events.MasterLost())
         _log.info("%s", reason)
 
-    def _take_beat(self, beat: msg.MasterBeat) -> None:
+    def _take_beat(self, beat: msg.MasterBeat, _run: bytes) -> None:
         if version_refusal(beat.protocol_version, "the master"):
             return  # the handshake reports the version mismatch
         now = time.monotonic()
@@ -292,6 +296,7 @@ class SlaveEndpoint:
         self._newest_beat = beat
         if not self._is_of_master(beat) or self._beat_clock.is_ahead(beat.beat / 1e9, now):
             return
+        self._endpoints.security.tickets_from = beat.tickets_from
         sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
-from rosrm.ros import names, qos
+from rosrm.errors import Refused
+from rosrm.keys.security import Member
+from rosrm.ros import names
 from rosrm.ros.control import ControlClient, accepted, refused, version_refusal
-from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.ros.introductions import Introduction, introduction_of, introduction_request
+from rosrm.ros.sealed import SealedClient, SealedEndpoints, SealedRequest
 from rosrm.snapshots.format import TransferPart
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import srv
 
+_log = logging.getLogger("rosrm.slave")
+
 #: Seconds without use after which a client is destroyed.
 _IDLE: Final = 60.0
+#: Time-out of a request for a ticket, and time until the next request, in seconds.
+_ASK_AGAIN: Final = 1.0
+#: Reason why a slave has not executed a request.
+_RESTARTED: Final = "its slave has restarted"
 #: Most bytes of one part.
 MOST: Final = 256 << 10
 
@@ -25,11 +36,11 @@ class NotStored(NamedTuple):
 
     Attributes:
         code: "newer": it has this snapshot or a newer one; "order": the parts before are missing;
-            "full": no room; "damaged": the digest differs; "timeout": no answer.
+            "full": no room; "damaged": the digest differs; "timeout": no answer, or it restarted.
         message: as text for the user.
     """
 
-    code: Literal["newer", "order", "full", "damaged", "timeout", "version"]
+    code: Literal["newer", "order", "full", "damaged", "timeout", "version", "denied"]
     message: str
 
 
@@ -56,26 +67,48 @@ class ReplicationHost(Protocol):
         """Read a part of a snapshot; `answer` with it, or with None."""
 
 
+class _Service(NamedTuple):
+    """Service of the slave of another host, for one process."""
+
+    kind: Any
+    name: str
+    host: str
+    process: str
+
+
 @dataclass(slots=True)
-class _Peer:
-    client: Any
-    used: float
+class _Client:
+    """Client of such a service.
+
+    Attributes:
+        introduction: with a ticket; None: the master has not sent one yet.
+        client: of the service; None until the first introduction.
+        asked_at: monotonic seconds of the last request for a ticket.
+        used: monotonic seconds of the last use.
+    """
+
+    introduction: Introduction | None = None
+    client: SealedClient | None = None
+    asked_at: float = -math.inf
+    used: float = 0.0
 
 
 class ReplicationEndpoint:
     """The replication services of the slave of one host, and its clients."""
 
-    def __init__(self, participant: Participant, name: str) -> None:
-        self._participant = participant
+    def __init__(self, endpoints: SealedEndpoints[Member], name: str) -> None:
+        self._endpoints = endpoints
         self._name = name
-        self._names = names.Names(participant.settings.namespace)
-        self._client = ControlClient(participant, f"slave {name}")
-        self._peers: dict[tuple[Any, str], _Peer] = {}
+        self._names = names.Names(endpoints.participant.settings.namespace)
+        self._client = ControlClient(endpoints.participant, f"slave {name}")
+        path = self._names(names.INTRODUCE)
+        self._master = endpoints.client(srv.Introduce, path, endpoints.security.master)
+        self._clients: dict[_Service, _Client] = {}
 
     def serve(self, host: ReplicationHost) -> None:
         """Offer the services."""
 
-        def take(request: srv.StoreReplica.Request, open_request: OpenRequest) -> None:
+        def take(request: srv.StoreReplica.Request, open_request: SealedRequest) -> None:
             fault = version_refusal(request.protocol_version, f"the slave of {request.sender}")
 
             def answer(refusal: NotStored | None) -> None:
@@ -84,6 +117,11 @@ class ReplicationEndpoint:
 
             if fault:
                 answer(NotStored("version", fault))
+                return
+            try:
+                open_request.check_process(request.process)
+            except Refused as refusal:
+                answer(NotStored("denied", str(refusal)))
                 return
             if len(request.data) > MOST:
                 answer(NotStored("damaged", f"it has more than {MOST} bytes"))
@@ -94,7 +132,7 @@ class ReplicationEndpoint:
             )  # fmt: skip
             host.take_part(part, answer)
 
-        def read(request: srv.ReadSnapshot.Request, open_request: OpenRequest) -> None:
+        def read(request: srv.ReadSnapshot.Request, open_request: SealedRequest) -> None:
             fault = version_refusal(request.protocol_version, "a reader of snapshots")
 
             def answer(part: TransferPart | None) -> None:
@@ -103,33 +141,64 @@ class ReplicationEndpoint:
             if fault:
                 open_request.answer(srv.ReadSnapshot.Response(answer=refused("version", fault)))
                 return
+            open_request.check_process(request.process)
             age = (request.number, request.sequence)
             size = min(request.max_bytes or MOST, MOST)
             host.read_part(request.process, age, request.offset, size, answer)
 
         own = self._names.of_host
-        self._participant.serve(srv.StoreReplica, own(self._name, names.STORE_REPLICA), take)
-        self._participant.serve(srv.ReadSnapshot, own(self._name, names.READ_SNAPSHOT), read)
+        self._endpoints.serve(srv.StoreReplica, own(self._name, names.STORE_REPLICA), take)
+        self._endpoints.serve(srv.ReadSnapshot, own(self._name, names.READ_SNAPSHOT), read)
 
     # --- requests to other slaves --------------------------------------------------------
 
-    def finds_receiver(self, host: str, now: float) -> bool:
-        """Return True if a host's slave is discovered and can receive a replica."""
-        return bool(self._peer(srv.StoreReplica, names.STORE_REPLICA, host, now).service_is_ready())
+    def finds_receiver(self, host: str, process: str, now: float) -> bool:
+        """Return True if a host's slave is known and discovered, and can receive a replica."""
+        return self._finds(_Service(srv.StoreReplica, names.STORE_REPLICA, host, process), now)
 
-    def finds_source(self, host: str, now: float) -> bool:
-        """Return True if a host's slave is discovered and can send a snapshot."""
-        return bool(self._peer(srv.ReadSnapshot, names.READ_SNAPSHOT, host, now).service_is_ready())
+    def finds_source(self, host: str, process: str, now: float) -> bool:
+        """Return True if a host's slave is known and discovered, and can send a snapshot."""
+        return self._finds(_Service(srv.ReadSnapshot, names.READ_SNAPSHOT, host, process), now)
 
-    def _peer(self, kind: Any, name: str, host: str, now: float) -> Any:
-        peer = self._peers.get((kind, host))
-        if peer is None:
-            client = self._participant.node.create_client(
-                kind, self._names.of_host(host, name), qos_profile=qos.SERVICE
-            )
-            peer = self._peers[kind, host] = _Peer(client, now)
-        peer.used = now
-        return peer.client
+    def _finds(self, service: _Service, now: float) -> bool:
+        known = self._clients.setdefault(service, _Client())
+        known.used = now
+        if known.introduction is None or now >= known.introduction.until:
+            self._introduce(service, known, now)
+        if known.introduction is None or known.client is None:
+            return False
+        return bool(known.client.service_is_ready())
+
+    def _introduce(self, service: _Service, known: _Client, now: float) -> None:
+        """Request a ticket from the master, unless a request is open."""
+        if now - known.asked_at < _ASK_AGAIN or not self._master.service_is_ready():
+            return
+        known.asked_at = now
+
+        def answered(response: srv.Introduce.Response | None) -> None:
+            if response is None or self._clients.get(service) is not known:
+                return
+            try:
+                introduction = introduction_of(response, self._endpoints.security, now)
+            except Refused as refusal:
+                _log.debug("no ticket for %s of %s: %s", service.name, service.host, refusal)
+                return
+            known.introduction = introduction
+            if known.client is None:
+                path = self._names.of_host(service.host, service.name)
+                known.client = self._endpoints.client(service.kind, path, introduction.slave)
+            known.client.peer = introduction.slave
+
+        request = introduction_request(service.host, service.name, service.process)
+        self._client.call(self._master, request, now + _ASK_AGAIN, answered)
+
+    def _found(self, service: _Service, now: float) -> SealedClient:
+        """Return the client of a service that was found; renew its ticket before it expires."""
+        self._finds(service, now)
+        client = self._clients[service].client
+        if client is None:
+            raise RuntimeError(f"{service} was not found before")
+        return client
 
     def give(
         self, host: str, part: TransferPart, now: float, timeout: float,
@@ -145,11 +214,14 @@ class ReplicationEndpoint:
         def answered(response: srv.StoreReplica.Response | None) -> None:
             if response is None:
                 done(NotStored("timeout", f"no answer within {timeout:g} s"))
+            elif self._has_restarted(service, response):
+                done(NotStored("timeout", _RESTARTED))
             else:
                 answer = response.answer
                 done(None if answer.accepted else NotStored(answer.code, answer.message))
 
-        client = self._peer(srv.StoreReplica, names.STORE_REPLICA, host, now)
+        service = _Service(srv.StoreReplica, names.STORE_REPLICA, host, part.process)
+        client = self._found(service, now)
         self._client.call(client, request, now + timeout, answered)
 
     def ask(
@@ -168,17 +240,29 @@ class ReplicationEndpoint:
         def answered(response: srv.ReadSnapshot.Response | None) -> None:
             if response is None:
                 done(NotSent(f"no answer within {timeout:g} s"))
+            elif self._has_restarted(service, response):
+                done(NotSent(_RESTARTED))
             else:
                 done(_part_of(response, wanted))
 
-        client = self._peer(srv.ReadSnapshot, names.READ_SNAPSHOT, host, now)
+        service = _Service(srv.ReadSnapshot, names.READ_SNAPSHOT, host, wanted.process)
+        client = self._found(service, now)
         self._client.call(client, request, now + timeout, answered)
+
+    def _has_restarted(self, service: _Service, response: Any) -> bool:
+        """Return True if the slave has restarted; the next use then requests a new ticket."""
+        is_stale = bool(response.answer.code == "stale")
+        if is_stale and service in self._clients:
+            self._clients[service].introduction = None
+        return is_stale
 
     def expire(self, now: float) -> None:
         """End requests without an answer in time, and destroy idle clients."""
         self._client.expire(now)
-        for key in [key for key, peer in self._peers.items() if now - peer.used >= _IDLE]:
-            self._participant.node.destroy_client(self._peers.pop(key).client)
+        for service in [one for one, known in self._clients.items() if now - known.used >= _IDLE]:
+            client = self._clients.pop(service).client
+            if client is not None:
+                client.destroy()
 
 
 def _part_of(response: srv.ReadSnapshot.Response, wanted: TransferPart) -> TransferPart | NotSent:

@@ -10,13 +10,14 @@ from typing import Any, Literal, NamedTuple
 from rosrm.core.slave.events import Event
 from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
+from rosrm.keys.security import Member
 from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
 from rosrm.ros import names
 from rosrm.ros.control import ControlServer, RequestGate, accepted, refused, version_refusal
 from rosrm.ros.orders import order_from_msg
-from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.ros.sealed import SealedEndpoints, SealedRequest
 from rosrm_msgs import srv
 
 
@@ -81,16 +82,19 @@ class SlaveServices:
     """
 
     def __init__(
-        self, participant: Participant, duties: Duties, host: str, max_age: float,
+        self, endpoints: SealedEndpoints[Member], duties: Duties, host: str, max_age: float,
         epoch: Callable[[], int],
     ) -> None:  # fmt: skip
         self._duties = duties
-        path = names.Names(participant.settings.namespace)
-        server = ControlServer(participant, RequestGate(time.monotonic_ns, max_age), epoch)
+        path = names.Names(endpoints.participant.settings.namespace)
+        server = ControlServer(endpoints, RequestGate(time.monotonic_ns, max_age), epoch)
         server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
-        participant.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
+        endpoints.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
 
-    def _take_order(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
+    def _take_order(
+        self, request: srv.ControlHost.Request, _sealed: SealedRequest,
+        respond: Callable[[Any], None],
+    ) -> None:  # fmt: skip
         """Carry out an order; the outcomes of executors and restart policies come later."""
         try:
             order = order_from_msg(request)
@@ -126,12 +130,13 @@ class SlaveServices:
 
         self._duties.execute(order, done)
 
-    def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
+    def _take_log(self, request: srv.ReadLog.Request, open_request: SealedRequest) -> None:
         fault = version_refusal(request.protocol_version, "a reader of logs")
         if fault:
             open_request.answer(srv.ReadLog.Response(answer=refused("version", fault)))
             return
         try:
+            open_request.check_process(request.process)
             part = self._duties.read_log(
                 LogQuery(
                     request.process, request.number, request.offset, request.tail, request.since,

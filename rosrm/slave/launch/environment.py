@@ -31,7 +31,7 @@ _IDENTITY: Final = (
 
 
 def no_key(_instance: InstanceId) -> None:
-    """Return None: the cluster has no security."""
+    """Return None: with `security: none` instances have no key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class ProcessLocation:
         snapshots: directory of the snapshots of all processes; None: no snapshots.
         keep_every: seconds by which a snapshot may be behind the state.
         epoch_file: file with the newest epoch of the master; None: there is none.
-        instance_key: returns the key of an instance; None: the cluster has no security.
+        instance_key: returns the key of an instance; None: with `security: none`.
     """
 
     host: str
@@ -91,10 +91,10 @@ def process_environment(
     if assignment.has_snapshots and where.snapshots is not None:
         environment[KEEP] = str(snapshot_directory(where.snapshots, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
-    if assignment.has_snapshots or assignment.shadow:  # a node that takes part in handoffs
-        key = where.instance_key(assignment.instance)
-        if key is not None:
-            environment[INSTANCE_KEY] = base64.b64encode(key).decode()
+    # Of each process, because a migratable node without a key takes messages of strangers.
+    key = where.instance_key(assignment.instance)
+    if key is not None:
+        environment[INSTANCE_KEY] = base64.b64encode(key).decode()
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
     if assignment.shadow:  # a migration waits for the end of its discovery

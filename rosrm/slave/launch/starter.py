@@ -38,7 +38,7 @@ class Starter:
         snapshots: directory of the snapshots.
         state: instances of the slave; read-only here.
         take: takes events for the core.
-        instance_key: returns the key of an instance; None: the cluster has no security.
+        instance_key: returns the key of an instance; None: with `security: none`.
     """
 
     config: HostConfig

@@ -60,7 +60,7 @@ class Fetch:
             self._end("")
         elif not self._waits:
             host = self._hosts[0]
-            if self._endpoint.finds_source(host, now):
+            if self._endpoint.finds_source(host, self._wanted.process, now):
                 self._waits = True
                 self._endpoint.ask(host, self._wanted, now, PATIENCE, self._answered)
             elif now >= self._host_by:

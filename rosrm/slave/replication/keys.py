@@ -1,8 +1,7 @@
-"""Keys of processes that have snapshots on this host, each in a file beside these snapshots.
+"""Keys of processes with snapshots on this host, each in a file beside the snapshots.
 
-An instance may run on over a restart of the slave. So the next run of the slave finds the key here,
-and never sends a snapshot without encryption. The file lies beside the state that its key protects,
-and is deleted with it.
+An instance may continue to run while the slave restarts. The restarted slave reads the key from the
+file, so that it never sends a snapshot without encryption. The key is deleted with the snapshots.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ class StateKeys:
         self._unsaved: dict[str, bytes] = {}
 
     def put(self, process: str, number: int, key: bytes) -> None:
-        """Store the key of a process; b"": it has none.
+        """Store the key of a process, in place of an earlier key.
 
         Args:
-            process: its name.
+            process: name of the process.
             number: of the instance whose assignment has the key.
-            key: replaces an earlier key.
+            key: of the process; b"": delete the earlier key.
 
         Raises:
             OSError: the file cannot be written; `of` tries again.
@@ -57,8 +56,8 @@ class StateKeys:
         """Return the key of a process; b"": it has none.
 
         Raises:
-            OSError: the file cannot be read, or an unsaved key cannot be written. Without the file
-                the next run of this slave would send the snapshots without encryption.
+            OSError: the file cannot be read, or an unsaved key cannot be written. Otherwise, after
+                its restart, this slave would send the snapshots without encryption.
             Damaged: the file holds no key.
         """
         if process in self._unsaved:

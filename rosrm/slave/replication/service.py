@@ -87,7 +87,7 @@ class _Found(NamedTuple):
 
     Attributes:
         head: its header; None: there is none.
-        fault: why the replica on this host is not used; "": it is, or there is none.
+        fault: why the replica on this host is not used; "": it is used, or there is none.
     """
 
     head: Head | None
@@ -236,7 +236,8 @@ class ReplicationService:
             return
         # The host that waits longest comes first, so a host without an answer delays no other.
         for host in sorted(shipment.hosts, key=lambda name: shipment.due.get(name, 0.0)):
-            if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_receiver(host, now):
+            is_due = now >= shipment.due.get(host, 0.0)
+            if is_due and self._endpoint.finds_receiver(host, process, now):
                 shipment.due[host] = now + shipment.every
                 transfer = self._transfers[process] = _Transfer(shipment, host)
                 sent = shipment.sent.get(host, (0, 0))

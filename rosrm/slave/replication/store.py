@@ -173,7 +173,7 @@ class SnapshotStore:
         these. A replica that is not allowed is deleted.
 
         Args:
-            process: its name.
+            process: name of the process.
             up_to: number of the instance that starts.
 
         Returns:
@@ -268,9 +268,10 @@ class SnapshotStore:
         return NotStored("full", obstacle) if obstacle else None
 
     def _as_new_as(self, part: TransferPart, *, bounded: bool) -> Head | None:
-        """Return a snapshot here that is at least as new as a part's, unless it is doubtful.
+        """Return a snapshot on this host that is at least as new as a part; None: there is none.
 
-        For a start, which is not `bounded`, only a snapshot counts that the node can read.
+        Ignores snapshots of doubtful age. For a start, which is not `bounded`, only snapshots that
+        the node can read count.
         """
         refreshed = self._refreshed.get(part.process, self._began)
         for path, head in snapshot_files(self.directory(part.process)):
@@ -325,7 +326,7 @@ class SnapshotStore:
 
     def _check_and_store(self, part: TransferPart, coming: _Incoming) -> None:
         if coming.digest != part.digest:
-            raise Damaged("what came does not match its checksum")
+            raise Damaged("the content does not match its checksum")
         head = coming.writer.check(part.process, part.age)
         key = self.keys.of(part.process)
         state = b""

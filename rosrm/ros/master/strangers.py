@@ -1,0 +1,63 @@
+"""Messages without a valid key: counted by topic, recorded at a bounded rate."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Final
+
+from rosrm.ros.master.refusals import Refuse
+from rosrm.wording import counted, duration
+
+#: Seconds between two records of messages on the same topic or service.
+_RECORD_PERIOD: Final = 600.0
+#: Seconds for which `rosrm status` shows them.
+_SHOWN: Final = 3600.0
+
+
+@dataclass(slots=True)
+class _Count:
+    total: int = 0
+    unrecorded: int = 0
+    last: float = 0.0
+    recorded_at: float = -_RECORD_PERIOD
+
+
+class Strangers:
+    """Counts of messages of strangers, by the master's own topics and services.
+
+    Args:
+        refuse: called for each record.
+    """
+
+    def __init__(self, refuse: Refuse) -> None:
+        self._refuse = refuse
+        self._counts: dict[str, _Count] = {}
+
+    def note(self, topic: str) -> None:
+        """Count one message on a topic or service."""
+        now = time.monotonic()
+        count = self._counts.setdefault(topic, _Count())
+        count.total += 1
+        count.unrecorded += 1
+        count.last = now
+        if now - count.recorded_at >= _RECORD_PERIOD:
+            number, count.unrecorded, count.recorded_at = count.unrecorded, 0, now
+            self._refuse(
+                "stranger", f"a sender on {topic}",
+                f"{counted(number, 'message', 'messages')} without a valid key on {topic}; nothing "
+                f"was done",
+            )  # fmt: skip
+
+    def sentence(self) -> str:
+        """Return a sentence about the messages of the last hour; "": there was none."""
+        now = time.monotonic()
+        shown = {name: one for name, one in self._counts.items() if now - one.last < _SHOWN}
+        if not shown:
+            return ""
+        topic = max(shown, key=lambda name: shown[name].last)
+        total = sum(one.total for one in shown.values())
+        return (
+            f"{counted(total, 'message', 'messages')} without a valid key refused, the last "
+            f"{duration(now - shown[topic].last)} ago on {topic}"
+        )

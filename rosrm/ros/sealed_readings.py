@@ -1,0 +1,77 @@
+"""Sealed readings: `resource_info` in a message of fixed size, which decodes fastest.
+
+Slave and master write and read the CDR form of `rosrm_msgs/SealedReading` without rclpy. A test
+compares this module with rclpy.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from rosrm.keys.links import OpenMessage
+from rosrm.keys.sealing import FORMAT, OVERHEAD
+from rosrm.keys.security import Peer
+from rosrm.ros.reading_codec import HOST_ID, LAYOUT
+from rosrm.ros.sealed_topic import topic_channel
+from rosrm_msgs import msg
+
+#: Encapsulation (little-endian plain CDR, no options), host, format, counter.
+_HEAD: Final = struct.Struct("<4sIIQ")
+_CDR: Final = b"\x00\x01\x00\x00"
+_PLAIN_BYTES: Final = LAYOUT.itemsize
+_SIZE: Final = _HEAD.size + _PLAIN_BYTES + OVERHEAD
+
+
+class RegisteredSlave(NamedTuple):
+    """Slave of a registered host.
+
+    Attributes:
+        peer: the slave.
+        run: of the slave, at its registration.
+        open: opens its readings.
+    """
+
+    peer: Peer
+    run: bytes
+    open: OpenMessage
+
+    @classmethod
+    def of(cls, peer: Peer, run: bytes, channel: bytes) -> RegisteredSlave:
+        """Return a slave whose registration was genuine; `channel` is that of the readings."""
+        return cls(peer, run, peer.link.opener(channel, run))
+
+
+def reading_channel(topic: str) -> bytes:
+    """Return the channel of the readings; `topic` is fully qualified."""
+    return topic_channel(msg.ResourceInfo, topic)
+
+
+def seal_reading(master: Peer, channel: bytes, reading: bytes) -> bytes:
+    """Return a serialised `SealedReading` with a serialised `ResourceInfo`."""
+    done = master.link.seal(channel, reading, master.run)
+    host = reading[HOST_ID]
+    head = _HEAD.pack(_CDR, int.from_bytes(host, "little"), FORMAT, done.counter)
+    return (head + done.body).ljust(_SIZE, b"\0")  # without keys, a body has no tag
+
+
+def is_of_unknown_host(data: bytes, slave_of: Callable[[int], RegisteredSlave | None]) -> bool:
+    """Return True if a reading has the right size and names a host that has not registered."""
+    return len(data) == _SIZE and slave_of(_HEAD.unpack_from(data)[1]) is None
+
+
+def open_reading(
+    data: bytes, master_run: bytes, slave_of: Callable[[int], RegisteredSlave | None]
+) -> bytes | None:
+    """Return a serialised `ResourceInfo`; None: not genuine, or not of the host that it names."""
+    if len(data) != _SIZE:
+        return None
+    _, host_id, form, counter = _HEAD.unpack_from(data)
+    slave = slave_of(host_id) if form == FORMAT else None
+    if slave is None:
+        return None
+    plain = slave.open(counter, data[_HEAD.size :], master_run)
+    if plain is None or plain[HOST_ID] != data[4:8]:
+        return None
+    return plain[:_PLAIN_BYTES]
