@@ -163,7 +163,8 @@ def _hosts() -> list[HostConfig]:
 @contextlib.contextmanager
 def _cluster(liveness: LivenessSettings, control: ControlSettings) -> Iterator[LocalCluster]:
     with tempfile.TemporaryDirectory(prefix="rosrm-failover-") as folder:
-        settings = ClusterConfig(liveness=liveness, control=control)
+        # The witness, which has no key, reads the states.
+        settings = ClusterConfig(liveness=liveness, control=control, security="none")
         with LocalCluster(Path(folder), cluster=settings, hosts=_hosts()) as cluster:
             yield cluster
 

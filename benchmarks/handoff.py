@@ -35,6 +35,7 @@ from benchmarks.hosts import three_hosts
 from benchmarks.machine import isolated_transports, parser, percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm.config.settings import ClusterConfig, MigrationSettings
+from rosrm.keys.roles import SecurityMode
 from rosrm.model.values import MigrationPolicy, ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
 
@@ -196,7 +197,9 @@ def outcome_of_relaunch(ends: list[str], outputs: Sequence[Output], period: floa
     return Outcome(ends, gaps, lost, repeated, 0)
 
 
-def measure(strategy: str, driven: str, rate: float, runs: int) -> Outcome:
+def measure(
+    strategy: str, driven: str, rate: float, runs: int, security: SecurityMode = "keys"
+) -> Outcome:
     """Migrate a node to and fro, `runs` times, on a cluster of two hosts; `rate` in Hz.
 
     Raises:
@@ -205,7 +208,7 @@ def measure(strategy: str, driven: str, rate: float, runs: int) -> Outcome:
     program = "tick" if strategy == "relaunch" else {"input": "echo", "timer": "count"}[driven]
     period = 1.0 / rate
     settings = ClusterConfig(
-        migration=MigrationSettings(strategies={strategy: {}}, automatic=False)
+        migration=MigrationSettings(strategies={strategy: {}}, automatic=False), security=security
     )
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosrm-handoff-"))

@@ -35,11 +35,15 @@ from typing import Any
 from benchmarks.machine import isolated_transports, parser, percentile, print_report, say
 from benchmarks.simulated_slaves import STEP
 from benchmarks.stopping import run
+from rosrm.config.settings import ClusterConfig
 from rosrm.errors import RosrmError
+from rosrm.keys.finding import user_security
+from rosrm.keys.roles import SecurityMode
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import Kind, ProcessSpec
 from rosrm.ros import names, qos
 from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedEndpoints
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_msgs import msg
 
@@ -62,15 +66,14 @@ class Loads:
         received: the content of each message, oldest first.
     """
 
-    def __init__(self, settings: RosSettings) -> None:
+    def __init__(self, settings: RosSettings, security: SecurityMode) -> None:
         self._participant = Participant(settings, "rosrm_scale")
         self.received: list[dict[str, Any]] = []
         topic = names.Names(settings.namespace)(names.MASTER_LOAD)
-        self._participant.node.create_subscription(
-            msg.Event, topic, self._participant.counted(self._take), qos.LOAD
-        )
+        endpoints = SealedEndpoints(self._participant, user_security(security))
+        endpoints.follow(msg.Event, topic, qos.LOAD, self._take)
 
-    def _take(self, message: msg.Event) -> None:
+    def _take(self, message: msg.Event, _run: bytes) -> None:
         self.received.append({**json.loads(message.data), "elapsed": message.elapsed})
 
     def wait(self, seconds: float) -> list[dict[str, Any]]:
@@ -104,12 +107,14 @@ class Crowd:
         domain: of the master.
         hz, step: of a slave's cycles, and of its readings.
         timeout: seconds for all slaves of a process to register.
+        security: of the master.
     """
 
     domain: int
     hz: float
     step: float
     timeout: float
+    security: SecurityMode = "keys"
     _processes: list[subprocess.Popen[str]] = field(default_factory=list)
 
     def start(self, slaves: int, processes: int) -> None:
@@ -118,7 +123,7 @@ class Crowd:
         for first, end in itertools.pairwise(bounds):
             options = {
                 "domain": self.domain, "first": first + 1, "slaves": end - first, "hz": self.hz,
-                "step": self.step, "timeout": self.timeout,
+                "step": self.step, "timeout": self.timeout, "security": self.security,
             }  # fmt: skip
             words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
             self._processes.append(
@@ -248,22 +253,29 @@ def _wait_for_end(cluster: LocalCluster, name: str) -> None:
         cluster.client.spin(_PAUSE)
 
 
-def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
+def measure(
+    arguments: argparse.Namespace, folder: Path, security: SecurityMode = "keys"
+) -> dict[str, float]:
     """Return all figures of one run.
+
+    Args:
+        arguments: of the command line.
+        folder: for the state of the master.
+        security: of the cluster.
 
     Raises:
         RosrmError: a part ended, or readings or assignments are missing.
         TimeoutError: no message of the master came.
     """
     with ExitStack() as opened:
-        cluster = LocalCluster(folder)
+        cluster = LocalCluster(folder, ClusterConfig(security=security))
         opened.callback(cluster.close)
         assert cluster.domain is not None
         cluster.start_master()
         cluster.client.list()
-        loads = Loads(cluster.ros)
+        loads = Loads(cluster.ros, security)
         opened.callback(loads.close)
-        crowd = Crowd(cluster.domain, arguments.hz, arguments.step, arguments.timeout)
+        crowd = Crowd(cluster.domain, arguments.hz, arguments.step, arguments.timeout, security)
         opened.callback(crowd.close)
         begun = time.monotonic()
         crowd.start(arguments.slaves, arguments.processes)

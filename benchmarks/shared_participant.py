@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
+from weakref import WeakKeyDictionary
 
+from rosrm.keys.security import Member
 from rosrm.model.ros_settings import RosSettings
+from rosrm.ros import names
 from rosrm.ros.participant import OpenRequest, Participant
-from rosrm_msgs import msg, srv
+from rosrm.ros.sealed import SealedEndpoints
+from rosrm_msgs import msg
 
 
 class Berth:
     """One slave's place in the participant that it shares with others.
 
-    It replaces a `Participant` and its node for one `SlaveEndpoint`.
+    It replaces a `Participant` and its node for the endpoints of one slave.
     """
 
     def __init__(self, shared: SharedParticipant) -> None:
@@ -22,6 +26,7 @@ class Berth:
         self.node = self
         self.settings = shared.participant.settings
         self.guard = shared.participant.guard
+        self.counted = shared.participant.counted
 
     def create_client(self, kind: Any, name: str, *, qos_profile: Any) -> Any:
         """Return a client; an own one only where answers reach many."""
@@ -31,20 +36,33 @@ class Berth:
         """Return a publisher; an own one for the readings."""
         return self._shared.publisher(kind, name, qos)
 
-    def create_subscription(
-        self, kind: Any, name: str, take: Callable[[Any], None], qos: Any
-    ) -> None:
-        """Add a callback to those of a topic."""
-        self._shared.hear(kind, name, take, qos)
-
-    def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Wrap a callback as the participant does."""
-        return self._shared.participant.counted(callback)
-
     def serve(self, kind: Any, name: str, handle: Callable[[Any, OpenRequest], None]) -> None:
-        """Offer an own service; none for `ReadLog`, because there are no logs."""
-        if kind is not srv.ReadLog:
+        """Offer an own service; none for logs, because there are none."""
+        if not name.endswith(f"/{names.READ_LOG}"):
             self._shared.participant.serve(kind, name, handle)
+
+
+class BerthEndpoints(SealedEndpoints[Member]):
+    """Sealed entities of one slave, which has a key of its own, in a participant of many."""
+
+    def __init__(self, shared: SharedParticipant, security: Member) -> None:
+        super().__init__(cast("Participant", Berth(shared)), security)
+        self._shared = shared
+
+    def follow(
+        self, message_type: Any, name: str, profile: Any, take: Callable[[Any, bytes], None]
+    ) -> None:
+        """Add a callback to those of a signed topic.
+
+        One slave checks the signature for all of this process. Real slaves check it on different
+        machines. Here hundreds of checks of each beat would occupy the processor of the master,
+        whose cost is measured.
+        """
+        if name not in self._shared.followers:
+            self._shared.followers[name] = []
+            reader = SealedEndpoints(self._shared.participant, self.security)
+            reader.follow(message_type, name, profile, self._shared.passes_on(name))
+        self._shared.followers[name].append(take)
 
 
 @dataclass
@@ -83,44 +101,74 @@ class CountedPublisher:
         self.publisher.publish(message)
 
 
+class SharedClient:
+    """A client of a service for many slaves: each answer goes to the slave that asked."""
+
+    def __init__(self, client: Any) -> None:
+        self.entity = client
+        self.pending_of = client.get_pending_request
+        self.askers: WeakKeyDictionary[Any, AskingClient] = WeakKeyDictionary()
+        # The executor calls this method with the number of each answer.
+        client.get_pending_request = self._pending_of_asker
+
+    def _pending_of_asker(self, sequence: int) -> Any:
+        return self.askers[self.pending_of(sequence)].get_pending_request(sequence)
+
+
+class AskingClient:
+    """One slave's use of a shared client; its `SealedClient` replaces `get_pending_request`."""
+
+    def __init__(self, shared: SharedClient) -> None:
+        self._shared = shared
+        self.get_pending_request = shared.pending_of
+        self.remove_pending_request = shared.entity.remove_pending_request
+        self.service_is_ready = shared.entity.service_is_ready
+
+    def call_async(self, request: Any) -> Any:
+        """Send a request; return the future of its answer."""
+        future = self._shared.entity.call_async(request)
+        self._shared.askers[future] = self
+        return future
+
+
 class SharedParticipant:
-    """One participant for many slaves."""
+    """One participant for many slaves.
+
+    Attributes:
+        followers: callbacks for the signed messages of each topic.
+    """
 
     def __init__(self, settings: RosSettings, name: str, tally: Tally) -> None:
         self._tally = tally
         self.participant = Participant(settings, name, pace="steady")
-        self._clients: dict[Any, Any] = {}
-        self._publishers: dict[Any, Any] = {}
-        self._hearers: dict[Any, list[Callable[[Any], None]]] = {}
+        self.followers: dict[str, list[Callable[[Any, bytes], None]]] = {}
+        self._clients: dict[str, SharedClient] = {}
+        self._publishers: dict[str, Any] = {}
 
     def client(self, kind: Any, name: str, qos_profile: Any) -> Any:
-        """Return the shared client of a service, or a new one for `request_process`."""
-        if kind in self._clients:
-            return self._clients[kind]
-        made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
-        if kind is not srv.RequestProcess:
-            self._clients[kind] = made
-        return made
+        """Return a use of the shared client of a service; a new client for `request_process`."""
+        if name not in self._clients:
+            made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
+            if name.endswith(f"/{names.REQUEST_PROCESS}"):
+                return made
+            self._clients[name] = SharedClient(made)
+        return AskingClient(self._clients[name])
 
     def publisher(self, kind: Any, name: str, qos: Any) -> Any:
         """Return the shared publisher of a topic, or a new one for `resource_info`."""
-        if kind in self._publishers:
-            return self._publishers[kind]
+        if name in self._publishers:
+            return self._publishers[name]
         made = self.participant.node.create_publisher(kind, name, qos)
-        if kind is msg.ResourceInfo:
+        if kind is msg.SealedReading:
             return CountedPublisher(made, self._tally)
-        self._publishers[kind] = made
+        self._publishers[name] = made
         return made
 
-    def hear(self, kind: Any, name: str, take: Callable[[Any], None], qos: Any) -> None:
-        """Pass each message of a topic to `take`, by one subscription for all."""
-        if kind in self._hearers:
-            self._hearers[kind].append(take)
-            return
-        hearers = self._hearers[kind] = [take]
+    def passes_on(self, name: str) -> Callable[[Any, bytes], None]:
+        """Return a callback that calls all followers of a topic."""
 
-        def pass_on(message: Any) -> None:
-            for hearer in hearers:
-                hearer(message)
+        def pass_on(message: Any, run: bytes) -> None:
+            for take in self.followers[name]:
+                take(message, run)
 
-        self.participant.node.create_subscription(kind, name, pass_on, qos)
+        return pass_on

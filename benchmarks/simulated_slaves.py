@@ -6,8 +6,9 @@ and each instance is reported as running and then as ended, without a process.
 
 All slaves of a process share one DDS participant, one node, and the entities that are seldom used:
 the clients for handshake, registration and leaving, the publishers of statuses and usages, and the
-reader of `master_beat`. Each has its own publisher of readings, its own service for orders and its
-own client of `request_process`, because each answer reaches all readers, as in a fleet.
+reader of `master_beat`. Each has its own key, its own publisher of readings, its own service for
+orders and its own client of `request_process`, because each answer reaches all readers, as in a
+fleet.
 
 The process prints one JSON object when all are registered and accepted. A line on its standard
 input begins a measurement and the next one ends it; then it prints the counts as JSON.
@@ -25,13 +26,13 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
-from typing import NoReturn, cast
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from benchmarks.machine import say
-from benchmarks.shared_participant import Berth, SharedParticipant, Tally
+from benchmarks.shared_participant import BerthEndpoints, SharedParticipant, Tally
 from rosrm.core.slave import commands, reducer
 from rosrm.core.slave.events import (
     AssignmentsReceived,
@@ -42,6 +43,9 @@ from rosrm.core.slave.events import (
 )
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused, RosrmError
+from rosrm.keys.finding import host_security
+from rosrm.keys.roles import SecurityMode
+from rosrm.keys.security import Member
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -51,7 +55,6 @@ from rosrm.model.values import (
     InstanceStatus,
     ResourceDescription,
 )
-from rosrm.ros.participant import Participant
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.services import Duties, SlaveServices
 from rosrm.testing.loopback import settings_on_this_machine
@@ -107,7 +110,7 @@ class Walks:
 class SimulatedSlave:
     """A slave with simulated readings and processes."""
 
-    def __init__(self, berth: Berth, name: str, period: float, tally: Tally) -> None:
+    def __init__(self, endpoints: BerthEndpoints, name: str, period: float, tally: Tally) -> None:
         self.name = name
         self._tally = tally
         self._state = SlaveState()
@@ -117,10 +120,9 @@ class SimulatedSlave:
             name, int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
             pid=os.getpid(), resources=resources, period=period,
         )  # fmt: skip
-        participant = cast("Participant", berth)
-        self.endpoint = SlaveEndpoint(participant, description, self._state, take=self.take)
+        self.endpoint = SlaveEndpoint(endpoints, description, self._state, take=self.take)
         duties = Duties(self.take, *[self._refuse] * 5)
-        SlaveServices(participant, duties, name, 5.0, lambda: self.endpoint.epoch)
+        SlaveServices(endpoints, duties, name, 5.0, lambda: self.endpoint.epoch)
 
     @property
     def registered(self) -> bool:
@@ -177,16 +179,19 @@ class Fleet:
         count: how many.
         period: seconds between two cycles of a slave.
         step: of a usage in one cycle, as in `Walks`.
+        security: of the master.
     """
 
     def __init__(
-        self, settings: RosSettings, first: int, count: int, period: float, step: float
-    ) -> None:
+        self, settings: RosSettings, first: int, count: int, period: float, step: float,
+        security: SecurityMode,
+    ) -> None:  # fmt: skip
         self.tally = Tally()
         self.slaves: list[SimulatedSlave] = []
         self._first = first
         self._count = count
         self._period = period
+        self._security = security
         self._pace = max(period, _GENTLY)
         self._walks = Walks(count, step)
         self._shared = SharedParticipant(settings, f"rosrm_simulated_{first}", self.tally)
@@ -216,7 +221,8 @@ class Fleet:
         now = time.monotonic()
         for index in range(len(self.slaves), min(len(self.slaves) + _AT_ONCE, self._count)):
             name = f"sim{self._first + index:05d}"
-            slave = SimulatedSlave(Berth(self._shared), name, self._period, self.tally)
+            endpoints = BerthEndpoints(self._shared, _security(self._security, name))
+            slave = SimulatedSlave(endpoints, name, self._period, self.tally)
             self.slaves.append(slave)
             # Spread over the period, as the cycles of separate slaves are.
             heapq.heappush(self._due, (now + self._period * index / self._count, index))
@@ -264,6 +270,14 @@ class Fleet:
         self._shared.participant.close()
 
 
+def _security(mode: SecurityMode, name: str) -> Member:
+    """Return the security of a slave, which finds its key as a real one does."""
+    found = host_security(mode, name)
+    if found is None:
+        raise RosrmError(f"host:{name} has no key: ROSRM_KEYS names no directory of a master")
+    return found
+
+
 def _told_to_go_on(fleet: Fleet) -> bool:
     """Serve the slaves until a line comes on standard input; False: it was closed."""
     while not select.select([sys.stdin], [], [], 0.0)[0]:
@@ -280,10 +294,13 @@ def main() -> int:
     parser.add_argument("--hz", type=float, required=True)
     parser.add_argument("--step", type=float, default=STEP)
     parser.add_argument("--timeout", type=float, default=120.0)
+    parser.add_argument("--security", choices=["keys", "none"], default="keys")
     arguments = parser.parse_args()
     settings = settings_on_this_machine(arguments.domain)
     period = 1.0 / arguments.hz
-    fleet = Fleet(settings, arguments.first, arguments.slaves, period, arguments.step)
+    fleet = Fleet(
+        settings, arguments.first, arguments.slaves, period, arguments.step, arguments.security
+    )
     try:
         fleet.bring_up(arguments.timeout)
     except (RosrmError, TimeoutError) as error:

@@ -24,12 +24,12 @@ from rosrm.testing.local_cluster import LocalCluster
 _BARE = """
 import rclpy
 from rclpy.node import Node
-from rosrm_msgs.msg import ResourceInfo
+from rosrm_msgs.msg import SealedReading
 
 rclpy.init()
 node = Node("bare")
-publisher = node.create_publisher(ResourceInfo, "bare_resource_info", 1)
-message = ResourceInfo(protocol_version=1)
+publisher = node.create_publisher(SealedReading, "bare_resource_info", 1)
+message = SealedReading(format=1)
 node.create_timer(0.1, lambda: publisher.publish(message))
 print("ready", flush=True)
 rclpy.spin(node)

@@ -1,10 +1,12 @@
-"""Signals and errors that end a benchmark, together with all processes that it started."""
+"""Begin and end of a benchmark: its keys, and the signals and errors that end it."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 from benchmarks.machine import say
@@ -40,14 +42,28 @@ def raise_signals() -> None:
         signal.signal(number, stop)
 
 
+@contextlib.contextmanager
+def own_keys() -> Iterator[None]:
+    """Make all parts use keys in a temporary directory, and not those of the user."""
+    users = {name: os.environ.pop(name, None) for name in ("ROSRM_KEY", "ROSRM_KEYS")}
+    with tempfile.TemporaryDirectory(prefix="rosrm-keys-") as directory:
+        os.environ["ROSRM_KEYS"] = directory
+        try:
+            yield
+        finally:
+            del os.environ["ROSRM_KEYS"]
+            os.environ.update({name: path for name, path in users.items() if path is not None})
+
+
 def run(name: str, main: Callable[[], int | None]) -> int:
-    """Run a benchmark; return its exit status.
+    """Run a benchmark with keys of its own; return its exit status.
 
     The status is 2 where something is missing or failed, 128 + signal number after a signal.
     """
     raise_signals()
     try:
-        return main() or 0
+        with own_keys():
+            return main() or 0
     except Stopped as stopped:
         say(f"benchmarks.{name}: stopped by {stopped}")
         return 128 + stopped.number

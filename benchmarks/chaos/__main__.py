@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +22,7 @@ from benchmarks.chaos.client_load import ClientLoad
 from benchmarks.chaos.cluster import HOSTS, LEASE_S, Cluster
 from benchmarks.chaos.event_log import EventLog
 from benchmarks.chaos.faults import Round, draw
+from benchmarks.chaos.intruder import intruder
 from benchmarks.chaos.stalls import StallWatch
 from benchmarks.chaos.trial import Stuck, Tally, Trial
 from benchmarks.machine import parser, percentile, print_report, say
@@ -63,6 +65,11 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--out", type=Path, help="folder for settings, logs and violations, else a temporary one"
     )
     command_line.add_argument("--lab", default="chaos", help="name of the lab")
+    command_line.add_argument(
+        "--intruder",
+        action="store_true",
+        help="let a participant without a key send forged, repeated and random messages",
+    )
     return command_line.parse_args(arguments)
 
 
@@ -85,6 +92,7 @@ def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> 
                 ) as cluster,
                 ClientLoad(cluster.lab, folder / "desk.log", event_log.add) as client_load,
                 StallWatch(cluster.pids(), LEASE_S) as stall_watch,
+                _intruder(options, cluster, folder),
             ):
                 trial = Trial(
                     cluster, client_load, lines, out, event_log, tally,
@@ -102,6 +110,12 @@ def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> 
                 break
 
 
+def _intruder(
+    options: argparse.Namespace, cluster: Cluster, folder: Path
+) -> AbstractContextManager[None]:
+    return intruder(cluster.lab, folder / "intruder.log") if options.intruder else nullcontext()
+
+
 def _while(rounds: Iterator[Round], faults: int, deadline: float, tally: Tally) -> Iterator[Round]:
     while tally.faults < faults and time.monotonic() < deadline:
         yield next(rounds)
@@ -115,7 +129,7 @@ def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
         {
             "faults": tally.faults, "violations": violations.total(), "lost": violations["lost"],
             "doubled": violations["doubled"], "orphans": violations["orphans"],
-            "seed": options.seed, "minutes": round(seconds / 60.0, 1),
+            "seed": options.seed, "intruder": options.intruder, "minutes": round(seconds / 60.0, 1),
             "violations_by_kind": dict(violations), "by_kind": dict(sorted(tally.by_kind.items())),
             "recovery_s": _spread(tally.recovery), "whole_s": _spread(tally.whole),
             "parted_s": _spread({"owner": tally.parted}), "overloaded": tally.overloaded,

@@ -24,7 +24,7 @@ from benchmarks.machine import say
 from benchmarks.paper.labs import Failed
 from benchmarks.paper.page import checked_page, update_page
 from benchmarks.paper.report import FIGURES, Options, plain_report, write_report
-from benchmarks.stopping import Stopped, raise_signals
+from benchmarks.stopping import Stopped, own_keys, raise_signals
 from rosrm.errors import RosrmError
 from rosrm_examples.errors import ExampleError
 from rosrm_lab import needs
@@ -47,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if set(names) - set(_WITHOUT_LAB):
             needs.check_rights()
             needs.check_commands(needs.FROM_THE_START)
-        statuses = {name: _measured(name, options) for name in names}
+        with own_keys():
+            statuses = {name: _measured(name, options) for name in names}
         if options.page is not None:
             measured = [name for name, status in statuses.items() if status != _FAILED]
             update_page(options.page, options.out, measured)

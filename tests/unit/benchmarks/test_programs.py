@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import signal
@@ -15,6 +16,7 @@ from benchmarks import stopping
 from benchmarks.chaos import __main__ as chaos
 from benchmarks.chaos import clocks
 from rosrm.errors import LabError
+from rosrm.keys.key_files import key_home, make_secret
 from rosrm_lab import needs
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -58,6 +60,23 @@ def test_what_is_missing_is_one_sentence(monkeypatch, capsys, error):
     monkeypatch.setattr(stopping, "raise_signals", lambda: None)
     assert stopping.run("it", main) == 2
     assert capsys.readouterr().err == "benchmarks.it: no loop devices\n"
+
+
+def test_a_benchmark_uses_keys_of_its_own(monkeypatch):
+    """The user's keys stay untouched, and are used again afterwards."""
+    monkeypatch.setenv("ROSRM_KEY", "/home/ada/ada.key")
+    monkeypatch.setenv("ROSRM_KEYS", "/home/ada")
+    used = {}
+
+    def main():
+        used.update(os.environ)
+        make_secret(key_home())
+
+    monkeypatch.setattr(stopping, "raise_signals", lambda: None)
+    assert stopping.run("it", main) == 0
+    assert "ROSRM_KEY" not in used
+    assert not Path(used["ROSRM_KEYS"]).exists()
+    assert (os.environ["ROSRM_KEY"], os.environ["ROSRM_KEYS"]) == ("/home/ada/ada.key", "/home/ada")
 
 
 PROGRAMS = sorted(
