@@ -47,7 +47,7 @@ class Scene:
 
     def __init__(self, make, module: str = COUNT, *, inputs: float = 0.0, **options) -> None:
         self.cluster: Cluster = make(host("h0"), host("h1"), liveness=LivenessSettings())
-        self.watcher = Watcher(self.cluster.domain, inputs)
+        self.watcher = Watcher(self.cluster.domain, ("h0", "h1"), inputs)
         self._source = self._pid = 0
         self._host = ""
         self._begun = 0

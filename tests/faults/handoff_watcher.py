@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import groupby, pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -14,7 +14,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64, Int64MultiArray
 
 from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
-from rosrm.keys.handoffs import HandoffKeys, new_link
+from rosrm.keys.finding import host_security, master_security
+from rosrm.keys.handoffs import new_link
 from rosrm.keys.names import handoff_name, named_instance
 from rosrm.keys.sealing import Direction
 from rosrm.ros import qos
@@ -26,6 +27,7 @@ from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, Sea
 from tests.ros.clusters import Cluster, pids_of, zombie
 
 STATE_CONFIG_TOPIC = "/rosrm/state_config"
+STATUS_TOPIC = "/rosrm/process_status"
 #: Handoff phases by the names that the tests use.
 SAID = {
     getattr(StateConfig, name): name
@@ -66,13 +68,19 @@ class Watcher:
 
     Args:
         domain: ROS domain.
+        hosts: of the cluster, whose secret this user has.
         inputs: inputs per second to publish, numbered from 1; 0: none.
-        keys: of the cluster; None: it has no security.
     """
 
-    def __init__(self, domain: int, inputs: float = 0.0, keys: HandoffKeys | None = None) -> None:
-        self._keys = keys
-        self._configs: dict[str, SealedTopic] = {}
+    def __init__(self, domain: int, hosts: Sequence[str], inputs: float = 0.0) -> None:
+        self._hosts = [host_security("keys", host) for host in hosts]
+        self._configs: dict[str, list[SealedTopic]] = {}
+        master = master_security("keys")
+        slaves = [master.peer(f"host:{host}", 0) for host in hosts]
+        self._statuses = [
+            SealedTopic(slave.link, slave.name, ProcessStatusBatch, STATUS_TOPIC)
+            for slave in slaves
+        ]
         self.outputs: list[Output] = []
         self.heard: list[str] = []
         self.injected = threading.Event()
@@ -89,9 +97,7 @@ class Watcher:
         self._node = node = rclpy.node.Node("watcher", context=self._context)
         node.create_subscription(Int64MultiArray, OUTPUT, self._output, QOS)
         node.create_subscription(Sealed, STATE_CONFIG_TOPIC, self._said, STATE_CONFIG, raw=True)
-        node.create_subscription(
-            ProcessStatusBatch, "/rosrm/process_status", self._told, qos.STATUSES
-        )
+        node.create_subscription(Sealed, STATUS_TOPIC, self._told, qos.STATUSES, raw=True)
         if inputs:
             self._inputs = node.create_publisher(Int64, INPUT, QOS)
             node.create_timer(1.0 / inputs, self._drive)
@@ -118,11 +124,16 @@ class Watcher:
     def _said(self, data: bytes) -> None:
         name = decode(data).principal
         process, number = named_instance(name)
-        if name not in self._configs:
-            key = None if self._keys is None else self._keys.of_instance(process, number)
-            link = new_link(key, Direction.TO_MASTER, Direction.FROM_MASTER)
-            self._configs[name] = SealedTopic(link, name, StateConfig, STATE_CONFIG_TOPIC)
-        config = self._configs[name].read(data)
+        if name not in self._configs:  # any of the hosts may run the instance
+            keys = [host.instance_key(process, number) for host in self._hosts]
+            self._configs[name] = [
+                SealedTopic(
+                    new_link(key, Direction.TO_MASTER, Direction.FROM_MASTER), name, StateConfig,
+                    STATE_CONFIG_TOPIC,
+                )
+                for key in keys
+            ]  # fmt: skip
+        config = _read(self._configs[name], data)
         if config.channel not in self._channels:
             self._channels.add(config.channel)
             self._listen_to(config)
@@ -139,7 +150,8 @@ class Watcher:
         if report.instance >= self._source:
             self._hear(REPORTED[report.phase])
 
-    def _told(self, batch: ProcessStatusBatch) -> None:
+    def _told(self, data: bytes) -> None:
+        batch = _read(self._statuses, data)
         for status in batch.statuses:
             self._is(status, repeats=batch.complete)
 
@@ -166,6 +178,11 @@ class Watcher:
         self._thread.join(5.0)
         self._node.destroy_node()
         self._context.try_shutdown()
+
+
+def _read(topics: list[SealedTopic], data: bytes) -> Any:
+    """Return the message that one of the topics opens."""
+    return next(found for topic in topics if (found := topic.read(data)) is not None)
 
 
 def blocks(outputs: list[Output]) -> list[list[Output]]:

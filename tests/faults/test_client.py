@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Sequence
 
 import pytest
 
 from rosrm.errors import Refused
+from rosrm.model.rows import ProcessRow
 from rosrm.ros.control import accepted, refused
 from rosrm.ros.master_connection import MasterClient, is_unsure
-from tests.ros.clusters import host, service
+from tests.ros.clusters import host, job, service
 from tests.waiting import PATIENCE
 
 
@@ -55,6 +57,28 @@ def test_a_request_to_another_run_of_the_master_is_repeated(make_cluster) -> Non
         client._last_contact += 1000.0  # the client greeted the former run just now
         client.submit([service("p")])
         cluster.wait("p", "running")
+
+
+def test_a_listing_and_a_log_are_read_across_restarts(make_cluster) -> None:
+    """A request that only reads is sent to the next run of the master or slave at once."""
+    cluster = make_cluster(host("h0"))
+    cluster.run(job("speaks", "echo", "hello"))
+    with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
+        assert client.read_log("h0", "speaks").content == b"hello\n"
+        cluster.start_slave_again("h0")  # the client has a ticket for the former run
+        assert client.read_log("h0", "speaks").content == b"hello\n"
+        cluster.master.process.send_signal(signal.SIGSTOP)
+        found: list[str] = []
+        asking = threading.Thread(target=lambda: found.extend(row.name for row in _rows(client)))
+        asking.start()
+        asking.join(3.0)  # the client sends the request a second time
+        cluster.restart_master()
+        asking.join(PATIENCE)
+    assert found == ["speaks"]
+
+
+def _rows(client: MasterClient) -> Sequence[ProcessRow]:
+    return client.list(processes=True).processes
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,7 @@ def test_a_standby_goes_on_from_the_last_state(make_cluster, how: str) -> None:
     """The standby continues the count when the primary or its host dies; a new standby follows."""
     hosts = ("h0", "h1", "h2")
     cluster = make_cluster(*map(host, hosts), **SOON)
-    watcher = Watcher(cluster.domain)
+    watcher = Watcher(cluster.domain, hosts)
     try:
         cluster.submit(counter("moving", standby=StandbyPolicy(wanted=True)))
         primary = cluster.wait("moving", "running")
