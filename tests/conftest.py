@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import os
 import shutil
 import signal
+import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,12 @@ LABS = {
 
 # By default DDS multicasts on every interface: what a test starts stays on this machine.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+# The keys of all tests, in a directory of their own.
+if "ROSRM_KEYS" not in os.environ:
+    _keys = tempfile.TemporaryDirectory(prefix="rosrm-keys-")
+    atexit.register(_keys.cleanup)
+    os.environ["ROSRM_KEYS"] = _keys.name
 
 # Where `make setup` has put CRIU, if it could be had.
 os.environ.setdefault("ROSRM_CRIU_PREFIX", str(HERE.parent / ".venv/criu"))

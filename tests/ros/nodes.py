@@ -35,7 +35,9 @@ from tests.waiting import PATIENCE, wait_until
 TOPIC = "/rosrm/state_config"
 STRANDED = "/rosrm/handoff/stranded"
 #: Keys of a cluster whose instances all run on one host.
-KEYS = HandoffKeys(b"secret of the cluster".ljust(32), lambda _process, _number: bytes(range(32)))
+KEYS = HandoffKeys(
+    lambda: b"secret of the cluster".ljust(32), lambda _process, _number: bytes(range(32))
+)
 #: Name of a destination.
 ALIAS = "counter_1700000000"
 CLUSTER = "rosrm"

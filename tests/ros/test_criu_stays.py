@@ -110,8 +110,8 @@ def test_an_image_that_was_damaged_is_not_restored(cluster, listener, running):
     cutter.start()
     why = stayed(cluster, listener)
     cutter.join(PATIENCE)
-    assert "is damaged: criu/core-" in why
-    assert "bytes instead of" in why
+    assert "is damaged: criu/core-" in why  # found by its size or by its content, which comes first
+    assert "bytes instead of" in why or "ends within a field" in why
 
 
 def cut_short(images: Path) -> None:

@@ -1,4 +1,4 @@
-"""Forged messages about handoffs: to nodes with keys, and to a cluster without security."""
+"""Forged messages of handoffs: to nodes with keys, and to a cluster with `security: none`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ R, C = HandoffReport, StateConfig
 
 PARTS = ("/counter/state", "/counter/total", "/counter/_rosrm/parameters")
 MARK = "/counter/_rosrm/mark"
-OTHER_KEYS = HandoffKeys(bytes(32), lambda _process, _number: bytes(32))
+OTHER_KEYS = HandoffKeys(lambda: bytes(32), lambda _process, _number: bytes(32))
 SECRET = "what only the two nodes may know"
 
 
@@ -40,7 +40,7 @@ def gapless(heard) -> bool:
 
 
 class Eavesdropper:
-    """A stranger who stores all that is published in a handoff, and sends whatever it likes."""
+    """A stranger that records all messages of a handoff, and sends forged ones."""
 
     def __init__(self, locked: Stage, conductor: Conductor, *more: str) -> None:
         self.node = Stage(beside=locked).plain
@@ -54,7 +54,7 @@ class Eavesdropper:
             self._publishers[topic] = self.node.create_publisher(Sealed, topic, profile)
 
     def repeat_all(self) -> None:
-        """Send all messages again: as they were, and as newer ones of a run of its own."""
+        """Send all messages again: unchanged, and as newer messages of another run."""
         for topic, heard in self.heard.items():
             for data in list(heard):
                 self.send(topic, data)
@@ -63,7 +63,7 @@ class Eavesdropper:
                 self.send(topic, encode(newer._replace(run=os.urandom(16))))
 
     def forge(self, topic: str, message, conductor: Conductor) -> None:
-        """Send a message that is not sealed, or under no key of this handoff."""
+        """Send a message that is not sealed, or not sealed with a key of this handoff."""
         config = conductor.config
         principal = handoff_name(config.process, config.destination)
         for key in (None, bytes(32)):
@@ -84,8 +84,8 @@ def locked():
 
 
 @pytest.mark.parametrize("keys", [None, OTHER_KEYS], ids=["open", "other keys"])
-def test_without_the_keys_no_node_is_silenced_or_woken(locked, keys) -> None:
-    """The messages of a whole handoff have no effect; the true master moves the node."""
+def test_messages_without_the_keys_do_not_change_the_mode_of_a_node(locked, keys) -> None:
+    """The messages of a whole handoff have no effect; the genuine master moves the node."""
     counts = locked.listen(Int64, "count")
     pair = pair_of(locked, Counter)
     counts_on(locked, counts)
@@ -160,7 +160,7 @@ def test_messages_of_a_stranger_do_not_hold_up_a_successor_whose_source_has_ende
 
 
 @pytest.mark.parametrize("keys", [KEYS, None], ids=["keys", "open"])
-def test_a_state_can_be_read_only_without_security(keys) -> None:
+def test_a_state_can_be_read_only_with_security_none(keys) -> None:
     """No message has the state, nor the key of the handoff."""
 
     class Knowing(Counter):
@@ -186,7 +186,8 @@ def test_a_state_can_be_read_only_without_security(keys) -> None:
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    return make_shared(host("h0"), host("h1"))
+    """Return a cluster without security: its nodes accept forged messages, and recover."""
+    return make_shared(host("h0"), host("h1"), security="none")
 
 
 @pytest.fixture
@@ -202,7 +203,7 @@ def counts_on(stage, heard, more: int = 10) -> None:
 
 
 def conductor(cluster, stage, row, destination: int) -> Conductor:
-    """Return a stranger that speaks as the master and as the destination of a handoff."""
+    """Return a stranger that sends messages of the master and of the destination of a handoff."""
     forged = Conductor(stage, source=row.number, destination=destination, name=row.name)
     forged.config.cluster, forged.config.epoch = cluster.cluster.name, 1
     return forged

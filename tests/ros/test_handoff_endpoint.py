@@ -126,7 +126,9 @@ def test_the_state_config_reaches_late_subscribers(stage):
 
 def test_an_instance_without_a_key_gets_no_message():
     """The grant of its host was revoked; the other one still learns of the end of the handoff."""
-    keys = HandoffKeys(bytes(32), lambda process, number: None if number == 2 else bytes(32))
+    keys = HandoffKeys(
+        lambda: bytes(32), lambda process, number: None if number == 2 else bytes(32)
+    )
     stage = Stage(keys)
     try:
         sent: list[bytes] = []
@@ -142,8 +144,8 @@ def test_an_instance_without_a_key_gets_no_message():
         stage.close()
 
 
-def test_a_stranger_cannot_speak_as_a_node_of_a_handoff():
-    """Forged and repeated reports and questions make no event and use up no room."""
+def test_forged_reports_and_questions_have_no_effect():
+    """Forged and repeated messages cause no event, and nothing is stored for them."""
     stage = Stage(KEYS)
     try:
         stage.say(HandoffPhase.SHADOW)

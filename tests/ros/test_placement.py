@@ -101,7 +101,7 @@ def test_an_idle_cluster_is_quiet(narrow) -> None:
         seen = []
         path = names.Names("/rosrm")(names.REQUEST_PROCESS)
         # Each DDS server of a name receives every request: this one counts them without an answer.
-        participant.serve(srv.RequestProcess, path, lambda request, _: seen.append(request))
+        participant.serve(srv.Sealed, path, lambda request, _: seen.append(request))
         numbers = itertools.count()
 
         def look(seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""Sealed topics and services over real DDS, with a stranger on the same domain."""
+"""Sealed topics and services over real DDS, with a stranger in the same domain."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ ADA = SECRET.key_of(own_grant(principal_of("user:ada")))
 
 
 class Stage:
-    """A master, a member, and a stranger who sees and sends everything without a key."""
+    """A master, a user, and a stranger that receives and sends all messages without a key."""
 
     def __init__(self) -> None:
         domain, self.claim = claim_domain()
         names = ("rosrm_master", "rosrm_client", "stranger")
         self.parts = [Participant(RosSettings(domain=domain), name) for name in names]
-        self.master, self.member, self.stranger = self.parts
+        self.master, self.command, self.stranger = self.parts
         self.refused: list[str] = []
         self.ada = MemberSecurity(ADA)
         self.cluster = MasterSecurity(SECRET)
         self.server = SealedEndpoints(self.master, self.cluster, self.refused.append)
-        self.user = SealedEndpoints(self.member, self.ada, self.refused.append)
+        self.user = SealedEndpoints(self.command, self.ada, self.refused.append)
         self.asked: list[tuple[str, str]] = []
         self.raises = False
 
     def serve(self, *, first_contact: bool = True) -> None:
         def take(request, opened) -> None:
-            self.asked.append((opened.peer.principal, request.process))
+            self.asked.append((str(opened.peer.grant.principal), request.process))
             if self.raises:
                 raise ValueError("broken handler")
             opened.answer(srv.Explain.Response(answer=accepted(), explanation=request.process))
@@ -63,19 +63,19 @@ class Stage:
         wait_until(future.done, f"an answer about {process}", pause=self.spin)
         return future.result()
 
-    def overhear(self) -> list[msg.Sealed]:
-        """Let the stranger offer the same service: DDS sends it every request, too."""
-        heard: list[msg.Sealed] = []
+    def record_requests(self) -> list[msg.Sealed]:
+        """Let the stranger offer the same service, so that it receives every request, too."""
+        recorded: list[msg.Sealed] = []
 
         def take(request, opened) -> None:
-            heard.append(request.message)
+            recorded.append(request.message)
             for body in (b"", request.message.body, os.urandom(60)):
                 opened.answer(
                     srv.Sealed.Response(message=self.forged(body, request.message.counter))
                 )
 
         self.stranger.serve(srv.Sealed, SERVICE, take)
-        return heard
+        return recorded
 
     def forged(self, body: bytes, counter: int = 1) -> msg.Sealed:
         return msg.Sealed(
@@ -102,20 +102,20 @@ def stage():
     stage.close()
 
 
-def test_a_member_is_answered_and_a_second_server_is_not_believed(stage: Stage) -> None:
-    """The stranger answers first, and as often as it likes; it can read nothing."""
+def test_a_forged_answer_of_a_second_server_is_dropped(stage: Stage) -> None:
+    """The stranger answers first, and cannot read the request."""
     stage.serve()
     client = stage.client()
-    heard = stage.overhear()
+    recorded = stage.record_requests()
     names = [f"p{number}" for number in range(20)]
-    while not heard:
+    while not recorded:
         names.append(f"p{len(names)}")
         stage.ask(client, names[-1])
     for name in names[:20]:
         assert stage.ask(client, name).explanation == name
     assert {principal for principal, _ in stage.asked} == {"user:ada"}
-    wait_until(lambda: len(heard) > 20, "the stranger to see the requests", pause=stage.spin)
-    assert not any(b"p1" in bytes(message.body) for message in heard)
+    wait_until(lambda: len(recorded) > 20, "the stranger to see the requests", pause=stage.spin)
+    assert not any(b"p1" in bytes(message.body) for message in recorded)
     assert SERVICE in stage.refused
 
 
@@ -123,13 +123,13 @@ def test_a_stranger_is_not_answered(stage: Stage) -> None:
     """Neither a forged request nor a recorded one nor one of an unknown principal."""
     stage.serve()
     client = stage.client()
-    heard = stage.overhear()
-    while not heard:
+    recorded = stage.record_requests()
+    while not recorded:
         stage.ask(client, "p")
     stage.asked.clear()
     unknown = stage.forged(os.urandom(50))
     unknown.principal = "host:\x1b[2J"
-    changed = stage.forged(bytes(heard[0].body), heard[0].counter + 1)
+    changed = stage.forged(bytes(recorded[0].body), recorded[0].counter + 1)
     client = stage.stranger.node.create_client(srv.Sealed, SERVICE, qos_profile=qos.SERVICE)
     graph = stage.stranger.node
     wait_until(client.service_is_ready, "the stranger to find the service", pause=stage.spin)
@@ -137,26 +137,26 @@ def test_a_stranger_is_not_answered(stage: Stage) -> None:
         lambda: "rosrm_master" in graph.get_node_names(), "the master to be found", pause=stage.spin
     )
     stage.refused.clear()
-    for message in (heard[0], stage.forged(b""), stage.forged(os.urandom(50)), unknown, changed):
+    for message in (recorded[0], stage.forged(b""), stage.forged(os.urandom(50)), unknown, changed):
         client.call_async(srv.Sealed.Request(message=message))
     wait_until(lambda: len(stage.refused) == 5, "five refusals", pause=stage.spin)
     assert stage.asked == []
 
 
 def test_a_request_for_a_former_run_is_answered_as_stale(stage: Stage) -> None:
-    """The sender is genuine and has to shake hands again; nothing is done."""
+    """The request of a genuine sender has no effect; the sender needs a new handshake."""
     stage.serve(first_contact=False)
     client = stage.client()
-    client.receiver_run = bytes(16)
+    client.peer.run = bytes(16)
     answer = stage.ask(client, "p").answer
     assert (answer.accepted, answer.code) == (False, "stale")
-    client.receiver_run = stage.cluster.run
+    client.peer.run = stage.cluster.run
     assert stage.ask(client, "p").explanation == "p"
     assert stage.asked == [("user:ada", "p")]
 
 
 def test_a_handler_that_raises_answers_as_failed(stage: Stage) -> None:
-    """The member learns the kind of the error, and the service goes on."""
+    """The user gets the kind of the error, and the service answers the next request."""
     stage.serve()
     stage.raises = True
     client = stage.client()
@@ -167,12 +167,12 @@ def test_a_handler_that_raises_answers_as_failed(stage: Stage) -> None:
     assert stage.ask(client, "q").answer.accepted
 
 
-def test_messages_of_a_topic_arrive_once_and_from_members_alone(stage: Stage) -> None:
-    """A stranger who repeats what it sees, and invents, is refused; a former run's is dropped."""
+def test_messages_of_a_topic_arrive_once_and_only_from_principals(stage: Stage) -> None:
+    """Repeated and forged messages of a stranger are refused, messages for a former run dropped."""
     taken: list[tuple[int, str]] = []
     stage.server.subscribe(
         msg.ProcessUsage, TOPIC, qos.STATUSES,
-        lambda message, peer: taken.append((message.host_id, peer.principal)),
+        lambda message, peer: taken.append((message.host_id, str(peer.grant.principal))),
     )  # fmt: skip
     publisher = stage.user.publisher(msg.ProcessUsage, TOPIC, qos.STATUSES, stage.ada.master)
     seen: list[msg.Sealed] = []
@@ -180,10 +180,10 @@ def test_messages_of_a_topic_arrive_once_and_from_members_alone(stage: Stage) ->
     forger = stage.stranger.node.create_publisher(msg.Sealed, TOPIC, qos.STATUSES)
     counts = [one.get_subscription_count for one in (publisher._publisher, forger)]
     wait_until(lambda: all(count() == 2 for count in counts), "both readers", pause=stage.spin)
-    publisher.publish(msg.ProcessUsage(host_id=1))  # for a run that the member does not know yet
-    publisher.receiver_run = stage.cluster.run
+    publisher.publish(msg.ProcessUsage(host_id=1))  # for a run that the user does not know yet
+    stage.ada.master.run = stage.cluster.run
     publisher.publish(msg.ProcessUsage(host_id=2))
-    wait_until(lambda: len(seen) == 2 and taken, "the member's messages", pause=stage.spin)
+    wait_until(lambda: len(seen) == 2 and taken, "the messages of the user", pause=stage.spin)
     for message in (*seen, stage.forged(b""), stage.forged(os.urandom(40))):
         forger.publish(message)
     wait_until(lambda: len(stage.refused) == 4, "the stranger's messages", pause=stage.spin)

@@ -9,14 +9,12 @@ import time
 import pytest
 
 from rosrm.model.values import InstanceId, RestartPolicy
-from rosrm.ros import convert, names, qos
-from rosrm.ros.control import ControlClient
-from rosrm.ros.master_connection import wait_for_service
+from rosrm.ros import convert, names
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
-from tests.ros.calls import answer_to
 from tests.ros.clusters import NODE, host, node, service
-from tests.waiting import PATIENCE, wait_gone
+from tests.ros.members import path, play_master
+from tests.waiting import wait_gone
 
 NEVER = RestartPolicy("never")
 ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
@@ -30,31 +28,23 @@ def cluster(make_shared):
 class Orders:
     """A sender of orders beside the master, on the slave's machine and so with its clock."""
 
-    def __init__(self, cluster) -> None:
-        self.participant = Participant(cluster.ros, "orders")
-        path = names.Names(cluster.ros.namespace).of_host("h0", names.CONTROL)
-        self.control = ControlClient(self.participant, "test")
-        self.client = self.participant.node.create_client(
-            srv.ControlHost, path, qos_profile=qos.SERVICE
-        )
+    def __init__(self, participant: Participant) -> None:
+        self._master = play_master(participant, "h0")
 
     def set_restart(self, instance: InstanceId, restart: RestartPolicy):
         """Order another restart policy; return the answer."""
-        deadline = time.monotonic() + PATIENCE
-        assert wait_for_service(self.participant, self.client, deadline)
         request = srv.ControlHost.Request(
-            envelope=self.control.envelope(time.monotonic_ns(), 1 << 40),
+            envelope=self._master.control.envelope(time.monotonic_ns(), 1 << 40),
             action=srv.ControlHost.Request.SET_RESTART,
             instance=convert.instance_to_msg(instance), restart=convert.restart_to_msg(restart),
         )  # fmt: skip
-        return answer_to(self.participant, self.client.call_async(request), deadline).answer
+        return self._master.ask(srv.ControlHost, path.of_host("h0", names.CONTROL), request).answer
 
 
 @pytest.fixture
 def orders(cluster):
-    made = Orders(cluster)
-    yield made
-    made.participant.close()
+    with Participant(cluster.ros, "orders") as participant:
+        yield Orders(participant)
 
 
 def end(pid: int) -> None:

@@ -13,6 +13,7 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.config.settings import CheckpointPolicySettings, KeepSettings, LivenessSettings
+from rosrm.keys.finding import master_security
 from rosrm.model.values import (
     HostLossPolicy,
     MigrationPolicy,
@@ -25,7 +26,6 @@ from rosrm.snapshots.format import Block
 from rosrm.snapshots.writer import SlotWriter
 from rosrm_msgs.msg import StateMark
 from tests.ros.clusters import CALM, STEADY, Cluster, host
-from tests.ros.programs.keyed_master import state_key
 from tests.waiting import PATIENCE, wait_until
 
 pytestmark = pytest.mark.timeout(120)
@@ -353,52 +353,50 @@ def test_a_restarted_master_knows_the_hosts_of_replicas(three):
     process.end()
 
 
+def test_replication_continues_after_a_restart_of_the_replicas_slave(make_cluster):
+    """The ticket of the sender names the former run, so the sender asks for another one at once."""
+    two = make_cluster(host("h0"), host("h1"), liveness=STEADY)
+    process = Replicated(two, "continued")
+    two.start_slave_again(process.keeper)
+    at = copies(two, "continued")[process.keeper]
+    wait_for_copy(two, "continued", at + 100)
+    two.cancel("continued")
+
+
 # --- encrypted --------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def keyed(make_cluster, monkeypatch):
-    """Yield a cluster of three hosts, lost after 3 s of silence, whose processes have keys."""
-    start = Cluster._start
-    masters = {"rosrm.master": "tests.ros.programs.keyed_master"}
-    monkeypatch.setattr(
-        Cluster, "_start",
-        lambda self, name, module, settings: start(
-            self, name, masters.get(module, module), settings
-        ),
-    )  # fmt: skip
-    hosts = [host(f"h{n}") for n in range(3)]
-    return make_cluster(*hosts, liveness=LivenessSettings(suspect=1.0, lease=3.0))
-
-
 @pytest.mark.parametrize("fetched", [False, True], ids=["on the replica's host", "on a third host"])
-def test_a_successor_of_a_lost_host_decrypts_the_replica(keyed, fetched):
+def test_a_successor_of_a_lost_host_decrypts_the_replica(three, fetched):
     """The host that stores the replica has neither the state nor the key.
 
     Master and slave of the source were restarted: the slave has the key on its disk, and the master
     derives it again from its secret.
     """
-    process = Replicated(keyed, "secret", 1_000_000)
-    keyed.restart_master()
-    keyed.start_slave_again(process.source)
-    at = copies(keyed, "secret")[process.keeper]
-    wait_for_copy(keyed, "secret", at + 50)
-    stored = snapshot_directory(keyed, process.keeper, "secret")
+    name = f"secret_{'fetched' if fetched else 'kept'}"
+    process = Replicated(three, name, 1_000_000)
+    three.restart_master()
+    three.start_slave_again(process.source)
+    at = copies(three, name)[process.keeper]
+    wait_for_copy(three, name, at + 50)
+    stored = snapshot_directory(three, process.keeper, name)
     assert [path.name for path in stored.iterdir() if path.name != "copy.new"] == ["copy"]
-    plain = snapshot_directory(keyed, process.source, "secret") / "state.0"
+    plain = snapshot_directory(three, process.source, name) / "state.0"
     ballast = plain.read_bytes()[-1000:-100]
     assert ballast == bytes(900)
     assert ballast not in (stored / "copy").read_bytes()
-    before = copies(keyed, "secret")[process.keeper]
+    before = copies(three, name)[process.keeper]
     if fetched:
-        keyed.client.set_host_state(process.keeper, "cordon")
+        three.client.set_host_state(process.keeper, "cordon")
     after = process.lose_host().host
     assert (after == process.keeper) is not fetched
-    assert wait_for_count(keyed, "secret", before)[0][0] > before
-    keyed.wait_for_log("secret", "continues from the snapshot of secret#")
-    assert_no_key(keyed, state_key("secret"))
-    keyed.cancel("secret")
-    there = snapshot_directory(keyed, after, "secret")
+    assert wait_for_count(three, name, before)[0][0] > before
+    three.wait_for_log(name, f"continues from the snapshot of {name}#")
+    assert_no_key(three, master_security("keys").snapshot_key(name))
+    if fetched:
+        three.client.set_host_state(process.keeper, "uncordon")
+    process.end()
+    there = snapshot_directory(three, after, name)
     wait_until(lambda: not there.exists(), "the key is deleted with the snapshots")
 
 

@@ -15,7 +15,7 @@ from tests.waiting import wait_until
 
 ROSRM = str(Path(sys.executable).parent / "rosrm")
 #: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
-PATIENCE = 60.0
+PATIENCE = 180.0
 MEMORY = 512 * MIB
 #: Exit status of `rosrm` while the master is starting.
 NO_MASTER_YET = 3

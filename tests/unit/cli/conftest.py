@@ -81,6 +81,8 @@ class FakeClient:
     plugins: list = field(default_factory=lambda: list(PLUGINS))
     events: list = field(default_factory=lambda: list(EVENTS))
     trouble: str = ""
+    security: str = "keys"
+    strangers: str = ""
     asked: list = field(default_factory=list)
     fails: BaseException | None = None
     settings: object = None
@@ -136,7 +138,8 @@ class FakeClient:
         chosen = [row for row in self.events if row.sequence > after]
         chosen = [one for one in chosen if process in ("", one.process) and host in ("", one.host)]
         return Listing(
-            master="lab", uptime=125.0, trouble=self.trouble,
+            master="lab", uptime=125.0, trouble=self.trouble, security=self.security,
+            strangers=self.strangers,
             last_sequence=max((row.sequence for row in self.events), default=0),
             hosts=self.hosts if hosts else (), processes=self.processes if processes else (),
             plugins=[row for row in self.plugins if plugins and plugins in (True, row.state)],
@@ -149,7 +152,7 @@ def client(monkeypatch):
     """Replace the connection of every command; the fake keeps its settings."""
     fake = FakeClient()
 
-    def connect(settings):
+    def connect(settings, _security):
         fake.settings = settings
         return fake
 

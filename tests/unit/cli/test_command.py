@@ -111,7 +111,7 @@ def test_ctrl_c_before_a_command_has_begun_is_clean():
 def test_ctrl_c_in_a_running_command_is_clean(tmp_path):
     code = (
         "import rosrm.cli.connection as c, time, sys\n"
-        "def connect(settings):\n"
+        "def connect(settings, _security):\n"
         "    print('ready', flush=True)\n"
         "    time.sleep(30)\n"
         "c.connect = connect\n"
@@ -171,7 +171,7 @@ from tests.unit.cli.conftest import FakeClient
 client = FakeClient()
 client.read_log = lambda host, name, number, offset, *more, **rest: LogPart(
     1, (1,), b"" if offset else b"hello", offset, 5, True, ())
-connection.connect = lambda settings: client
+connection.connect = lambda *_: client
 sys.argv = ["rosrm", *sys.argv[1:]]
 from rosrm.cli.app import main
 main()

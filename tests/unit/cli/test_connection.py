@@ -15,6 +15,7 @@ from typer.main import get_command
 from rosrm.cli import connection, early
 from rosrm.cli.commands import app
 from rosrm.errors import NoMaster, RosrmError
+from rosrm.keys.security import NoSecurity
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import master_connection
 
@@ -49,7 +50,7 @@ def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, ela
 
     class MasterClient:
         @staticmethod
-        def connect(settings, *, name, timeout, joined, begun):
+        def connect(settings, *, name, timeout, security, joined, begun):
             seen.update(name=name, timeout=timeout)
 
     module = SimpleNamespace(MasterClient=MasterClient)
@@ -140,6 +141,7 @@ def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, serve
     participant = SimpleNamespace(settings=settings, close=lambda: closed.append(True))
     monkeypatch.delenv("ROS_DISCOVERY_SERVER", raising=False)
     monkeypatch.setattr(master_connection, "find_master", lambda *_: None)
+    monkeypatch.setattr(master_connection, "user_security", lambda *_: NoSecurity())
     with pytest.raises(NoMaster) as refusal:
         master_connection.MasterClient.connect(
             settings, name="x", timeout=1.6, joined=participant, begun=time.monotonic() - 3.0

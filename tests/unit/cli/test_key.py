@@ -46,9 +46,9 @@ def listed(rosrm):
 # --- init, add, list --------------------------------------------------------------------------
 
 
-def test_the_secret_is_drawn_once(rosrm, home):
+def test_the_secret_is_created_once(rosrm, home):
     path = home / "cluster.key"
-    assert rosrm("key", "init").out == f"{path}: drawn\n"
+    assert rosrm("key", "init").out == f"{path}: created\n"
     before = path.read_bytes()
     assert rosrm("key", "init").out == f"{path}: exists already\n"
     assert path.read_bytes() == before
@@ -84,8 +84,8 @@ def test_a_new_key_is_written_to_the_standard_output(
     result = rosrm("key", "add", *words)
     assert result.code == 0
     assert result.err == (
-        f"rosrm: {principal} has a new key (role {role}). Copy the file to ~/.config/rosrm/ of its "
-        "user, with mode 0600\n"
+        f"rosrm: {principal} has a new key (role {role}). Copy the file to ~/.config/rosrm/ of the "
+        "user that will use it, with mode 0600\n"
     )
     path = tmp_path / "some.key"
     path.touch(mode=0o600)
@@ -131,7 +131,7 @@ def test_a_wrong_role_is_refused_with_the_allowed_ones(rosrm, secret, principal,
 
 
 def test_the_file_behind_the_standard_output_becomes_private(home, secret, tmp_path):
-    """The shell makes the file, for everybody, before the command starts."""
+    """The shell creates the file with mode 0644 before the command starts."""
     path = tmp_path / "robot-1.key"
     with path.open("wb") as output:
         path.chmod(0o644)
@@ -199,8 +199,8 @@ def spoil(path, fault):
         path.chmod(0o644)
         return (
             f"the key file {path} has mode 0644, so that others can read or change it; run `chmod "
-            f"600 {path}`. If others may have read it, replace the key: `rosrm key add` again at "
-            "the master"
+            f"600 {path}`. If others may have read it, replace the key: run `rosrm key add` again "
+            "on the machine of the master"
         )
     if fault == "owner":
         os.chown(path, 12345, -1)
@@ -266,12 +266,12 @@ def test_the_user_of_the_master_has_all_rights_without_a_key_file(rosrm, home, s
     assert shown["not protected"] == [
         "topics and services of the applications",
         "names, sizes and times of rosrm's messages",
-        "delivery: floods and forged packets of DDS can delay messages",
+        "delivery: flooding and forged packets of DDS can delay messages",
     ]
     assert "problem" not in shown
 
 
-def test_a_user_without_a_key_is_told_where_to_get_one(rosrm, home):
+def test_a_user_without_a_key_gets_a_remedy(rosrm, home):
     result = rosrm("key", "check")
     shown = facts(result)
     assert result.code == 1

@@ -40,10 +40,20 @@ def test_status_shows_the_cluster_on_half_a_page(rosrm, client):
 
 def test_status_json_counts_states(rosrm, client):
     assert json.loads(rosrm("status", "--json").out) == {
-        "master": "lab", "uptime": 125.0, "last_sequence": 2, "trouble": "",
+        "master": "lab", "uptime": 125.0, "last_sequence": 2, "trouble": "", "security": "keys",
+        "strangers": "",
         "hosts": {"up": 2, "suspect": 1}, "failing_plugins": [],
         "processes": {"running": 1, "queued": 1, "failed": 1, "finished": 1},
     }  # fmt: skip
+
+
+def test_status_shows_what_is_not_protected(rosrm, client):
+    """A cluster without keys, and messages of strangers; otherwise neither is mentioned."""
+    assert "security" not in rosrm("status").out
+    client.security, client.strangers = "none", "3 messages without a valid key refused"
+    lines = rosrm("status").out.splitlines()
+    assert lines[1] == "security   none: every participant of this ROS domain has all rights"
+    assert lines[2] == "strangers  3 messages without a valid key refused"
 
 
 def test_status_names_the_plugins_that_fail(rosrm, client):

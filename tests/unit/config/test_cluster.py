@@ -179,8 +179,8 @@ def test_every_error_is_reported_at_once_with_its_place(refusal):
          "1:24: quotas.ada.memory: unknown unit 'cores'. Allowed: B, kB, KB,"),
         ("{ada: {cpu: .inf}}", "1:21: quotas.ada.cpu:"),
         ("{ada: 5}", "1:15: quotas.ada: a mapping is required, not 5"),
-        ("{'a b': {cpu: 1}}", "1:10: quotas: 'a b' names no user; for user:ada write ada"),
-        ("{'user:ada': {cpu: 1}}", "1:10: quotas: 'user:ada' names no user;"),
+        ("{'a b': {cpu: 1}}", "1:10: quotas: 'a b' is no name of a user; for user:ada write ada"),
+        ("{'user:ada': {cpu: 1}}", "1:10: quotas: 'user:ada' is no name of a user;"),
         ("[ada]", "1:9: quotas: a mapping is required, not a list"),
     ],
 )  # fmt: skip

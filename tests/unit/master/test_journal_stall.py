@@ -23,7 +23,7 @@ KEPT = {
     happened.HostLeft, happened.StatusesReceived, happened.OrderAnswered,
     happened.HandoffReported, happened.AssignmentWithdrawn,
 }  # fmt: skip
-NEWEST = {happened.ProcessRequested, happened.SnapshotsReported}
+NEWEST = {happened.ProcessRequested, happened.SnapshotsReported, happened.KeyRevoked}
 DROPPED = {
     happened.TimePassed, happened.UsagesReceived, happened.PeerRefused, happened.SourceStranded,
 }  # fmt: skip

@@ -1,7 +1,9 @@
-"""Fake participant: stores what is sent, and lets a test answer requests and publish messages."""
+"""Fake of `SealedEndpoints`: stores what is sent; a test answers requests and publishes."""
 
 from __future__ import annotations
 
+from rosrm.keys.roles import Principal
+from rosrm.keys.security import NoSecurity
 from rosrm.ros.callback_guard import CallbackGuard
 
 
@@ -44,24 +46,35 @@ class Peer:
 
 
 class Wire:
-    """Fake participant, and its node."""
+    """Fake of endpoints, and of their participant and node.
+
+    Args:
+        principal: the part whose endpoints these are; None: the master.
+    """
 
     settings = type("Settings", (), {"namespace": "/rosrm"})
 
-    def __init__(self) -> None:
-        self.node = self
+    def __init__(self, principal: Principal | None = None) -> None:
+        self.participant = self.node = self
+        self.security = NoSecurity(principal)
         self.guard = CallbackGuard()
         self.to: dict[type, Peer] = {}
         self.hear = {}
 
-    def create_client(self, kind, _name, *, qos_profile) -> Peer:
+    def refused(self, name: str) -> None:
+        raise AssertionError(f"a message on {name} was refused")
+
+    def client(self, kind, _name, _peer, **_named) -> Peer:
         return self.to.setdefault(kind, Peer())
+
+    def publisher(self, _kind, _name, _qos, _peer) -> Peer:
+        return Peer()
 
     def create_publisher(self, _kind, _name, _qos) -> Peer:
         return Peer()
 
-    def create_subscription(self, kind, _name, callback, _qos) -> None:
-        self.hear[kind] = callback
+    def follow(self, kind, _name, _qos, take) -> None:
+        self.hear[kind] = lambda message: take(message, b"")
 
     def counted(self, callback):
         return callback

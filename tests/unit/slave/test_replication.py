@@ -37,7 +37,7 @@ class Wire:
     def serve(self, host) -> None:
         self.host = host
 
-    def finds_receiver(self, host: str, now: float) -> bool:
+    def finds_receiver(self, host: str, process: str, now: float) -> bool:
         return host not in self.net.hidden
 
     finds_source = finds_receiver

@@ -378,17 +378,20 @@ def test_a_process_knows_the_file_with_the_masters_epoch():
     assert "ROSRM_EPOCH_FILE" not in process_environment(assignment(command=("x",)), made, HERE)
 
 
-def test_only_a_node_that_takes_part_in_handoffs_gets_a_key():
-    """The key is of its instance; a process that the node starts as a slave inherits none."""
+def test_each_process_gets_the_key_of_its_instance():
+    """A migratable node without one would take every message about a handoff as its master's.
+
+    It may be in any process, also in one whose strategy moves no state of nodes.
+    """
     here = replace(HERE, instance_key=lambda instance: str(instance).encode().ljust(32))
     key = "dGFsa2VyIzcgICAgICAgICAgICAgICAgICAgICAgICA="
     stateful = replace(assignment(command=("x",)), snapshots_from=1)
-    made = process_environment(stateful, {}, here)
-    assert made["ROSRM_INSTANCE_KEY"] == key
-    assert identity_from(made).key == b"talker#7".ljust(32)
+    for one in (stateful, assignment(command=("x",))):
+        made = process_environment(one, {}, here)
+        assert made["ROSRM_INSTANCE_KEY"] == key
+        assert identity_from(made).key == b"talker#7".ljust(32)
     assert "ROSRM_INSTANCE_KEY" in process_environment(shadow(), {}, here)
-    assert "ROSRM_INSTANCE_KEY" not in process_environment(assignment(command=("x",)), made, here)
-    assert "ROSRM_INSTANCE_KEY" not in process_environment(stateful, {}, HERE)
+    assert "ROSRM_INSTANCE_KEY" not in process_environment(stateful, made, HERE)
 
 
 def test_the_identity_of_the_slave_is_not_inherited():

@@ -6,13 +6,17 @@ import math
 
 import pytest
 
+from rosrm.keys.cluster import ClusterSecret
+from rosrm.keys.security import MasterSecurity
 from rosrm.ros.master import rivals
 from rosrm.ros.master.rivals import RivalWatch
+from rosrm.ros.master.services import MasterIdentity
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
 from tests.unit.ros.wire import Wire
 
 OWN = 11
+IDENTITY = MasterIdentity("m", "r", 8, 3, OWN)
 
 
 class Watch:
@@ -23,8 +27,9 @@ class Watch:
         monkeypatch.setattr(rivals, "time", self)
         self.wire, self.refused = Wire(), []
         self.watch = RivalWatch(
-            self.wire, "m", OWN, lambda who, reason: self.refused.append((who, reason))
+            self.wire, IDENTITY, lambda who, reason: self.refused.append((who, reason))
         )
+        monkeypatch.setattr(self.watch, "_endpoints", self.wire)
 
     def monotonic(self) -> float:
         return self.now
@@ -39,7 +44,7 @@ class Watch:
             "protocol_version": PROTOCOL_VERSION, "name": "m", "hostname": "r", "pid": 9,
             "epoch": 4, "incarnation": incarnation, "uptime": uptime,
         }  # fmt: skip
-        self.watch.take_beat(msg.MasterBeat(**{**known, **changes}))
+        self.watch.take_beat(msg.MasterBeat(**{**known, **changes}), b"")
 
     def answer(self, **changes) -> None:
         known = {"protocol_version": PROTOCOL_VERSION, "hostname": "r", "pid": 9, "epoch": 4}
@@ -56,7 +61,7 @@ def test_another_master_that_answers_is_found(watch) -> None:
     watch.beat(uptime=50.0)
     watch.beat(uptime=50.2)
     (asked,) = watch.asked
-    assert (asked.request.role, asked.request.name) == ("master", watch.watch.own_name)
+    assert (asked.request.role, asked.request.name) == ("master", IDENTITY.as_client)
     watch.answer()
     assert watch.watch.take_found().uptime == 50.2
     assert watch.watch.take_found() is None
@@ -87,3 +92,17 @@ def test_an_impossible_beat_is_refused(watch, changes) -> None:
     watch.beat(**changes)
     assert watch.asked == []
     assert len(watch.refused) == 1
+
+
+def test_another_master_is_asked_with_the_present_secret(watch) -> None:
+    """After `rosrm key rotate` no master would answer a request under the former one."""
+    first, second = ClusterSecret(b"1" * 32), ClusterSecret(b"2" * 32)
+    watch.wire.security = master = MasterSecurity(first)
+    for secret in (first, second):
+        master.replace(secret, [])
+        watch.beat()
+        peer = watch.wire.to[srv.Handshake].peer
+        asked = peer.link.seal(b"channel", b"question")
+        known = master.peer(peer.name, peer.generation)
+        assert known.link.open(b"channel", asked) == b"question"
+        watch.now += 1.0

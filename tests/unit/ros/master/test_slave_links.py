@@ -10,6 +10,8 @@ import pytest
 
 from rosrm.core.master.commands import Assign, SendOrder
 from rosrm.core.master.events import BAD_RESULT
+from rosrm.keys.cluster import ClusterSecret
+from rosrm.keys.security import MasterSecurity
 from rosrm.model.orders import ReportInstances, StartInstance
 from rosrm.model.values import Assignment, HostDescription, InstanceId, ProcessSpec
 from rosrm.ros.control import accepted
@@ -18,8 +20,8 @@ from rosrm.ros.reading_codec import Runs
 from rosrm_msgs import srv
 
 HOST, RUN = 1, 500
-#: Keys of the snapshots of processes.
-KEYS = {"stateful": b"k" * 32}
+SECURITY = MasterSecurity(ClusterSecret(bytes(32)))
+SLAVE, SLAVE_RUN = SECURITY.peer("host:shelf", 0), b"r" * 16
 DESCRIPTION = HostDescription("shelf", RUN)
 
 
@@ -38,7 +40,7 @@ class FakeClient:
         self.requests.append(request)
 
 
-def heard(links: HostLinks, beat: int, sequence: int) -> None:
+def receive_reading(links: HostLinks, beat: int, sequence: int) -> None:
     column = np.array([HOST], np.int64)
     one = np.ones(1, np.int64)
     links.reading_stats.take(
@@ -64,11 +66,11 @@ def control() -> Control:
 
 @pytest.fixture
 def links(monkeypatch, control) -> HostLinks:
-    node = SimpleNamespace(create_client=lambda *arguments, **named: control)
-    participant = SimpleNamespace(node=node, settings=SimpleNamespace(namespace="/rosrm"))
-    links = HostLinks(
-        participant, "master test", 1, 5.0, lambda event: None, lambda process: KEYS[process]
-    )
+    endpoints = SimpleNamespace(
+        participant=SimpleNamespace(settings=SimpleNamespace(namespace="/rosrm")),
+        security=SECURITY, client=lambda *_: control,
+    )  # fmt: skip
+    links = HostLinks(endpoints, "master test", 1, 5.0, lambda event: None)
     links._client = FakeClient()
     monkeypatch.setattr(
         "rosrm.ros.master.slave_links.order_to_msg",
@@ -80,36 +82,59 @@ def links(monkeypatch, control) -> HostLinks:
 def test_an_order_waits_until_discovery_finds_the_service_of_the_slave(links, control):
     """An earlier order would be lost, and repeated only after `control.order_retry`."""
     control.ready = False
-    links.renew(HOST, DESCRIPTION)
-    heard(links, beat=100, sequence=1)
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    receive_reading(links, beat=100, sequence=1)
     links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
-    heard(links, beat=200, sequence=2)
+    receive_reading(links, beat=200, sequence=2)
     assert links._client.beats == []
     control.ready = True
-    heard(links, beat=300, sequence=3)
+    receive_reading(links, beat=300, sequence=3)
     assert links._client.beats == [300]
 
 
 def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
     """A host that was cut off has only old readings; an order with their beat would be stale."""
     client = links._client
-    links.renew(HOST, DESCRIPTION)
-    heard(links, beat=100, sequence=1)
-    links.renew(HOST, DESCRIPTION)
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    receive_reading(links, beat=100, sequence=1)
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
     links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
     assert client.beats == []
-    heard(links, beat=900, sequence=2)
+    receive_reading(links, beat=900, sequence=2)
     assert client.beats == [900]
 
 
 def test_waiting_requests_of_one_slave_are_bounded(links):
     """A sender repeats requests for a host that sends no reading; the oldest get no answer."""
-    links.renew(HOST, DESCRIPTION)
-    link, sent = links.find(HOST, RUN), []
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    link, sent = links.find(HOST, RUN, SLAVE), []
     for number in range(1200):
         links.after_first_reading(link, partial(sent.append, number))
-    heard(links, beat=100, sequence=1)
+    receive_reading(links, beat=100, sequence=1)
     assert sent == list(range(200, 1200))
+
+
+def test_the_link_of_a_slave_with_a_revoked_key_is_closed(links) -> None:
+    """Orders and requests that wait for it end without an answer."""
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    link, ended = links.find(HOST, RUN, SLAVE), []
+    links.after_first_reading(link, lambda: None, done=ended.append)
+    links.shut_revoked(lambda _: True)
+    assert links.find(HOST, RUN, SLAVE) is link
+    links.shut_revoked(lambda _: False)
+    assert ended == [None]
+    assert links.find(HOST, RUN, SLAVE) is None
+    assert links.slave_of(HOST) is None
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
+    assert links._client.requests == []
+
+
+def test_a_slave_reports_only_its_own_host(links) -> None:
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    other = SECURITY.peer("host:other", 0)
+    assert links.is_slave_of(HOST, SLAVE)
+    assert not links.is_slave_of(HOST, other)
+    assert links.find(HOST, RUN, other) is None
 
 
 def assignment(process: str, snapshots_from: int) -> Assignment:
@@ -119,8 +144,8 @@ def assignment(process: str, snapshots_from: int) -> Assignment:
 
 def test_only_the_messages_have_the_key_and_only_for_a_process_with_snapshots(links):
     """The core derives, stores and journals no key."""
-    links.renew(HOST, DESCRIPTION)
-    link, answers = links.find(HOST, RUN), []
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    link, answers = links.find(HOST, RUN, SLAVE), []
     kept = [assignment("stateful", 1), assignment("stateless", 0)]
     for one in kept:
         links.assign(Assign(HOST, one))
@@ -128,8 +153,8 @@ def test_only_the_messages_have_the_key_and_only_for_a_process_with_snapshots(li
     links.open_poll(link, answers.append, lambda: None)
     links.flush(0)
     keys = [bytes(one.state_key) for one in answers[0].assignments]
-    assert keys == [KEYS["stateful"], b""]
-    heard(links, beat=100, sequence=1)
+    assert keys == [SECURITY.snapshot_key("stateful"), b""]
+    receive_reading(links, beat=100, sequence=1)
     for number, one in enumerate(kept):
         links.order(SendOrder(number, HOST, StartInstance(one)), now=0.0)
     started = [request.order.assignment.state_key for request in links._client.requests]

@@ -8,6 +8,7 @@ import pytest
 
 from rosrm.core.slave import events
 from rosrm.core.slave.state import SlaveState
+from rosrm.keys.roles import Principal
 from rosrm.model.values import HostDescription
 from rosrm.ros.slave import endpoint
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
@@ -55,11 +56,13 @@ class Master:
         self._incarnation = incarnation
         self._epoch = epoch
 
-    def beat(self, silent_hosts=(), age: float = 0.0, journal: int = 0) -> None:
+    def beat(
+        self, silent_hosts=(), age: float = 0.0, journal: int = 0, tickets_from: int = 0
+    ) -> None:
         beat = msg.MasterBeat(
             protocol_version=PROTOCOL_VERSION, incarnation=self._incarnation,
             beat=self._slave.clock.monotonic_ns() - int(age * 1e9), silent_hosts=list(silent_hosts),
-            journal=journal, **self._is,
+            journal=journal, tickets_from=tickets_from, **self._is,
         )  # fmt: skip
         self._slave.wire.hear[msg.MasterBeat](beat)
 
@@ -86,7 +89,7 @@ class Slave:
     """Endpoint of a slave with its fake surroundings."""
 
     def __init__(self, clock: Clock, seen: JournalWatermark | None = None) -> None:
-        self.clock, self.wire, self.host = clock, Wire(), Host()
+        self.clock, self.wire, self.host = clock, Wire(Principal("host", "h0")), Host()
         description = HostDescription("h0", 5)
         self.endpoint = SlaveEndpoint(
             self.wire, description, SlaveState(), take=self.host.take, seen=seen
@@ -212,6 +215,16 @@ def test_beats_confirm_the_contact_of_this_host(slave) -> None:
     assert slave.host.contacts == []
     ours.beat(silent_hosts=[2])
     assert slave.host.contacts == pytest.approx([slave.clock.now])
+
+
+def test_the_master_says_which_tickets_are_in_force(slave) -> None:
+    """A beat of another master says nothing about them."""
+    master, other = Master(slave, 11), Master(slave, 12, pid=8)
+    slave.join(master)
+    other.beat(tickets_from=9)
+    assert slave.wire.security.tickets_from == 0
+    master.beat(tickets_from=3)
+    assert slave.wire.security.tickets_from == 3
 
 
 def test_delayed_beats_confirm_the_contact_of_their_time(slave) -> None:

@@ -1,0 +1,174 @@
+"""Sealed services: which requests are handled, and how they are answered."""
+
+from __future__ import annotations
+
+from array import array
+from types import SimpleNamespace
+
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+
+from rosrm.errors import Refused
+from rosrm.keys.roles import Principal
+from rosrm.keys.security import NoSecurity, Peer
+from rosrm.keys.tickets import Ticket
+from rosrm.ros import qos
+from rosrm.ros.callback_guard import CallbackGuard
+from rosrm.ros.participant import Participant
+from rosrm.ros.sealed import SealedEndpoints, envelope_to_msg, request_channel, sealed
+from rosrm_msgs import msg, srv
+
+SUBMIT, BEATS = "/rosrm/submit", "/rosrm/master_beat"
+
+
+class Service:
+    """A sealed service of a master without a ROS context."""
+
+    def __init__(self, kind, name: str, handle, security: NoSecurity | None = None) -> None:
+        made = Participant.__new__(Participant)
+        made._executed, made.guard, made.node = 0, CallbackGuard(), self
+        self.kind, self.name = kind, name
+        self.sent: list[srv.Sealed.Response] = []
+        self.refused: list[str] = []
+        self.security = security or NoSecurity()
+        endpoints = SealedEndpoints(made, self.security, self.refused.append)
+        endpoints.serve(kind, name, handle, first_contact=security is None)
+
+    def create_service(self, _kind, _name, _callback, *, qos_profile):
+        self.entity = SimpleNamespace(send_response=lambda response, _: self.sent.append(response))
+        return self.entity
+
+    def take(self, message: msg.Sealed) -> None:
+        """Pass a message to the service, as the executor does."""
+        self.entity.send_response(srv.Sealed.Request(message=message), "header")
+
+    def answers(self, request=None, sender: Peer | None = None) -> list:
+        """Return the answers to a request, by default of a user."""
+        sender = sender or NoSecurity(Principal("user", "ada")).master
+        channel = request_channel(self.kind, self.name)
+        self.take(envelope_to_msg(sealed(sender, channel, request or self.kind.Request())))
+        return [
+            deserialize_message(bytes(response.message.body), self.kind.Response)
+            for response in self.sent
+        ]
+
+
+@pytest.mark.parametrize(("kind", "name"), [(srv.Submit, SUBMIT), (srv.Handshake, "/handshake")])
+def test_a_request_whose_handler_raises_is_answered_as_failed(caplog, kind, name) -> None:
+    """The caller need not wait for a time-out; the answer names the error."""
+
+    def handle(_request, _open_request):
+        raise Refused("a result is a JSON NoneType, not an object")
+
+    (response,) = Service(kind, name, handle).answers()
+    answer = getattr(response, "answer", response)
+    assert not answer.accepted
+    assert "Refused: a result is a JSON NoneType" in answer.message
+    assert len(caplog.messages) == 1
+
+
+def test_an_error_of_the_receiver_is_answered_without_its_paths(caplog) -> None:
+    """The log of the receiver has the text and the place."""
+
+    def handle(_request, _open_request):
+        raise OSError(36, "File name too long", "/home/ada/.local/state/rosrm/x")
+
+    (response,) = Service(srv.Submit, SUBMIT, handle).answers()
+    assert response.answer.message == "an error of the receiver: OSError; its log has the cause"
+    assert "/home/ada" in caplog.messages[0]
+
+
+def test_a_request_that_was_answered_is_not_answered_again(caplog) -> None:
+    """An error after the answer is only logged."""
+
+    def handle(_request, open_request):
+        open_request.answer(srv.Submit.Response())
+        raise Refused("too late")
+
+    assert len(Service(srv.Submit, SUBMIT, handle).answers()) == 1
+    assert len(caplog.messages) == 1
+
+
+def test_a_request_beyond_its_bounds_is_answered_with_the_field() -> None:
+    """The handler is not called."""
+    handled: list[object] = []
+    service = Service(srv.Cancel, "/rosrm/cancel", lambda request, _: handled.append(request))
+    (response,) = service.answers(srv.Cancel.Request(processes=[65_537 * "n"]))
+    assert (response.answer.accepted, response.answer.code) == (False, "failed")
+    assert "Cancel_Request.processes has 65537 letters" in response.answer.message
+    assert handled == []
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"body": array("B", bytes((1 << 24) + 1))},
+        {"principal": f"user:{600 * 'a'}"},
+        {"principal": f"ticket:1:read_log:{600 * 'p'}:user:a"},
+        {"format": 2},
+        {"principal": "nobody"},
+    ],
+    ids=["huge", "long name", "long ticket", "other format", "no principal"],
+)
+def test_a_message_of_no_principal_is_counted_and_not_answered(fields) -> None:
+    """The executor gets no exception: that would end the master."""
+    service = Service(srv.Submit, SUBMIT, lambda *_: pytest.fail("it was handled"))
+    service.take(msg.Sealed(**{"format": 1, "principal": "", **fields}))
+    assert service.refused == [SUBMIT]
+    assert service.sent == []
+
+
+def test_a_ticket_from_before_a_revocation_is_refused() -> None:
+    """Its bearer may have lost its key; another bearer asks the master for a new ticket."""
+    host, handled = Principal("host", "robot-1"), []
+    service = Service(
+        srv.ReadLog, "/read_log", lambda *_: handled.append("ticket"), NoSecurity(host)
+    )
+    service.security.tickets_from = 7
+    for version, code in ((6, "stale"), (7, None), (8, None)):
+        name = Ticket(1, version, "read_log", "p", Principal("user", "ada")).text()
+        bearer = NoSecurity(host).bearer(name, b"", service.security.run)
+        answers = service.answers(sender=bearer)
+        assert code is None or answers[-1].answer.code == code
+    assert handled == ["ticket", "ticket"]
+
+
+class Follower:
+    """A member that follows a signed topic without a ROS context."""
+
+    def __init__(self) -> None:
+        made = Participant.__new__(Participant)
+        made._executed, made.guard, made.node = 0, CallbackGuard(), self
+        self.taken: list[int] = []
+        self.checked = 0
+        self.security = NoSecurity(Principal("host", "robot-1"))
+        self.security.is_signed = self.is_signed
+        endpoints = SealedEndpoints(made, self.security)
+        endpoints.follow(
+            msg.MasterBeat, BEATS, qos.BEAT_IN, lambda beat, _: self.taken.append(beat.beat)
+        )
+
+    def create_subscription(self, _kind, _name, callback, _profile) -> None:
+        self.take = callback
+
+    def is_signed(self, _content: bytes, _signature: bytes) -> bool:
+        self.checked += 1
+        return True
+
+    def beat(self, run: int, counter: int) -> None:
+        body = array("B", serialize_message(msg.MasterBeat(beat=counter)))
+        sender = array("B", run.to_bytes(16, "big"))
+        self.take(msg.Signed(format=1, run=sender, counter=counter, body=body))
+
+
+def test_a_repeated_beat_is_dropped_before_its_signature_is_checked() -> None:
+    """And recorded beats of many former runs do not make the present run be forgotten."""
+    follower = Follower()
+    for counter in range(1, 101):
+        follower.beat(1, counter)
+        follower.beat(1, counter)
+        follower.beat(1000 + counter, 1)
+    assert follower.checked == 200
+    assert [beat for beat in follower.taken if beat > 1] == list(range(2, 101))
+    follower.beat(1, 100)
+    assert follower.checked == 200
