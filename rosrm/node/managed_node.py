@@ -88,6 +88,8 @@ class NodeEntities:
         self.on_overflow: Callable[[str], None] = lambda _: None
         self._gate = PublisherGate(self.mode is Mode.ACTIVE)
         self._openings: list[ServiceOf | OpeningOf] = []
+        #: `timers_due` of a node that is active, but whose timers have not started yet.
+        self._due_at_start: Sequence[int] | None = None
         self._replay = InputReplay(plain, self.turn, self._serve_next)
         self.buffer = self._new_buffer()
 
@@ -305,8 +307,10 @@ class NodeEntities:
         if not self.buffer:  # messages that came during the last cycle stay for the successor
             self.buffer = self._new_buffer()
         for timer in self.timers:
-            timer.started = not timer.timer.is_canceled()
+            if self._due_at_start is None:
+                timer.started = not timer.timer.is_canceled()
             timer.stop()
+        self._due_at_start = None
         self._close_all(OpeningOf)
         return due
 
@@ -350,7 +354,12 @@ class NodeEntities:
                 own[covered.topic].covered.extend(covered.covered)
 
     def timers_due(self) -> list[int]:
-        """Return the nanoseconds until each timer is due, in order of creation; -1: cancelled."""
+        """Return the nanoseconds until each timer is due, in order of creation; -1: cancelled.
+
+        Timers beyond the list are due now.
+        """
+        if self._due_at_start is not None:
+            return list(self._due_at_start)
         return [timer.due_ns() for timer in self.timers]
 
     def become_active(
@@ -369,6 +378,7 @@ class NodeEntities:
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
         self._late_until = time.monotonic() + _LATE
+        self._due_at_start = timers_due
         announce()
         self._replay.begin(self._start(timers_due, since, settle))
 
@@ -376,7 +386,10 @@ class NodeEntities:
         self, timers_due: Sequence[int], since: float, settle: Sequence[Callable[[], None]]
     ) -> Iterator[None]:
         """Start timers and services in steps of some ms; new messages are served between steps."""
+        if self.mode is not Mode.ACTIVE:
+            return
         self._start_timers(timers_due, time.monotonic() - since)
+        self._due_at_start = None
         for opening in list(self._openings):
             yield
             if self.mode is not Mode.ACTIVE:

@@ -14,6 +14,7 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rosrm.node.handoff.state_parts import StateError
+from rosrm.node.managed_node import Mode
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, encoded_head
 from rosrm.version import PROTOCOL_VERSION
@@ -222,6 +223,20 @@ def test_what_is_not_kept_at_once_is_kept_though_no_cycle_follows(stage, tmp_pat
     writes = node._rosrm._source._keeper
     assert writes._kept < node._rosrm.entities.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, 5), "the last state")
+
+
+def test_a_node_that_ends_before_its_timers_start_keeps_them(stage, tmp_path):
+    """The next instance continues, although no cycle came between two restarts."""
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.count >= 10, "ten counts")
+    stage.remove(first)
+    second = stage.instance(Counter, 2, keep=tmp_path)
+    entities = second._rosrm.entities
+    stage.spin_until(lambda: entities.mode is Mode.ACTIVE, "the restore")
+    stage.remove(second)
+    assert second.count == first.count
+    third = stage.instance(Counter, 3, keep=tmp_path)
+    stage.spin_until(lambda: third.count > first.count, "a further count")
 
 
 class Asking(Counter):
