@@ -20,6 +20,8 @@ _KEPT: Final = {
     DESK: ("master/journal.sqlite", "master/journal.sqlite-wal"),
     **dict.fromkeys(HOSTS, (INSTANCE_RECORD, "slave/supervisor/supervisor.log")),
 }
+#: Logs of one process on a host.
+_OUTPUT: Final = "slave/supervisor/logs"
 
 
 class EventLog:
@@ -47,10 +49,14 @@ class EventLog:
         for part in cluster.parts.values():
             with contextlib.suppress(OSError):
                 shutil.copy(part.log, folder)
+        logs = [f"{_OUTPUT}/{one['name']}.*.log" for one in violations]
         for host, files in _KEPT.items():
-            for file in files:
-                # A host may be off.
-                with contextlib.suppress(Exception):
-                    shutil.copy(
-                        cluster.lab.outside(host, file), folder / f"{host}-{Path(file).name}"
-                    )
+            for pattern in (*files, *logs):
+                _copy(cluster, host, Path(pattern), folder)
+
+
+def _copy(cluster: Cluster, host: str, pattern: Path, folder: Path) -> None:
+    """Copy the files of a host that match a pattern; the host may be off."""
+    with contextlib.suppress(Exception):
+        for file in cluster.lab.outside(host, pattern.parent).glob(pattern.name):
+            shutil.copy(file, folder / f"{host}-{file.name}")
