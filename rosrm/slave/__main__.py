@@ -10,19 +10,30 @@ import signal
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
+import logging
 import sys
 
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import Registry
+from rosrm.runtime import oom_score
 from rosrm.runtime.bootstrap import Handover, run
 from rosrm.slave.own_key import wait_for_security
 from rosrm.slave.runtime import SlaveRuntime
+
+_log = logging.getLogger("rosrm.slave")
 
 
 def serve(handover: Handover) -> int:
     """Load the plugins and run the slave; return the exit code."""
     config = HostConfig.from_json(handover.settings)
     registry = Registry.load(handover.plugins)
+    fault = oom_score.protect()
+    if fault:
+        _log.info(
+            "slave and supervisor are not protected from the OOM killer: %s. As root, with "
+            "CAP_SYS_RESOURCE or with `OOMScoreAdjust=%d` of systemd they are",
+            fault, oom_score.PROTECTED,
+        )  # fmt: skip
     return SlaveRuntime(config, registry, wait_for_security(config)).run()
 
 

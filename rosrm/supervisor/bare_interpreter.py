@@ -18,11 +18,13 @@ def main() -> None:
     sys.path.append(os.path.dirname(package))  # last: the standard library takes precedence
 
     # ruff: noqa: PLC0415 - these can be imported only now
+    from rosrm.runtime import oom_score
     from rosrm.supervisor import endpoint
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server
 
     state, *limits = sys.argv[1:]
+    oom_score.protect()  # the slave, which cannot do it either then, logs why
     try:
         listener = endpoint.listen(state)
     except endpoint.EndpointError as error:

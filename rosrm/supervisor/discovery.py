@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import SupervisorError
-from rosrm.runtime import private_files
+from rosrm.runtime import oom_score, private_files
 from rosrm.supervisor import endpoint
 from rosrm.supervisor.logs import LogLimits
 
@@ -53,14 +53,15 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
     )  # fmt: skip
     limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
     command = [sys.executable, "-I", "-S", str(main), "--state", str(state), *limits]
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-        umask=private_files.user_umask(),  # its processes inherit it
-    )
+    with oom_score.score_of_children():  # it protects itself
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            umask=private_files.user_umask(),  # its processes inherit it
+        )
     assert process.stdout is not None
     with process.stdout as output:
         answer = b""

@@ -21,6 +21,7 @@ from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
 from rosrm.core.supervisor.instance import STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
+from rosrm.runtime.oom_score import score_of_children
 from rosrm.supervisor import lease_file, messages, own_log, paths, procfs, spawn, takeover
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.instance_record import InstanceRecord
@@ -200,7 +201,9 @@ class Server:
             raise spawn.SpawnError(message, transient=True) from None
         try:
             directory = launch.directory or paths.work_directory(self._state)
-            return spawn.spawn(launch.argv, self._environment(launch), directory, self._null, log)
+            environment = self._environment(launch)
+            with score_of_children():
+                return spawn.spawn(launch.argv, environment, directory, self._null, log)
         finally:
             os.close(log)
 

@@ -1,0 +1,56 @@
+"""Protection of an agent from the OOM killer, which ends the process with the highest score.
+
+A process that leaks must be killed before the slave and the supervisor, which report and restart
+it. A child inherits the score of its parent, so an agent takes back its former score while it
+starts one. The supervisor imports this module: it stays small.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Final
+
+#: Score of a protected agent. Not -1000, which exempts a process: a leak of the agent must end too.
+PROTECTED: Final = -900
+_FILE: Final = "/proc/self/oom_score_adj"
+#: Score of this process and that of its children; equal: this process is not protected.
+_scores = (0, 0)
+
+
+def protect() -> str:
+    """Lower the score of this process; return why that is impossible, "" if it is protected.
+
+    The processes that it starts get the score that it had before; 0 if it was protected already,
+    for example by systemd.
+    """
+    global _scores  # noqa: PLW0603 - an attribute of the process
+    try:
+        with open(_FILE, encoding="ascii") as file:
+            present = int(file.read())
+        if present > PROTECTED:
+            _set(PROTECTED)
+    except OSError as error:
+        return f"{_FILE} cannot be lowered: {error.strerror}"
+    _scores = (PROTECTED, present) if present > PROTECTED else (present, 0)
+    return ""
+
+
+@contextlib.contextmanager
+def score_of_children() -> Iterator[None]:
+    """Take the score of the children for a while; a process that is started now keeps it."""
+    own, children = _scores
+    if own == children:
+        yield
+        return
+    _set(children)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # the right to lower it was lost since
+            _set(own)
+
+
+def _set(score: int) -> None:
+    with open(_FILE, "w", encoding="ascii") as file:
+        file.write(str(score))
