@@ -26,7 +26,8 @@ Client          Client, load_work, RosSettings; its results: Listing, ProcessRow
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health
 Plugins         hookimpl, NoOptions, SkipPlugin
-  probes        ProbeOffer, Probe, ProbeContext, Sessions, ResourceDescription, Reading
+  probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
+                ResourceDescription, Reading
   scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
@@ -92,6 +93,7 @@ if TYPE_CHECKING:
         Probe,
         ProbeContext,
         ProbeOffer,
+        ProcessMeasuring,
         ProcessTreeLauncher,
         ProcessView,
         Scores,
@@ -164,8 +166,8 @@ __all__ = [
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
     "MigrationStrategy", "Move", "NoMaster", "NoOptions", "PeriodicImaging", "Plan",
     "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
-    "ProbeContext", "ProbeOffer", "ProcessRow", "ProcessSpec", "ProcessTreeLauncher",
-    "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
+    "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
+    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
     "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError",
     "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
     "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
@@ -184,8 +186,8 @@ _NAMES: Final = {
         "CheckpointView FloatArray GraphDepartureLauncher HostChecking HostView ImageLauncher "
         "Imaging Launch Launcher LauncherContext LauncherOffer MemoryPacing MemoryView "
         "MigrationOffer MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext "
-        "ProbeOffer ProcessTreeLauncher ProcessView Scores ScoringOffer ScoringPolicy "
-        "Sessions SpecChecking"
+        "ProbeOffer ProcessMeasuring ProcessTreeLauncher ProcessView Scores ScoringOffer "
+        "ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
     "extensions.options": "options_of",

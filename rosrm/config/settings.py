@@ -106,6 +106,8 @@ class MigrationSettings:
         hysteresis: seconds for which a host must be over a limit before the master evicts a
             process.
         headroom: fraction by which a destination stays under each of its limits.
+        need: need by which the master chooses a destination. "measured": the larger one of the
+            process's need and its measured usage; "declared": its need as at its first placement.
         max_in_flight: highest number of migrations in flight.
         automatic: True: the master evicts processes from hosts that are over a limit.
     """
@@ -116,6 +118,7 @@ class MigrationSettings:
     cooldown: Seconds = _CORE.cooldown
     hysteresis: Seconds = _CORE.hysteresis
     headroom: Fraction = _CORE.headroom
+    need: Literal["measured", "declared"] = _CORE.need
     max_in_flight: PositiveCount = _CORE.max_migrations
     automatic: bool = _CORE.automatic
 
@@ -283,6 +286,7 @@ class ClusterConfig:
             cooldown=self.migration.cooldown,
             hysteresis=self.migration.hysteresis,
             headroom=self.migration.headroom,
+            need=self.migration.need,
             max_migrations=self.migration.max_in_flight,
             automatic=self.migration.automatic,
             order_retry=self.control.order_retry,

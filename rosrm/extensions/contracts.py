@@ -57,6 +57,18 @@ class Probe(Protocol):
         """Release the probe's files, threads and devices; called once, at the slave's end."""
 
 
+class ProcessMeasuring(Protocol):
+    """A probe that also measures how much of its resources single processes use."""
+
+    def by_process(self) -> Mapping[str, Mapping[int, float]]:
+        """Return resource name to pid to amount, in the unit of the resource; others use nothing.
+
+        Called after each `read`, in the same thread. The answer has each attributed resource of the
+        probe, and may have others: eviction then moves the process with the largest usage. Pids
+        outside of the slave's sessions have no effect.
+        """
+
+
 class Sessions(Protocol):
     """The sessions (process trees) that the slave runs, for probes whose scope is the slice."""
 

@@ -11,7 +11,13 @@ from rosrm.extensions.contracts import Executor, Launcher, Probe, ProbeOffer
 from rosrm.extensions.discovery import FAULTS
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.rows import PluginKind
-from rosrm.model.values import EMPTY, RESOURCE_SLOTS, Reading, ResourceDescription
+from rosrm.model.values import (
+    EMPTY,
+    MOST_USED,
+    RESOURCE_SLOTS,
+    Reading,
+    ResourceDescription,
+)
 from rosrm.wording import get_close_matches
 
 #: Members that an object of each kind must have.
@@ -162,6 +168,23 @@ def fault_of_resources(
     if len(taken) + len(resources) > RESOURCE_SLOTS:
         return f"exceeds the {RESOURCE_SLOTS} resources that a host may have"
     return ""
+
+
+def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:
+    """Return the fault of a probe that does not measure an attributed resource; "" for none."""
+    if hasattr(probe, "by_process"):
+        return ""
+    attributed = [
+        one.name
+        for one in resources
+        if one.accounting == "attributed" and one.name not in MOST_USED
+    ]
+    if not attributed:
+        return ""
+    return (
+        f"gives {attributed[0]!r} the accounting 'attributed', and has no `by_process` that "
+        "measures it"
+    )
 
 
 def close_quietly(probe: Probe) -> None:

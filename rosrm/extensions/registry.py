@@ -50,6 +50,7 @@ from rosrm.extensions.made import (
     failed_probe,
     fault_of_resources,
     missing_method,
+    unmeasured,
 )
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
@@ -356,7 +357,7 @@ class Registry:
         probe = self._make("probe", name, options, context)
         try:
             resources = tuple(probe.resources)
-            fault = fault_of_resources(resources, offer, before)
+            fault = fault_of_resources(resources, offer, before) or unmeasured(probe, resources)
             fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
         except FAULTS as raised:
             resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Final
+from typing import Final, get_args
 
-from rosrm.model.values import RESOURCE_SLOTS, HostDescription, ResourceDescription
+from rosrm.model.values import (
+    RESOURCE_SLOTS,
+    Accounting,
+    HostDescription,
+    ResourceDescription,
+)
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 _NAMESPACE: Final = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -14,6 +19,7 @@ _LONGEST_NAMESPACE: Final = 255
 _RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 #: Seconds: the longest period of readings.
 _LONGEST_PERIOD: Final = 3600.0
+_ACCOUNTINGS: Final = get_args(Accounting)
 #: Examples of fields in the description of a resource.
 _EXAMPLES: Final = {"unit": '"B", "core", "B/s" or "1"', "scope": '"machine"'}
 
@@ -87,6 +93,10 @@ def resource_fault(resource: object) -> str:
         word: object = getattr(resource, field)
         if not (isinstance(word, str) and word.isprintable()):
             return f"gives {name!r} the {field} {word!r}; text is required, as {_EXAMPLES[field]}"
+    accounting: object = resource.accounting
+    if accounting not in _ACCOUNTINGS:
+        allowed = ", ".join(map(repr, _ACCOUNTINGS))
+        return f"gives {name!r} the accounting {accounting!r:.100}; allowed: {allowed}"
     capacity: object = resource.capacity
     numeric = isinstance(capacity, (int, float)) and not isinstance(capacity, bool)
     if not (numeric and math.isfinite(resource.capacity) and resource.capacity > 0.0):

@@ -18,6 +18,8 @@ RESOURCE_SLOTS: Final = 16
 ABSURD_USAGE: Final = 64.0
 #: More than this of a resource (base units), used by one process, is an error, not a measurement.
 MOST_USED: Final[Mapping[str, float]] = MappingProxyType({"cpu": 65_536.0, "memory": 2.0**53})
+#: The same of each other resource.
+MOST_USED_OF_OTHERS: Final = 2.0**53
 #: Instance numbers and journal records grow one by one, and so never get as large as this.
 LARGEST_NUMBER: Final = 2**53
 
@@ -27,6 +29,7 @@ RestartCondition = Literal["never", "on-failure", "always"]
 ReadinessKind = Literal["auto", "graph", "running"]
 HostLossAction = Literal["wait", "elsewhere", "stop"]
 IsolationAction = Literal["keep", "stop"]
+Accounting = Literal["attributed", "shared", "countable"]
 
 
 class Kind(str, Enum):
@@ -403,12 +406,18 @@ class ResourceDescription:
         capacity: amount at usage 1.0, > 0.
         scope: scope of the measurement: "machine", "cgroup", "slice" or a name that the probe
             defines.
+        accounting: end of the reservation of a declared need. "attributed": the usage of each
+            process is measured, and replaces its reservation. "shared": the readings include the
+            usage once the process is ready for a while, and the reservation ends then. "countable":
+            the readings do not include it, and the reservation lasts as long as the instance. cpu
+            and memory are always attributed, because the slave measures them itself.
     """
 
     name: str
     unit: str
     capacity: float
     scope: str = "machine"
+    accounting: Accounting = "countable"
 
 
 @dataclass(frozen=True, slots=True)
@@ -449,3 +458,14 @@ class HostDescription:
     period: float = 0.1
     executors: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+
+    def accounted(self, accounting: Accounting) -> frozenset[str]:
+        """Return the names of the resources with this accounting."""
+        found = {one.name for one in self.resources if one.accounting == accounting}
+        measured = MOST_USED.keys()
+        return frozenset(found | measured if accounting == "attributed" else found - measured)
+
+
+def is_plausible(resource: str, amount: float) -> bool:
+    """Return True if one process may use this amount of a resource; False also for NaN."""
+    return 0.0 <= amount <= MOST_USED.get(resource, MOST_USED_OF_OTHERS)

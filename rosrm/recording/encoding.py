@@ -177,7 +177,11 @@ def _decoded_readings(content: bytes) -> happened.ReadingsReceived:
 def _encoded_usages(event: happened.UsagesReceived) -> bytes:
     head = _USAGES.pack(event.host_id, event.incarnation, len(event.numbers))
     columns = ((event.numbers, "<u8"), (event.cpu, "<f8"), (event.memory, "<f8"))
-    return head + b"".join(values.astype(kind).tobytes() for values, kind in columns)
+    parts = [values.astype(kind).tobytes() for values, kind in columns]
+    parts += [
+        bytes([slot]) + values.astype("<f8").tobytes() for slot, values in event.others.items()
+    ]
+    return head + b"".join(parts)
 
 
 def _decoded_usages(content: bytes) -> happened.UsagesReceived:
@@ -188,7 +192,13 @@ def _decoded_usages(content: bytes) -> happened.UsagesReceived:
         values = np.frombuffer(content, kind, count, at)
         columns.append(values.astype(values.dtype.newbyteorder("=")))
         at += values.nbytes
-    return happened.UsagesReceived(host_id, incarnation, *columns)
+    others = {}
+    while at < len(content):  # rosrm 0.1.0 wrote cores and bytes alone
+        values = np.frombuffer(content, "<f8", count, at + 1)
+        others[content[at]] = values.astype(values.dtype.newbyteorder("="))
+        at += 1 + values.nbytes
+    numbers, cpu, memory = columns
+    return happened.UsagesReceived(host_id, incarnation, numbers, cpu, memory, others)
 
 
 # --- decisions --------------------------------------------------------------------------------

@@ -45,6 +45,7 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.avoided_labels": 256,
     "StandbyPolicy.apart_by": 256,
     "ProcessStatusBatch.failing": 1000,
+    "ProcessUsage.others": 16,
     "Sealed.body": 1 << 24,
     "Submit_Request.processes": 10_000,
     "List_Response.process_list": 1 << 20,

@@ -292,7 +292,7 @@ class SlaveRuntime:
                 self._cycle(now)
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
-                self._usage.look(now)
+                self._usage.look(now, self._sampler.by_process)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
@@ -361,10 +361,12 @@ class SlaveRuntime:
     def _publish_usage(self) -> None:
         seen = self._usage.after_reading()
         if seen:
+            used = list(seen.values())
             self._endpoint.publish_usage(
                 list(seen),
-                [used.cpu for used in seen.values()],
-                [used.memory for used in seen.values()],
+                [one.cpu for one in used],
+                [one.memory for one in used],
+                {slot: [one.others[slot] for one in used] for slot in used[0].others},
             )
 
     # --- core and supervisor -------------------------------------------------------------

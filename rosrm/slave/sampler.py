@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Final
@@ -35,11 +35,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.errors import PluginError, describe_plugin_fault
-from rosrm.extensions.plugin_calls import given, required
-from rosrm.model.values import ABSURD_USAGE, RESOURCE_SLOTS, Reading
+from rosrm.model.values import EMPTY, MOST_USED, RESOURCE_SLOTS
+from rosrm.slave.probe_reads import UsageByProcess, read_processes, read_values
 
 if TYPE_CHECKING:
-    from rosrm.extensions.contracts import Probe
     from rosrm.extensions.made import MadeProbe
 
 #: A read that takes longer, in seconds, is too slow to share a thread.
@@ -101,12 +100,14 @@ class _Outcome:
 
     Attributes:
         values: in the order of the probe's resources; () after a failure.
+        by_process: usage of single processes, as measured after that.
         reason: of a failure; "" otherwise.
         seconds: duration of the read.
         age: seconds since the read was queued, which can be much longer on a busy machine.
     """
 
     values: tuple[float, ...]
+    by_process: UsageByProcess
     reason: str
     seconds: float
     age: float
@@ -131,6 +132,7 @@ class Sampler:
         self._left: list[_Lane] = []
         self._watched: list[_Watched] = []
         self._usage = [0.0] * RESOURCE_SLOTS
+        self._by_process: dict[int, Mapping[int, float]] = {}
         first = 0
         for made in probes:
             watched = _Watched(made, first, clock, self._progress)
@@ -142,6 +144,11 @@ class Sampler:
     def present(self) -> int:
         """Return a bit mask; bit i: slot i is in use."""
         return (1 << len(self.resources)) - 1
+
+    @property
+    def by_process(self) -> Mapping[int, Mapping[int, float]]:
+        """Return slot to pid to amount, measured for the newest readings, but cpu and memory."""
+        return self._by_process
 
     def latest(self, now: float) -> Sample:
         """Return the newest readings, and queue a read of each probe that is due. Never waits."""
@@ -209,6 +216,9 @@ class Sampler:
         watched.outcome, watched.measured = None, True
         if outcome.values:
             self._usage[watched.slots] = outcome.values
+            for name, amounts in outcome.by_process.items():
+                if name not in MOST_USED:  # the slave measures cpu and memory of sessions itself
+                    self._by_process[watched.slots.start + watched.names.index(name)] = amounts
         late = outcome.age > watched.deadline
         watched.reason = f"answered after {outcome.age:.3g} s" if late else outcome.reason
         self._choose_lane(watched, outcome.seconds)
@@ -303,6 +313,7 @@ class _Watched:
         self.outcome: _Outcome | None = None
         self._started: float | None = None
         self._probe = made.probe
+        self._resources = made.resources
         self._period = made.period
         self._clock = clock
         self._progress = progress
@@ -371,53 +382,18 @@ class _Watched:
         started = self._clock()
         self._started = started
         values: tuple[float, ...] = ()
+        by_process: UsageByProcess = EMPTY
         reason = ""
         try:
-            values = read_values(self._probe, self.names)
+            read = read_values(self._probe, self.names)
+            by_process = read_processes(self._probe, self._resources)
+            values = read
         except PluginError as nonsense:
             reason = str(nonsense)
         except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
             # SystemExit, makes its readings stale and harms nothing else.
             reason = f"read() raised {describe_plugin_fault(error)}"
         ended = self._clock()
-        self.outcome = _Outcome(values, reason, ended - started, ended - self.asked)
+        self.outcome = _Outcome(values, by_process, reason, ended - started, ended - self.asked)
         self.busy = False
         self._progress.set()
-
-
-def read_values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
-    """Return one usage for each resource of a probe, in the order of `names`.
-
-    Raises:
-        PluginError: the answer is not one reading of each resource; the text says why.
-    """
-    values: dict[str, float] = {}
-    answers: object = probe.read()
-    if not isinstance(answers, Iterable):
-        raise PluginError(f"answered {given(answers)}; a list of Readings is required")
-    for answer in answers:
-        reading = required(answer, Reading)
-        if reading.resource not in names:
-            raise PluginError(f"a reading of {reading.resource!r}, which it did not announce")
-        if reading.resource in values:
-            raise PluginError(f"two readings of {reading.resource!r}")
-        usage = _fraction(reading)
-        values[reading.resource] = usage
-    missing = [name for name in names if name not in values]
-    if missing:
-        raise PluginError(f"no reading of {', '.join(missing)}")
-    return tuple(values[name] for name in names)
-
-
-def _fraction(reading: Reading) -> float:
-    """Return the usage of a reading; raise `PluginError` if it is not a valid fraction."""
-    try:
-        usage = float(reading.usage)
-    except (TypeError, ValueError, OverflowError):
-        usage = math.nan
-    if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
-        raise PluginError(
-            f"usage {reading.usage!r} of {reading.resource!r}; a fraction of its capacity is "
-            f"required, 1.0 where it is full and at most {ABSURD_USAGE:g}"
-        )
-    return usage

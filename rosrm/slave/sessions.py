@@ -12,7 +12,7 @@ import contextlib
 import errno
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -32,10 +32,12 @@ class SessionUsage:
     Attributes:
         cpu: cores, mean since the previous walk.
         memory: resident bytes, summed over the processes (shared pages count in each).
+        others: slot of another resource to the amount in its base unit, as probes measure it.
     """
 
     cpu: float
     memory: int
+    others: Mapping[int, float] = field(default_factory=dict)
 
 
 class SessionTable:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
@@ -47,14 +48,32 @@ class UsageWatch:
             self._sessions.add(status.pid)
             self._leaders[status.instance] = status.pid
 
-    def look(self, now: float) -> None:
-        """Measure the usage of each instance, unless the last result is not published yet."""
+    def look(self, now: float, by_process: Mapping[int, Mapping[int, float]]) -> None:
+        """Measure the usage of each instance, unless the last result is not published yet.
+
+        Args:
+            now: monotonic seconds.
+            by_process: slot to pid to amount, as the probes measured it for the last reading.
+        """
         if not self._leaders or self._seen:
             return
         self._sessions.refresh(now)
         usage = self._sessions.usage()
-        self._seen = {one.number: usage[pid] for one, pid in self._leaders.items() if pid in usage}
+        self._seen = {
+            one.number: replace(usage[pid], others=self._others(pid, by_process))
+            for one, pid in self._leaders.items()
+            if pid in usage
+        }
         self._publish_in = _READINGS_FIRST
+
+    def _others(
+        self, leader: int, by_process: Mapping[int, Mapping[int, float]]
+    ) -> dict[int, float]:
+        members = self._sessions.members(leader)
+        return {
+            slot: sum(amounts.get(pid, 0.0) for pid in members)
+            for slot, amounts in by_process.items()
+        }
 
     def after_reading(self) -> Mapping[int, SessionUsage]:
         """Count a published reading; return the usage to publish, by instance number, or {}."""

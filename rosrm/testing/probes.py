@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rosrm.extensions.contracts import Probe, ProbeContext, ProbeOffer
-from rosrm.extensions.made import MadeProbe
+from rosrm.extensions.made import MadeProbe, unmeasured
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.values import EMPTY, Reading, ResourceDescription
-from rosrm.slave.sampler import read_values
+from rosrm.slave.probe_reads import read_processes, read_values
 from rosrm.testing.calls import call, made
 
 
@@ -130,6 +130,8 @@ class ProbeContract:
         """Read the probe as a slave does, within the deadline and with its checks."""
         names = tuple(resource.name for resource in probe.resources)
         call("read", self.offer.deadline, lambda: read_values(probe, names))
+        resources = tuple(probe.resources)
+        call("by_process", self.offer.deadline, lambda: read_processes(probe, resources))
 
     def test_resources_are_well_described(self) -> None:
         """Resources have valid types, unique names of the offer, and capacities above 0."""
@@ -141,6 +143,8 @@ class ProbeContract:
         for resource in resources:
             fault = resource_fault(resource)
             assert not fault, f"the probe {fault}"
+        fault = unmeasured(probe, resources)
+        assert not fault, f"the probe {fault}"
         assert len(set(names)) == len(names), f"two resources of one name: {names}"
         assert set(names) <= set(self.offer.resources), (
             f"ProbeOffer.resources is {self.offer.resources}, and it reads {names}"

@@ -96,7 +96,7 @@ def recording() -> bytes:
         np.array([True]), np.array([0], np.uint32), np.zeros((1, 16)), np.ones((1, 16)),
     )  # fmt: skip
     usages = happened.UsagesReceived(
-        1, 7, np.array([1], np.uint64), np.array([0.5]), np.array([1.0])
+        1, 7, np.array([1], np.uint64), np.array([0.5]), np.array([1.0]), {2: np.array([3.0])}
     )
     parts = [opening(), frame(FrameKind.HEADER, Header("0", "m", {}, 1, 0.0, {}).encoded())]
     request = happened.CancelRequested(1, ("p",), Requester("user:ada"))

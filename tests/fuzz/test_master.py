@@ -101,11 +101,13 @@ def readings(draw: Any) -> happened.ReadingsReceived:
 
 @st.composite
 def usages(draw: Any) -> happened.UsagesReceived:
-    rows = draw(st.lists(st.tuples(numbers, floats, floats), max_size=3))
-    columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], []]
+    rows = draw(st.lists(st.tuples(numbers, floats, floats, floats), max_size=3))
+    columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], [], []]
+    slots = draw(st.sets(st.integers(0, 20), max_size=2))
     return happened.UsagesReceived(
         draw(host_ids), draw(incarnations), np.array(columns[0], np.uint64),
         np.array(columns[1], np.float64), np.array(columns[2], np.float64),
+        {slot: np.array(columns[3], np.float64) for slot in slots},
     )  # fmt: skip
 
 

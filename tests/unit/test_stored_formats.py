@@ -124,8 +124,9 @@ EVENTS: list[tuple[happened.Event, str]] = [
         (
             '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5,'
             '"hostname":"","pid":0,"software_version":"","labels":{"arm":"yes"},"resources":'
-            '[{"name":"cpu","unit":"core","capacity":4.0,"scope":"machine"}],"max_processes":0,'
-            '"period":0.1,"executors":[],"absent":{}},"instances":[],"journal_seen":0,"snapshots":[]}'
+            '[{"name":"cpu","unit":"core","capacity":4.0,"scope":"machine","accounting":"countable"'
+            '}],"max_processes":0,"period":0.1,"executors":[],"absent":{}},"instances":[],'
+            '"journal_seen":0,"snapshots":[]}'
         ),
     ),
 ]
@@ -133,9 +134,14 @@ SNAPSHOTS = (SnapshotReport(InstanceId("a", 7), 3, 9),)
 SNAPSHOTS_TEXT = '[{"instance":{"process":"a","number":7},"sequence":3,"size":9}]'
 RENAMED_EVENTS: list[tuple[happened.Event, str]] = [
     (
-        happened.HostRegistered(1, HostDescription("h", 5), snapshots=SNAPSHOTS),
+        happened.HostRegistered(
+            1,
+            HostDescription("h", 5, resources=(ResourceDescription("disk", "B", 4.0),)),
+            snapshots=SNAPSHOTS,
+        ),
         (
-            '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5},'
+            '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5,'
+            '"resources":[{"name":"disk","unit":"B","capacity":4.0,"scope":"machine"}]},'
             f'"kept":{SNAPSHOTS_TEXT}}}'
         ),
     ),

@@ -139,13 +139,18 @@ class StatusesReceived:
 
 @dataclass(frozen=True, slots=True)
 class UsagesReceived:
-    """Resource usage of each instance of a host: parallel arrays (cores, bytes)."""
+    """Resource usage of each instance of a host: parallel arrays (cores, bytes).
+
+    Attributes:
+        others: slot of another resource to its amounts, in its base unit.
+    """
 
     host_id: int
     incarnation: int
     numbers: npt.NDArray[np.uint64]
     cpu: npt.NDArray[np.float64]
     memory: npt.NDArray[np.float64]
+    others: Mapping[int, npt.NDArray[np.float64]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

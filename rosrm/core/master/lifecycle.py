@@ -8,7 +8,7 @@ from typing import Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
-from rosrm.core.master.assignment.reservations import learn_from
+from rosrm.core.master.assignment.reservations import learn_from, settle_reservation
 from rosrm.core.master.hosts import readoption
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover
@@ -53,6 +53,8 @@ _EVENT: Final = {
 }
 #: Reported states that show that the slave has begun to restart the instance.
 _RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
+#: Reported states in which nothing of the instance runs, and so the readings do not show it.
+_DOWN: Final = frozenset({InstanceState.STARTING, InstanceState.BACKOFF})
 _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
 
 
@@ -109,6 +111,17 @@ def _yet_to_start(state: MasterState, instance: Instance) -> bool:
     )
 
 
+def _note_load(
+    state: MasterState, instance: Instance, before: InstanceState | None, now: float
+) -> None:
+    """Note from when on the readings show the load of an instance, or that they no longer do."""
+    if instance.state is InstanceState.READY and before is not InstanceState.READY:
+        instance.ready_at = now
+    elif instance.state in _DOWN and instance.seen:
+        instance.seen = {}
+        settle_reservation(state, instance, now)
+
+
 def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
     """Apply the status of one instance."""
     instance = state.instances.get(status.instance.number)
@@ -117,8 +130,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
         return
     before = instance.state
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
-    if instance.state is InstanceState.READY and before is not InstanceState.READY:
-        instance.ready_at = now
+    _note_load(state, instance, before, now)
     if status.state.ended:
         _ended(state, instance, status, before, now)
     review_slots(state, host, now)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Literal
 
 from rosrm.model.values import EMPTY
 
@@ -27,6 +27,8 @@ class CoreSettings:
         cooldown: seconds after a migration in which the core does not migrate a process again.
         hysteresis: seconds for which a host must be over a limit before an eviction.
         headroom: fraction by which a destination stays under each of its limits.
+        need: need by which a destination is chosen. "measured": the larger one of the process's
+            need and its measured usage; "declared": its need as at its first placement.
         max_migrations: highest number of migrations in flight.
         automatic: True: the core evicts processes from hosts that are over a limit.
         order_retry: seconds after which an unanswered order is repeated.
@@ -48,6 +50,7 @@ class CoreSettings:
     cooldown: float = 30.0
     hysteresis: float = 2.0
     headroom: float = 0.05
+    need: Literal["measured", "declared"] = "measured"
     max_migrations: int = 2
     automatic: bool = True
     order_retry: float = 2.0

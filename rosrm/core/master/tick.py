@@ -7,7 +7,7 @@ from typing import Final
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
-from rosrm.core.master.assignment.reservations import settle_reservation
+from rosrm.core.master.assignment.reservations import review_reservation
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.commands import Redeliver, Withdraw
 from rosrm.core.master.hosts import capabilities
@@ -61,8 +61,7 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
         _cancel_prefetch(state, instance, now)
     if instance.stopping and now - instance.order_at >= state.settings.order_retry:
         stop_instance(state, instance, now)
-    if not instance.settled and age >= state.settings.settle:
-        settle_reservation(state, instance, now)
+    review_reservation(state, instance, now)
 
 
 def _review_delivery(state: MasterState, instance: Instance, age: float, now: float) -> None:

@@ -112,7 +112,9 @@ class SlaveSubscriptions:
         )  # fmt: skip
 
     def _take_usage(self, message: msg.ProcessUsage) -> None:
+        others = {one.slot: np.asarray(one.amounts, np.float64) for one in message.others}
         sizes = {len(message.numbers), len(message.cpu), len(message.memory)}
+        sizes |= {len(amounts) for amounts in others.values()}
         who = f"process_usage of host {message.host_id}"
         fault = version_refusal(message.protocol_version, who)
         if fault or len(sizes) > 1:
@@ -121,7 +123,7 @@ class SlaveSubscriptions:
         self._handle(
             happened.UsagesReceived(
                 message.host_id, message.incarnation, np.asarray(message.numbers, np.uint64),
-                np.asarray(message.cpu, np.float64), np.asarray(message.memory, np.float64),
+                np.asarray(message.cpu, np.float64), np.asarray(message.memory, np.float64), others,
             )
         )  # fmt: skip
 

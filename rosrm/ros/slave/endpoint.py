@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final
 
@@ -399,9 +399,10 @@ class SlaveEndpoint:
         )  # fmt: skip
 
     def publish_usage(
-        self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int]
-    ) -> None:
-        """Publish each instance's use: cores and bytes, in parallel sequences.
+        self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int],
+        others: Mapping[int, Sequence[float]],
+    ) -> None:  # fmt: skip
+        """Publish each instance's use: cores, bytes, other resources by slot; parallel sequences.
 
         The newest reading is sent first: the master reduces reservations by these usages, so its
         readings must already include that load.
@@ -413,6 +414,10 @@ class SlaveEndpoint:
                     protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                     incarnation=self._description.incarnation, numbers=numbers, cpu=cpu,
                     memory=memory,
+                    others=[
+                        msg.ResourceUsage(slot=slot, amounts=amounts)
+                        for slot, amounts in others.items()
+                    ],
                 )
             )  # fmt: skip
 

@@ -49,8 +49,10 @@ def readings(draw):
 def usages(draw):
     count = draw(st.integers(0, 4))
     numbers = draw(arrays(np.uint64, count))
+    amounts = arrays(np.float64, count)
+    others = draw(st.dictionaries(st.integers(0, RESOURCE_SLOTS - 1), amounts, max_size=2))
     return happened.UsagesReceived(
-        draw(INT), draw(INT), numbers, *(draw(arrays(np.float64, count)) for _ in range(2))
+        draw(INT), draw(INT), numbers, draw(amounts), draw(amounts), others
     )
 
 
@@ -63,6 +65,8 @@ EVENTS = st.one_of(
 
 def same(one, other) -> bool:
     """Return True if both are equal bit by bit: NaN equals NaN, and 0.0 is not -0.0."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, np.ndarray):
         return one.dtype == other.dtype and one.shape == other.shape and (
             one.tobytes() == other.tobytes()

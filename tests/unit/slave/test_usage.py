@@ -30,6 +30,9 @@ class Table:
     def refresh(self, now: float) -> None:
         self.looks += 1
 
+    def members(self, leader: int) -> tuple[int, ...]:
+        return (leader, leader + 1)
+
     def usage(self) -> dict[int, SessionUsage]:
         return {leader: SessionUsage(0.5, 1000 + leader) for leader in self.leaders}
 
@@ -47,17 +50,26 @@ def test_usage_is_reported_three_readings_after_its_measurement(table) -> None:
     """Each usage is reported once, and is not measured again before its report."""
     watch = UsageWatch(table)
     watch.follow(told(InstanceState.RUNNING, 40))
-    watch.look(1.0)
-    watch.look(1.5)
+    watch.look(1.0, {})
+    watch.look(1.5, {})
     said = [watch.after_reading() for _ in range(4)]
     assert said == [{}, {}, {7: SessionUsage(0.5, 1040)}, {}]
     assert table.looks == 1
 
 
+def test_the_usage_of_a_session_is_that_of_its_processes(table) -> None:
+    """A probe measures processes, of which a session may have several."""
+    watch = UsageWatch(table)
+    watch.follow(told(InstanceState.RUNNING, 40))
+    watch.look(1.0, {2: {40: 1.0, 41: 2.0, 50: 4.0}, 3: {}})
+    *_, said = [watch.after_reading() for _ in range(3)]
+    assert said[7].others == {2: 3.0, 3: 0.0}
+
+
 def test_nothing_is_looked_at_while_nothing_runs(table) -> None:
     """An idle host has no overhead."""
     watch = UsageWatch(table)
-    watch.look(1.0)
+    watch.look(1.0, {})
     assert (table.looks, watch.after_reading()) == (0, {})
 
 

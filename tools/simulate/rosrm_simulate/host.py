@@ -24,6 +24,7 @@ from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
 from rosrm.model.values import (
     EMPTY,
+    MOST_USED,
     RESOURCE_SLOTS,
     Assignment,
     HostDescription,
@@ -87,6 +88,7 @@ class Host(ABC, Generic[ProgramT]):
         polled: assignments at the master that wait for the slave's next request.
         status_batches: status batches on their way to the master.
         stale: resources whose readings are too old.
+        measured: resources that are not attributed, whose usage by each program is measured.
         limit: (RESOURCE_SLOTS,) as in its readings.
         newest_pid: of its programs; each start of a program has another one.
     """
@@ -109,6 +111,7 @@ class Host(ABC, Generic[ProgramT]):
     polled: list[Assignment] = field(default_factory=list)
     status_batches: deque[StatusesReceived] = field(default_factory=deque)
     stale: set[str] = field(default_factory=set)
+    measured: frozenset[str] = frozenset()
     sequence: int = 0
     batches: int = 0
     newest_pid: int = 100
@@ -202,9 +205,16 @@ class Host(ABC, Generic[ProgramT]):
         """Return the event with the usage of each instance."""
         used = self.used(now)
         numbers, cpu, memory = zip(*used, strict=True) if used else ((), (), ())
+        amounts = [self.used_by(program, now) for program in self.programs.values()]
+        measured = self.measured | self.description().accounted("attributed") - MOST_USED.keys()
+        others = {
+            slot: np.array([one.get(resource.name, 0.0) for one in amounts])
+            for slot, resource in enumerate(self.resources)
+            if resource.name in measured
+        }
         return UsagesReceived(
             self.host_id, self.incarnation, np.array(numbers, np.uint64),
-            np.array(cpu, np.float64), np.array(memory, np.float64),
+            np.array(cpu, np.float64), np.array(memory, np.float64), others,
         )  # fmt: skip
 
     # --- the slave -------------------------------------------------------------------------

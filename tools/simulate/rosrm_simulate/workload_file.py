@@ -234,7 +234,7 @@ def _host(node: Node, problems: Problems) -> SimulatedHost | None:
             f"leaves ({host.leaves:g} s) must be after joins ({host.joins:g} s)",
         )
     resources = tuple(
-        ResourceDescription(name, unit, getattr(host, name), "simulated")
+        ResourceDescription(name, unit, getattr(host, name), "simulated", "attributed")
         for name, unit in _UNITS.items()
         if getattr(host, name) > 0.0
     )

@@ -65,9 +65,14 @@ def demand_to_move(
         **process.excluded, **unable(state, process, source), **lacking,
         source: "it is the source of the move",
     }  # fmt: skip
-    amounts, guessed = demand_amounts(state, process, seen)
+    amounts, guessed = demand_amounts(state, process, measured_need(state, seen))
     reads = state.declared.reads
     return Demand(process.spec, amounts, guessed, excluded, headroom, reads=reads)
+
+
+def measured_need(state: MasterState, seen: Mapping[str, float]) -> Mapping[str, float]:
+    """Return the measured usage that counts at the destination of a move: all of it, or none."""
+    return seen if state.settings.need == "measured" else EMPTY
 
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:

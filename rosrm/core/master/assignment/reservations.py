@@ -9,28 +9,45 @@ import numpy as np
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import Instance
 from rosrm.model.records import Intent
-from rosrm.model.values import MOST_USED, InstanceState, InstanceStatus, ProcessSpec
+from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec, is_plausible
 
 #: Shortest run, in seconds, that shows the CPU use of a program; before, start-up dominates.
 _TELLING_RUN: Final = 1.0
 
 
+def review_reservation(state: MasterState, instance: Instance, now: float) -> None:
+    """Settle the reservation of an instance if a part of it has ended, or counts again."""
+    settle = state.settings.settle
+    settles = not instance.settled and now - instance.since >= settle
+    if settles or instance.shown is not _is_shown(instance, now, settle):
+        settle_reservation(state, instance, now)
+
+
 def settle_reservation(state: MasterState, instance: Instance, now: float) -> None:
     """Lower the reservation of an instance to the part that the readings do not show yet."""
-    table = state.hosts
+    table, host = state.hosts, instance.host
     instance.settled = now - instance.since >= state.settings.settle
+    instance.shown = _is_shown(instance, now, state.settings.settle)
+    ended = instance.estimated if instance.settled else frozenset()
+    if instance.shown:
+        ended |= host.shared
     left = {}
     for resource, amount in instance.demand.items():
-        hidden = amount - instance.seen.get(resource, 0.0)
-        if hidden > 0.0 and not (instance.settled and resource in instance.estimated):
-            left[resource] = hidden
-    fractions = table.fractions_of(instance.host, left, instance.estimated)
+        shown = instance.seen.get(resource, 0.0) if resource in host.attributed else 0.0
+        if amount > shown and resource not in ended:
+            left[resource] = amount - shown
+    fractions = table.fractions_of(host, left, instance.estimated)
     reserved = np.where(fractions < np.inf, fractions, 0.0)
     change = reserved.copy()
     change[: len(instance.reserved)] -= instance.reserved
     if np.any(change):
         instance.reserved = reserved
-        table.add_reservation(instance.host, change)
+        table.add_reservation(host, change)
+
+
+def _is_shown(instance: Instance, now: float, settle: float) -> bool:
+    """Return True if the readings show the load of an instance: it is ready for `settle`."""
+    return instance.state is InstanceState.READY and now - instance.ready_at >= settle
 
 
 def learn_from(
@@ -40,11 +57,11 @@ def learn_from(
     if status.state is InstanceState.REFUSED:
         return
     cpu = status.cpu_time / status.run_time if status.run_time >= _TELLING_RUN else 0.0
-    peaks = {
+    peaks = instance.peak | {
         "memory": max(status.peak_memory, instance.peak.get("memory", 0.0)),
         "cpu": max(cpu, instance.peak.get("cpu", 0.0)),
     }
-    plausible = {name: used for name, used in peaks.items() if used <= MOST_USED[name]}
+    plausible = {name: used for name, used in peaks.items() if is_plausible(name, used)}
     counts = state.learned.learn(spec.program, plausible)
     if counts is not None:
         state.emit(Intent("learned", spec.program, counts))

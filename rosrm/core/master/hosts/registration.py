@@ -21,13 +21,13 @@ from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
-from rosrm.core.master.state.process import DesiredState, ProcessPhase
+from rosrm.core.master.state.process import DesiredState, Instance, ProcessPhase
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import ReportInstances
 from rosrm.model.plan import Execute
 from rosrm.model.records import Intent
-from rosrm.model.values import MOST_USED, HostDescription, InstanceStatus
+from rosrm.model.values import HostDescription, InstanceStatus, is_plausible
 from rosrm.wording import counted, listed
 
 #: Seconds after its `leave` for which readings that a slave sent before may arrive.
@@ -275,18 +275,32 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         return
-    for number, cpu, memory in zip(event.numbers, event.cpu, event.memory, strict=True):
-        instance = state.instances.get(int(number))
-        if instance is None or instance.host is not host:
-            continue
-        if not (0.0 <= cpu <= MOST_USED["cpu"] and 0.0 <= memory <= MOST_USED["memory"]):
-            fault = f"a usage of {instance.id} was refused (NaN, negative or absurd)"
+    columns = {"cpu": event.cpu, "memory": event.memory}
+    resources = host.description.resources
+    for slot, amounts in event.others.items():
+        if slot >= len(resources) or resources[slot].name in columns:
+            fault = f"usages of {host.name} were refused: slot {slot} is not of another resource"
             state.record_seldom(host, EventKind.READING_REFUSED, now, fault)
-            continue
-        instance.seen = {"cpu": float(cpu), "memory": float(memory)}
-        for resource, amount in instance.seen.items():
+            return
+        columns[resources[slot].name] = amounts
+    for number, *used in zip(event.numbers, *columns.values(), strict=True):
+        instance = state.instances.get(int(number))
+        if instance is not None and instance.host is host:
+            _take_usage(state, instance, dict(zip(columns, map(float, used), strict=True)), now)
+
+
+def _take_usage(state: MasterState, instance: Instance, used: dict[str, float], now: float) -> None:
+    """Take the usage of an instance, in base units by resource."""
+    host = instance.host
+    if not all(is_plausible(resource, amount) for resource, amount in used.items()):
+        fault = f"a usage of {instance.id} was refused (NaN, negative or absurd)"
+        state.record_seldom(host, EventKind.READING_REFUSED, now, fault)
+        return
+    instance.seen = used
+    for resource, amount in used.items():
+        if resource in host.attributed:
             instance.peak[resource] = max(amount, instance.peak.get(resource, 0.0))
-        settle_reservation(state, instance, now)
+    settle_reservation(state, instance, now)
 
 
 def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:

@@ -12,7 +12,12 @@ from collections.abc import Iterable
 from math import inf
 from typing import Final
 
-from rosrm.core.master.assignment.assign import demand_amounts, demand_to_move, ranking_of
+from rosrm.core.master.assignment.assign import (
+    demand_amounts,
+    demand_to_move,
+    measured_need,
+    ranking_of,
+)
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.start import (
@@ -39,6 +44,7 @@ from rosrm.wording import counted, few, listed
 _RECORD_PERIOD: Final = 10.0
 #: Highest number of reasons against hosts in one answer.
 _MOST_REASONS: Final = 3
+_UNMEASURED: Final = "and its use by single processes is not measured"
 _ALONE: Final = "there is no other host"
 
 
@@ -107,8 +113,12 @@ def _evict(state: MasterState, host: Host, now: float) -> None:
 
 def _evict_for_resource(state: MasterState, host: Host, resource: str, now: float) -> bool:
     """Begin to move one process; return False, and record why, if none can leave."""
-    reasons = []
-    for instance in _largest_first(state, host, resource):
+    reasons, largest = [], _largest_first(state, host, resource)
+    if largest and not any(_accounts_for(instance, resource) for instance in largest):
+        # Without their names, because each new process would cause another record.
+        reasons = [("", f"no process on it declares a need of {resource}, {_UNMEASURED}")]
+        largest = []
+    for instance in largest:
         process = state.processes[instance.id.process]
         reason = _why_not_now(state, process, instance, resource, now)
         if not reason:
@@ -130,6 +140,12 @@ def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instan
     return sorted(owned, key=lambda one: (-_usage_to_free(one, resource), one.id.number))
 
 
+def _accounts_for(instance: Instance, resource: str) -> bool:
+    """Return True if the usage of an instance is measured, or its need is known."""
+    is_measured = resource in instance.seen or resource in instance.host.attributed
+    return is_measured or resource in instance.demand
+
+
 def _usage_to_free(instance: Instance, resource: str) -> float:
     """Return the usage, in base units of the resource, that moving an instance frees."""
     return instance.seen.get(resource, instance.demand.get(resource, 0.0))
@@ -142,6 +158,8 @@ def _why_not_now(
     if refusal:
         return refusal
     if _usage_to_free(instance, resource) <= 0.0:
+        if not _accounts_for(instance, resource):
+            return f"{process.name} declares no need of {resource}, {_UNMEASURED}"
         return f"{process.name} uses no {resource}"
     since_move, cooldown = now - process.moved_at, state.settings.cooldown
     if since_move < cooldown:
@@ -274,7 +292,8 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
     # Only labels, resources and exclusions count here. A missing capability, or a lost host, may
     # change later.
     lasting = {**process.excluded, source.name: "it is there"}
-    amounts, estimated = demand_amounts(state, process, instance.measured)
+    measured = measured_need(state, instance.measured)
+    amounts, estimated = demand_amounts(state, process, measured)
     possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
     if any(possible[host.column] for host in state.hosts.listed() if host is not source):
         return ""

@@ -63,6 +63,7 @@ class Host:
 
     Attributes:
         column: column of this host in the arrays of `HostTable`.
+        attributed, shared: resources with this accounting on the host.
         instances: numbers of the instances that run on the host or are assigned to it.
         over_since: resource name to the time since when the host is over this limit.
         over_at: resource name to the time of the last reading over the limit, from the record
@@ -84,6 +85,8 @@ class Host:
     draining: bool = False
     drained: bool = False
     pruned: bool = False
+    attributed: frozenset[str] = frozenset()
+    shared: frozenset[str] = frozenset()
     instances: set[int] = field(default_factory=set)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
@@ -142,6 +145,8 @@ class HostTable(HostColumns):
         host = self.by_name.get(description.name) or self.expect(description.name)
         column = host.column
         host.description, host.pruned = description, False
+        host.attributed = description.accounted("attributed")
+        host.shared = description.accounted("shared")
         self._listed = None
         host.over_since.clear()
         host.over_at.clear()

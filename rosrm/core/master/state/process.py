@@ -64,10 +64,11 @@ class Instance:
         estimated: resources whose amount is an estimate and stops counting after `settle`.
         reserved: (R',) reservation on its host, fractions.
         state: state that the slave has reported last; None: assigned, without a report yet.
-        seen: newest usage in base units.
+        seen: newest usage in base units; also of resources that are not attributed, if measured.
         peak: highest usage in base units.
         restarting: the slave was ordered to restart it, and no report shows the restart yet.
         settled: its estimates no longer count.
+        shown: the readings show its load of shared resources, which no longer counts.
         redelivered: the assignment was delivered again, because its slave did not accept it.
         recalled: a former run of the master may have ordered it to stop, so its end counts as
             ordered.
@@ -91,6 +92,7 @@ class Instance:
     stopping: bool = False
     restarting: bool = False
     settled: bool = False
+    shown: bool = False
     redelivered: bool = False
     recalled: bool = False
     at_once: bool = False
@@ -105,9 +107,10 @@ class Instance:
 
     @property
     def measured(self) -> dict[str, float]:
-        """Return the newest usage, in base units, of the resources that its host measures."""
+        """Return its newest usage, in base units, of the attributed resources that are probed."""
         probed = {resource.name for resource in self.host.description.resources}
-        return {name: amount for name, amount in self.seen.items() if name in probed}
+        counted = probed & self.host.attributed
+        return {name: amount for name, amount in self.seen.items() if name in counted}
 
 
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
