@@ -52,7 +52,7 @@ def create(options: CpuOptions, context: ProbeContext) -> GaugeProbe:
         gauge = SliceCpu(budget(context, "cpu", "cores"), context.sessions, options.window)
     elif scope == "cgroup":
         gauge = CgroupCpu.find(options.window, path=options.group)
-    return GaugeProbe("cpu", "core", gauge or MachineCpu(options.window))
+    return GaugeProbe("cpu", "core", gauge or MachineCpu(options.window), "attributed")
 
 
 def machine_cores(proc: Path = Path("/proc")) -> float:

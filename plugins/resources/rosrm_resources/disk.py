@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
 from annotated_types import Gt
 
-from rosrm import ProbeContext
-from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget
+from rosrm import ProbeContext, Sessions
+from rosrm_resources.gauge import GaugeProbe, Scope, budget
 
 #: Largest fraction of the time that walks through the directory may take.
 _WALK_SHARE: Final = 0.01
+#: Share of a file system that a process has written before it can be the one that fills the disk.
+_MUCH: Final = 0.01
 #: Bytes of a unit of `st_blocks`, independent of the block size of the file system.
 _BLOCK: Final = 512
 
@@ -39,12 +41,28 @@ class DiskOptions:
 def create(options: DiskOptions, context: ProbeContext) -> GaugeProbe:
     """Create the probe for the configured scope."""
     path = Path(options.path) if options.path is not None else context.data_directory
-    gauge: Gauge
     if (options.scope or context.scope) == "slice" and "disk" in context.budget:
-        gauge = DirectoryTree(path, budget(context, "disk", "bytes"), options.walk_period)
-    else:
-        gauge = FileSystem(path)
-    return GaugeProbe("disk", "B", gauge)
+        tree = DirectoryTree(path, budget(context, "disk", "bytes"), options.walk_period)
+        # Only the slave writes there, so the usage of processes is not in the readings.
+        return GaugeProbe("disk", "B", tree, "countable")
+    system = FileSystem(path)
+    return DiskProbe(system, DiskWriters(system.path, _MUCH * system.capacity, context.sessions))
+
+
+class DiskProbe(GaugeProbe):
+    """Probe of a file system and of the processes that fill it.
+
+    The resource is shared, because the written bytes are no measure of the room that a process
+    takes: it may overwrite or delete them. They show who fills the disk, for eviction.
+    """
+
+    def __init__(self, gauge: FileSystem, writers: DiskWriters) -> None:
+        super().__init__("disk", "B", gauge, "shared")
+        self._writers = writers
+
+    def by_process(self) -> Mapping[str, Mapping[int, float]]:
+        """Return the bytes that each large writer has written."""
+        return {"disk": self._writers.written()}
 
 
 class FileSystem:
@@ -62,6 +80,7 @@ class FileSystem:
         path = path.absolute()
         while not path.exists():
             path = path.parent
+        self.path: Final = path
         self._path = str(path)
         used, free = self._bytes()
         self.capacity: Final = float(max(1, used + free))
@@ -81,6 +100,90 @@ class FileSystem:
             (status.f_blocks - status.f_bfree) * status.f_frsize,
             status.f_bavail * status.f_frsize,
         )
+
+
+class DiskWriters:
+    """Bytes that processes have written, of those that write to a file system.
+
+    The kernel counts the bytes of a process (`/proc/PID/io`) over all its disks, with those of its
+    ended children. So a process counts only once it had a file of this file system open for
+    writing, which is looked up only for processes that have written much.
+
+    Args:
+        path: a file or directory of the file system.
+        least: bytes that a process must have written.
+        sessions: the processes that count.
+    """
+
+    def __init__(self, path: Path, least: float, sessions: Sessions) -> None:
+        self._least = least
+        self._sessions = sessions
+        self._device = device_of(path)
+        self._writers: set[int] = set()
+
+    def written(self) -> dict[int, float]:
+        """Return the bytes written by each process that has written much, by pid."""
+        pids = self._sessions.pids()
+        self._writers.intersection_update(pids)
+        written = {}
+        for pid in pids:
+            amount = written_bytes(pid)
+            if amount >= self._least and self._writes_here(pid):
+                written[pid] = amount
+        return written
+
+    def _writes_here(self, pid: int) -> bool:
+        if pid not in self._writers and writes_to(pid, self._device):
+            self._writers.add(pid)
+        return pid in self._writers
+
+
+def device_of(path: Path) -> str:
+    """Return the device number of the mount that holds a file, as mountinfo writes it."""
+    descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    try:
+        mount = _fields(f"/proc/self/fdinfo/{descriptor}")["mnt_id"]
+        return _devices("self").get(mount, "")
+    finally:
+        os.close(descriptor)
+
+
+def written_bytes(pid: int) -> float:
+    """Return the bytes that a process has written to disks; 0 if that is not known."""
+    try:
+        fields = _fields(f"/proc/{pid}/io")
+        return max(0.0, float(fields["write_bytes"]) - float(fields["cancelled_write_bytes"]))
+    except (OSError, KeyError):  # it has ended, or is of another user
+        return 0.0
+
+
+def writes_to(pid: int, device: str) -> bool:
+    """Return True if a process has a file on a device open for writing."""
+    try:
+        devices = _devices(pid)
+        for descriptor in os.listdir(f"/proc/{pid}/fdinfo"):  # noqa: PTH208 - no Path for each
+            fields = _fields(f"/proc/{pid}/fdinfo/{descriptor}")
+            writes = int(fields["flags"], 8) & os.O_ACCMODE != os.O_RDONLY
+            if writes and devices.get(fields["mnt_id"]) == device:
+                return True
+    except (OSError, KeyError):  # it, or its file, is gone since
+        return False
+    return False
+
+
+def _fields(path: str) -> dict[str, str]:
+    """Return the fields of a file with a line `name: value` for each."""
+    text = Path(path).read_text(encoding="ascii", errors="replace")
+    return {
+        name: value.strip()
+        for name, _, value in (line.partition(":") for line in text.splitlines())
+    }
+
+
+def _devices(pid: int | str) -> dict[str, str]:
+    """Return mount id to device number of the mounts that a process sees."""
+    lines = Path(f"/proc/{pid}/mountinfo").read_text(errors="replace").splitlines()
+    return {fields[0]: fields[2] for fields in (line.split(" ", 3) for line in lines)}
 
 
 class DirectoryTree:

@@ -11,6 +11,8 @@ from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription
 #: the slave's own process tree against a budget.
 Scope = Literal["machine", "cgroup", "slice"]
 
+Accounting = Literal["attributed", "shared", "countable"]
+
 #: Largest reported usage. A small budget can be exceeded a hundredfold, and a larger number would
 #: add no information.
 OVERFULL: Final = 10.0
@@ -41,12 +43,15 @@ class GaugeProbe:
         name: of the resource.
         unit: base unit of the capacity.
         gauge: measures the resource.
+        accounting: of the resource.
     """
 
-    def __init__(self, name: str, unit: str, gauge: Gauge) -> None:
+    def __init__(self, name: str, unit: str, gauge: Gauge, accounting: Accounting) -> None:
         self._name = name
         self._gauge = gauge
-        self._resources = (ResourceDescription(name, unit, gauge.capacity, gauge.scope),)
+        self._resources = (
+            ResourceDescription(name, unit, gauge.capacity, gauge.scope, accounting),
+        )
 
     @property
     def resources(self) -> Sequence[ResourceDescription]:

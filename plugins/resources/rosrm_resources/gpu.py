@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Ge
 
 from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription, SkipPlugin
+from rosrm_resources.gauge import Accounting
 
 _LIBRARY: Final = "libnvidia-ml.so.1"
+#: Inode of the first pid namespace (`PROC_PID_INIT_INO` of the kernel).
+_FIRST_PID_NAMESPACE: Final = 0xEFFFFFFC
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ def create(options: GpuOptions, _context: ProbeContext) -> GpuProbe:
     """
     nvml = load_nvml()
     try:
-        return GpuProbe(options, nvml)
+        return GpuProbe(options, nvml, same_pids=_sees_all_pids())
     except BaseException:  # any error: without a probe nothing else closes the driver
         nvml.nvmlShutdown()
         raise
@@ -70,22 +74,28 @@ class GpuProbe:
     Args:
         options: selects the GPUs and combines them into one reading.
         nvml: the module `pynvml`, initialised; the probe shuts it down.
+        same_pids: True if the driver reports processes by the pids that this process sees.
     """
 
-    def __init__(self, options: GpuOptions, nvml: Any) -> None:
+    def __init__(self, options: GpuOptions, nvml: Any, *, same_pids: bool = True) -> None:
         self._nvml = nvml
         self._combine: Callable[[list[float]], float] = max if options.combine == "max" else fmean
+        self._combine_amounts: Callable[[list[float]], float] = (
+            max if options.combine == "max" else sum
+        )
         self._handles = _handles(nvml, options.devices)
-        self._usages: list[tuple[str, Callable[[Any], float]]] = []
+        self._reads: dict[str, Callable[[Any], float]] = {}
         self._resources: list[ResourceDescription] = []
         # A GPU in MIG mode reports no utilisation, and one that is part of a SoC reports no memory.
+        self._measures = same_pids and self._can(self._memory_by_process)
         if self._can(self._busy):
             count = 1.0 if options.combine == "max" else float(len(self._handles))
-            self._offer("gpu", "1", count, self._busy)
+            self._offer("gpu", "1", count, "shared", self._busy)
         if self._can(self._memory):
             sizes = [float(nvml.nvmlDeviceGetMemoryInfo(handle).total) for handle in self._handles]
             size = min(sizes) if options.combine == "max" else sum(sizes)
-            self._offer("gpu_memory", "B", size, self._memory)
+            accounting: Accounting = "attributed" if self._measures else "shared"
+            self._offer("gpu_memory", "B", size, accounting, self._memory)
         if not self._resources:
             raise SkipPlugin("the NVIDIA GPU tells neither its utilisation nor its memory")
 
@@ -98,18 +108,33 @@ class GpuProbe:
         """Return the utilisation over the driver's last sampling period, and the memory in use."""
         return [
             Reading(name, self._combine([usage(handle) for handle in self._handles]))
-            for name, usage in self._usages
+            for name, usage in self._reads.items()
         ]
+
+    def by_process(self) -> Mapping[str, Mapping[int, float]]:
+        """Return the bytes of GPU memory of each process, as far as the driver reports them."""
+        if "gpu_memory" not in self._reads or not self._measures:
+            return {}
+        amounts = [self._memory_by_process(handle) for handle in self._handles]
+        pids = {pid for used in amounts for pid in used}
+        return {
+            "gpu_memory": {
+                pid: self._combine_amounts([used.get(pid, 0.0) for used in amounts]) for pid in pids
+            }
+        }
 
     def close(self) -> None:
         """Shut down the connection to the driver."""
         self._nvml.nvmlShutdown()
 
-    def _offer(self, name: str, unit: str, capacity: float, usage: Callable[[Any], float]) -> None:
-        self._resources.append(ResourceDescription(name, unit, capacity, "machine"))
-        self._usages.append((name, usage))
+    def _offer(
+        self, name: str, unit: str, capacity: float, accounting: Accounting,
+        usage: Callable[[Any], float],
+    ) -> None:  # fmt: skip
+        self._resources.append(ResourceDescription(name, unit, capacity, "machine", accounting))
+        self._reads[name] = usage
 
-    def _can(self, usage: Callable[[Any], float]) -> bool:
+    def _can(self, usage: Callable[[Any], object]) -> bool:
         try:
             for handle in self._handles:
                 usage(handle)
@@ -123,6 +148,23 @@ class GpuProbe:
     def _memory(self, handle: Any) -> float:
         memory = self._nvml.nvmlDeviceGetMemoryInfo(handle)
         return float(memory.used) / float(memory.total)
+
+    def _memory_by_process(self, handle: Any) -> dict[int, float]:
+        """Return the bytes of each process on one GPU; a process may compute and draw at once."""
+        used: dict[int, float] = {}
+        for running in (
+            self._nvml.nvmlDeviceGetComputeRunningProcesses(handle),
+            self._nvml.nvmlDeviceGetGraphicsRunningProcesses(handle),
+        ):
+            for one in running:
+                # None: the driver does not tell, as under WSL.
+                used[one.pid] = max(used.get(one.pid, 0.0), float(one.usedGpuMemory or 0))
+        return used
+
+
+def _sees_all_pids() -> bool:
+    """Return True if this process is in the first pid namespace, whose pids the driver reports."""
+    return Path("/proc/self/ns/pid").stat().st_ino == _FIRST_PID_NAMESPACE
 
 
 def _handles(nvml: Any, devices: Sequence[int]) -> list[Any]:

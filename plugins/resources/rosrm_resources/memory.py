@@ -41,7 +41,7 @@ def create(options: MemoryOptions, context: ProbeContext) -> GaugeProbe:
         gauge = SliceMemory(budget(context, "memory", "bytes"), context.sessions)
     elif scope == "cgroup":
         gauge = CgroupMemory.find(path=options.group)
-    return GaugeProbe("memory", "B", gauge or MachineMemory())
+    return GaugeProbe("memory", "B", gauge or MachineMemory(), "attributed")
 
 
 class MachineMemory:

@@ -60,7 +60,8 @@ class NetworkProbe:
         window: float,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._resources = (ResourceDescription("network", "B/s", min(links.values()), "machine"),)
+        slowest = min(links.values())
+        self._resources = (ResourceDescription("network", "B/s", slowest, "machine", "shared"),)
         self._links = links
         self._clock = clock
         now, counters = clock(), _counters()

@@ -4,6 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from functools import partial
@@ -16,15 +17,25 @@ import rosrm_resources.plugin
 from rosrm.extensions.registry import Registry
 from rosrm.slave.sampler import Sampler
 from rosrm.slave.sessions import SessionTable
-from rosrm.testing import probe_context
+from rosrm.testing import FakeSessions, probe_context
 from rosrm_resources.cgroups import find_group
 from rosrm_resources.cpu import CgroupCpu, GroupTime, MachineCpu, SliceCpu
+from rosrm_resources.disk import DiskWriters
 from rosrm_resources.memory import CgroupMemory, SliceMemory
 from rosrm_resources.plugin import register_probes
 from tests.waiting import wait_until
 
 BURN = "while True: pass"
 HOLD = "import sys; block = bytearray(int(sys.argv[1])); print('ready', flush=True); input()"
+WRITE = """
+import os, sys
+with open(sys.argv[1], "wb") as file:
+    file.write(bytes(int(sys.argv[2])))
+    file.flush()
+    os.fsync(file.fileno())
+    print("ready", flush=True)
+    input()
+"""
 MIB = 2**20
 
 
@@ -114,6 +125,27 @@ def test_slice_memory_is_what_the_processes_hold(start):
         sessions.add(start(HOLD, str(size * MIB), ready=True).pid)
     assert gauge.usage() == pytest.approx(3 * own + 0.080, abs=0.005)
     gauge.close()
+
+
+def test_writers_of_a_disk_are_found(start, tmp_path):
+    """A process counts with what it has written if it writes much, and to this file system."""
+    if Path("/dev/shm").stat().st_dev == tmp_path.stat().st_dev or not on_a_disk(tmp_path):
+        pytest.skip("the temporary directory is in memory, where the kernel counts no bytes")
+    large = start(WRITE, str(tmp_path / "large"), str(20 * MIB), ready=True)
+    small = start(WRITE, str(tmp_path / "small"), str(MIB), ready=True)
+    with tempfile.NamedTemporaryFile(dir="/dev/shm") as elsewhere:
+        away = start(WRITE, elsewhere.name, str(20 * MIB), ready=True)
+        pids = (large.pid, small.pid, away.pid, os.getpid())
+        written = DiskWriters(tmp_path, 10.0 * MIB, FakeSessions(pids)).written()
+    assert written == {large.pid: pytest.approx(20 * MIB, rel=0.1)}
+
+
+def on_a_disk(path):
+    """Return True if the kernel counts bytes that this process writes there."""
+    before = psutil.Process().io_counters().write_bytes
+    file = path / "probe"
+    file.write_bytes(bytes(MIB))
+    return psutil.Process().io_counters().write_bytes > before
 
 
 def test_sessions_find_the_children(start):

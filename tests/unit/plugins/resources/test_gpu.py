@@ -22,6 +22,8 @@ class FakeNvml:
 
     def __init__(self, *devices):
         self.devices = devices
+        self.computing = [{} for _ in devices]
+        self.drawing = [{} for _ in devices]
         self.shut_down = 0
 
     def nvmlInit(self):  # noqa: N802 - the driver's name
@@ -42,6 +44,16 @@ class FakeNvml:
     def nvmlDeviceGetMemoryInfo(self, handle):  # noqa: N802
         _, used, total = self.devices[handle]
         return SimpleNamespace(used=self._told(used), total=total)
+
+    def nvmlDeviceGetComputeRunningProcesses(self, handle):  # noqa: N802
+        return self._running(self.computing[handle])
+
+    def nvmlDeviceGetGraphicsRunningProcesses(self, handle):  # noqa: N802
+        return self._running(self.drawing[handle])
+
+    def _running(self, memory_of_pid):
+        memory = self._told(memory_of_pid)
+        return [SimpleNamespace(pid=pid, usedGpuMemory=used) for pid, used in memory.items()]
 
     def _told(self, value):
         if value is None:
@@ -75,6 +87,29 @@ def test_capacity_and_usage(options, devices, capacity, usage):
     probe = GpuProbe(options, nvml)
     assert capacities(probe) == {"gpu": capacity[0], "gpu_memory": capacity[1] * GIB}
     assert readings(probe) == pytest.approx({"gpu": usage[0], "gpu_memory": usage[1]})
+
+
+@pytest.mark.parametrize(("combine", "expected"), [("max", 3 * GIB), ("mean", 5 * GIB)])
+def test_gpu_memory_of_processes(combine, expected):
+    """A process that computes and draws, on two GPUs, counts as one; the resource is attributed."""
+    nvml = FakeNvml((0, 0, 8 * GIB), (0, 0, 8 * GIB))
+    nvml.computing = [{7: 2 * GIB, 8: None}, {7: 3 * GIB}]
+    nvml.drawing[0] = {7: 2 * GIB}
+    probe = GpuProbe(GpuOptions(combine=combine), nvml)
+    assert [one.accounting for one in probe.resources] == ["shared", "attributed"]
+    assert probe.by_process() == {"gpu_memory": {7: expected, 8: 0.0}}
+
+
+@pytest.mark.parametrize("cause", ["the driver does not tell", "pids of another namespace"])
+def test_gpu_memory_is_shared_where_processes_cannot_be_told_apart(cause):
+    """As on a Jetson, or in a container."""
+    nvml = FakeNvml((0, 0, 8 * GIB))
+    seen = cause.startswith("pids")
+    if not seen:
+        nvml.computing = [None]
+    probe = GpuProbe(GpuOptions(), nvml, same_pids=not seen)
+    assert [one.accounting for one in probe.resources] == ["shared", "shared"]
+    assert probe.by_process() == {}
 
 
 def test_unknown_device_is_refused():
