@@ -520,7 +520,8 @@ def test_a_part_that_did_not_change_goes_on_from_successor_to_successor(stage):
     stage.remove(first)
     conductor = Conductor(stage, source=2, destination=3)
     conductor.say(C.SHADOW)
-    stage.spin_until(lambda: second._rosrm._source._channel, "the channel of the second handoff")
+    node = second._rosrm  # it is no source before its own handoff has ended
+    stage.spin_until(lambda: node._source and node._source._channel, "the second channel")
     third = stage.instance(Mapper, 3, alias="counter_18", shadow=True)
     conductor.hand_over()
     assert (second.map, third.map) == ("drawn", "drawn")
