@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from rosrm.core.slave.events import LookedAt
@@ -39,17 +39,25 @@ class HealthWatch:
         self._node: Any = None
         self._monitors: dict[tuple[InstanceId, int], HealthMonitor] = {}
 
-    def look(self, watched: Mapping[InstanceId, HeldInstance], now: float) -> Iterator[LookedAt]:
-        """Yield the result of one check of each watched instance."""
+    def look(self, watched: Mapping[InstanceId, HeldInstance], now: float) -> list[LookedAt]:
+        """Return the result of one check of each watched instance; a check that fails has none."""
         self.watches = bool(watched)
         runs = {(instance, held.status.pid) for instance, held in watched.items()}
         for run in [run for run in self._monitors if run not in runs]:
             self._monitors.pop(run).close()
+        results: list[LookedAt] = []
         for instance, held in watched.items():
-            watch = held.watched
-            if watch is not None and not self._launchers.has_departed(held.status.pid):
-                look = self._look(instance, held.status.pid, watch, now)
-                yield LookedAt(instance, held.status.pid, look)
+            self._participant.guard.call(self._check, instance, held, now, results.append)
+        return results
+
+    def _check(
+        self, instance: InstanceId, held: HeldInstance, now: float,
+        result: Callable[[LookedAt], None],
+    ) -> None:  # fmt: skip
+        watch = held.watched
+        if watch is not None and not self._launchers.has_departed(held.status.pid):
+            look = self._look(instance, held.status.pid, watch, now)
+            result(LookedAt(instance, held.status.pid, look))
 
     def _look(self, instance: InstanceId, pid: int, watch: Watch, now: float) -> Observation:
         stat = read_stat(self._launchers.root(pid))

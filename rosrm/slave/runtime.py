@@ -284,6 +284,7 @@ class SlaveRuntime:
 
     def _serve(self, condition: Callable[[], bool]) -> None:
         now = time.monotonic()
+        guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
         next_sample = next_usage = next_graph = next_health = now
         logged_at = now - _LOG_PERIOD
         while condition():
@@ -292,15 +293,15 @@ class SlaveRuntime:
                 self._cycle(now)
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
-                self._usage.look(now, self._sampler.by_process)
+                guard.call(self._usage.look, now, self._sampler.by_process)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
-                self._starter.look_at_graph(awaited)
+                guard.call(self._starter.look_at_graph, awaited)
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
-                self._events.extend(self._health.look(self._state.watched(), now))
+                guard.call(self._look_at_health, now)
             searches = self._endpoint.link is MasterLink.SEARCHING and not self._ending.has_begun
             if searches and now - logged_at >= _LOG_PERIOD:
                 logged_at = now
@@ -313,6 +314,9 @@ class SlaveRuntime:
             self._work(now)
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
+
+    def _look_at_health(self, now: float) -> None:
+        self._events.extend(self._health.look(self._state.watched(), now))
 
     def _stop(self, number: int, _frame: Any) -> None:
         if self._stopping:  # the handler may interrupt a log call: the loop logs instead

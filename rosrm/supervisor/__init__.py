@@ -6,6 +6,7 @@
     endpoint.py           both ends of the socket, and one supervisor for one host
     connection.py         the supervisor's side of a connection, with send_buffer.py
     spawn.py              spawning of one process
+    descriptors.py        limit of open descriptors
     process_tree.py       process trees of the instances: signals, reaping
     procfs.py             lookup in /proc of the processes of an instance
     instance_record.py    the record that survives the supervisor's own death: instances.jsonl

@@ -19,7 +19,7 @@ def main() -> None:
 
     # ruff: noqa: PLC0415 - these can be imported only now
     from rosrm.runtime import oom_score
-    from rosrm.supervisor import endpoint
+    from rosrm.supervisor import descriptors, endpoint
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server
 
@@ -29,7 +29,8 @@ def main() -> None:
         listener = endpoint.listen(state)
     except endpoint.EndpointError as error:
         sys.exit(f"{error}")
-    server = Server(state, listener, LogLimits(*(int(limit) for limit in limits)))
+    log_limits = LogLimits(*(int(limit) for limit in limits))
+    server = Server(state, listener, log_limits, files=descriptors.raise_limit())
     endpoint.let_go_of_terminal(state)
     server.run()
 

@@ -3,7 +3,7 @@
 The supervisor is a subreaper: a process whose parent ends becomes its child. So the last process of
 an instance always dies as the supervisor's child, and SIGCHLD reports it. An exception follows a
 take-over (an earlier supervisor was killed): the processes are not children of the new supervisor,
-which detects their end by a pidfd.
+which detects their end by a pidfd, or by looking at /proc once a second if no descriptor is left.
 """
 
 from __future__ import annotations
@@ -12,12 +12,18 @@ import os
 import selectors
 import signal
 from collections.abc import Callable, Iterable
+from typing import Final
 
 from rosrm.core.supervisor.events import Event, Exited, SessionEnded
 from rosrm.core.supervisor.instance import UNKNOWN_EXIT
 from rosrm.core.supervisor.rules import Key
-from rosrm.supervisor import own_log, procfs
+from rosrm.supervisor import descriptors, own_log, procfs
 from rosrm.supervisor.procfs import Stat
+
+#: In place of a pidfd: no descriptor was left, and `look` finds the end of the process.
+_NO_PIDFD: Final = -1
+#: Seconds between two looks at such processes.
+_LOOK_EVERY: Final = 1.0
 
 
 class ProcessTrees:
@@ -40,6 +46,9 @@ class ProcessTrees:
         self._births: dict[Key, int] = {}
         self._children: dict[int, Key] = {}
         self._taken_over: dict[int, int] = {}
+        self._looked_at: dict[int, tuple[Key, int]] = {}
+        self._next_look = 0.0
+        self._most_watched = descriptors.most_watched()
         self._adopted: dict[int, Key | None] = {}
         self._strays: dict[Key, dict[int, int]] = {}
 
@@ -53,13 +62,31 @@ class ProcessTrees:
     def take_over(self, key: Key, leader: Stat) -> bool:
         """Add a session leader that an earlier supervisor spawned; return False if it has ended."""
         try:
-            pidfd = os.pidfd_open(leader.pid)
+            pidfd = os.pidfd_open(leader.pid) if self._has_room() else _NO_PIDFD
         except ProcessLookupError:
             return False
         self._taken_over[leader.pid] = pidfd
         self._add(key, leader.pid, leader.start)
-        self._watch(pidfd, lambda: self._taken_over_ended(key, leader.pid))
+        if pidfd == _NO_PIDFD:
+            self._looked_at[leader.pid] = (key, leader.start)
+        else:
+            self._watch(pidfd, lambda: self._taken_over_ended(key, leader.pid))
         return True
+
+    def look(self, now: float) -> None:
+        """Find the ends of the leaders for which no descriptor was left; called in each round."""
+        if now < self._next_look or not self._looked_at:
+            return
+        self._next_look = now + _LOOK_EVERY
+        for pid, (key, birth) in list(self._looked_at.items()):
+            stat = procfs.read_stat(pid)
+            if stat is None or not stat.alive or stat.start != birth:
+                del self._looked_at[pid]
+                self._taken_over_ended(key, pid)
+
+    def deadline(self) -> float | None:
+        """Return the time at which `look` has work; None: never."""
+        return self._next_look if self._looked_at else None
 
     def birth(self, key: Key) -> int:
         """Return the start time of the instance's leader in clock ticks; 0: not known."""
@@ -78,7 +105,9 @@ class ProcessTrees:
         self._births[key] = birth
 
     def _taken_over_ended(self, key: Key, pid: int) -> None:
-        self._unwatch(self._taken_over.pop(pid))
+        pidfd = self._taken_over.pop(pid)
+        if pidfd != _NO_PIDFD:
+            self._unwatch(pidfd)
         left = procfs.find_members(pid, mark(key), self._state)
         self.watch_strays(key, left)
         self._happened(Exited(key, UNKNOWN_EXIT, leftovers=bool(left)))
@@ -149,7 +178,8 @@ class ProcessTrees:
         """Watch these processes; report `SessionEnded` when they and their forks have ended."""
         watched = self._strays.setdefault(key, {})
         for stat in found:
-            if stat.pid not in watched:
+            # Beyond the limit they are found again when a watched one ends.
+            if stat.pid not in watched and (self._has_room() or not watched):
                 self._watch_stray(key, stat.pid, watched)
         if not watched:
             del self._strays[key]
@@ -195,6 +225,10 @@ class ProcessTrees:
             _send(os.kill, stat.pid, signal.SIGKILL, str(stat.pid))
 
     # --- the selector -------------------------------------------------------------------------
+
+    def _has_room(self) -> bool:
+        """Return True if another process may be watched by a descriptor."""
+        return len(self._selector.get_map()) < self._most_watched
 
     def _watch(self, pidfd: int, ended: Callable[[], None]) -> None:
         self._selector.register(pidfd, selectors.EVENT_READ, ended)

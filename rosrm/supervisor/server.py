@@ -7,6 +7,7 @@ status is recorded before it is sent; a spawn is recorded as imminent before it 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import selectors
 import signal
@@ -22,7 +23,16 @@ from rosrm.core.supervisor.instance import STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
 from rosrm.runtime.oom_score import score_of_children
-from rosrm.supervisor import lease_file, messages, own_log, paths, procfs, spawn, takeover
+from rosrm.supervisor import (
+    descriptors,
+    lease_file,
+    messages,
+    own_log,
+    paths,
+    procfs,
+    spawn,
+    takeover,
+)
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.instance_record import InstanceRecord
 from rosrm.supervisor.json_lines import ProtocolError
@@ -41,18 +51,28 @@ END_PATIENCE: Final = 1.0
 
 
 class Server:
-    """The supervisor of one state directory, given by its absolute path."""
+    """The supervisor of one state directory.
 
-    def __init__(self, state: str, listener: socket.socket, limits: LogLimits) -> None:
+    Args:
+        state: absolute path of the directory.
+        listener: socket for clients.
+        limits: of the logs.
+        files: soft limit of open descriptors of each process; None: that of the supervisor.
+    """
+
+    def __init__(
+        self, state: str, listener: socket.socket, limits: LogLimits, files: int | None = None
+    ) -> None:
         self._state = state
         self._listener = listener
+        self._files = files
         self._selector = selectors.DefaultSelector()
         self._core = SupervisorState()
         self._trees = ProcessTrees(state, self._selector, self._happened)
         self._record = InstanceRecord(state)
         self._last_contact = lease_file.LastContact(state)
         self._logs = LogKeeper(state, limits)
-        self._null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+        self._null = _open_null()
         self._launches: dict[Key, messages.Launch] = {}
         self._environments: dict[str, dict[str, str]] = {}
         self._notes: list[str] = []
@@ -92,6 +112,7 @@ class Server:
             self._happened(events.TimePassed())
         now = time.monotonic()
         self._logs.look(now)
+        self._trees.look(now)
         self._spawn_some()
         if self._record.is_large():
             self._rewrite_record()
@@ -107,7 +128,7 @@ class Server:
     def _timeout(self) -> float | None:
         if self._spawns:
             return 0.0
-        deadlines = [self._core.deadline(), self._logs.deadline()]
+        deadlines = [self._core.deadline(), self._logs.deadline(), self._trees.deadline()]
         if self._record.trouble:
             deadlines.append(time.monotonic() + RECORD_AGAIN)
         due = [deadline for deadline in deadlines if deadline is not None]
@@ -202,7 +223,7 @@ class Server:
         try:
             directory = launch.directory or paths.work_directory(self._state)
             environment = self._environment(launch)
-            with score_of_children():
+            with score_of_children(), descriptors.limited(self._files):
                 return spawn.spawn(launch.argv, environment, directory, self._null, log)
         finally:
             os.close(log)
@@ -253,13 +274,25 @@ class Server:
     def _accept(self) -> None:
         try:
             peer, _ = self._listener.accept()
-        except OSError:  # the peer is gone, or no descriptor is left: it connects again
-            return
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                self._turn_away()
+            return  # the peer is gone: it connects again
         connection = Connection(peer)
         self._watch(connection, lambda: self._readable(connection))
         if connection.uid not in (0, os.geteuid()):
             self._refuse(connection, "this supervisor belongs to another user")
             self._send(connection, b"")
+
+    def _turn_away(self) -> None:
+        """Accept and close a connection for which no descriptor is left.
+
+        Otherwise the selector would report it in every round, without a wait.
+        """
+        os.close(self._null)  # for a moment, because a connection needs a descriptor
+        with contextlib.suppress(OSError):
+            self._listener.accept()[0].close()
+        self._null = _open_null()
 
     def _readable(self, connection: Connection) -> None:
         try:
@@ -409,3 +442,7 @@ class Server:
 
     def _watch(self, file: socket.socket | Connection, call: Callable[[], None]) -> None:
         self._selector.register(file, selectors.EVENT_READ, call)
+
+
+def _open_null() -> int:
+    return os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)

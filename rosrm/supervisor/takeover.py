@@ -11,7 +11,6 @@ and its restart policy decides.
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Iterator
 
@@ -38,8 +37,7 @@ def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
         leader = procfs.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]
         if leader is not None and leader.alive and procfs.was_born(leader, birth):
-            with contextlib.suppress(OSError):  # it has ended since
-                trees.take_over(instance.key, leader)
+            trees.take_over(instance.key, leader)
     return recorded
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import rosrm
 from rosrm.core.supervisor.events import ShutdownOrdered, StatusStored, StopOrdered
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
-from rosrm.supervisor import instance_record, messages, procfs
+from rosrm.supervisor import descriptors, instance_record, messages, procfs
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 from rosrm.supervisor.messages import Forget
 from tests.waiting import command_of, wait_gone, wait_until
@@ -25,6 +26,7 @@ from tests.waiting import command_of, wait_gone, wait_until
 from .conftest import Host, kill
 
 OURS = messages.PROTOCOL
+MAIN = Path(procfs.__file__).with_name("__main__.py")
 
 SLAVE = """
     import os, sys
@@ -425,3 +427,38 @@ def test_the_supervisor_is_small(client):
     """The supervisor uses at most 12 MiB, alone on the machine (about 8 beside other Pythons)."""
     rollup = Path(f"/proc/{client.pid}/smaps_rollup").read_text().split()
     assert int(rollup[rollup.index("Pss:") + 1]) < 12 * 1024
+
+
+def test_the_supervisor_may_open_more_files_than_its_processes(host):
+    """Each taken-over process needs a descriptor, but programs with `select` fail above 1023."""
+    former, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = min(700, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    try:
+        client = host.connect()
+        pid = host.sleeper(client, "p")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (former, hard))
+    assert resource.prlimit(client.pid, resource.RLIMIT_NOFILE) == (hard, hard)
+    assert resource.prlimit(pid, resource.RLIMIT_NOFILE) == (wanted, hard)
+
+
+def test_more_processes_than_descriptors_are_taken_over(host):
+    """None counts as ended, and the end of each is found."""
+    client = host.connect()
+    names = [f"p{number}" for number in range(20)]
+    pids = [host.sleeper(client, name) for name in names]
+    kill(client.pid)
+    few = descriptors.RESERVE + 10
+    started = subprocess.run(
+        [sys.executable, str(MAIN), "--state", str(host.state)],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (few, few)),
+        stdout=subprocess.PIPE, check=True,
+    )  # fmt: skip
+    assert started.stdout == b"ready\n"
+    client = host.connect(start=False)
+    assert [one.pid for one in client.instances] == pids
+    assert {one.state for one in client.instances} == {InstanceState.RUNNING}
+    for name, pid in zip(names, pids, strict=True):
+        os.kill(pid, signal.SIGKILL)
+        host.wait(client, name, InstanceState.FAILED)

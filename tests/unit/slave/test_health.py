@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -21,6 +23,9 @@ from rosrm.model.values import (
     ProcessSpec,
     RestartPolicy,
 )
+from rosrm.ros.callback_guard import CallbackGuard
+from rosrm.slave import health
+from rosrm.slave.health import HealthWatch
 from rosrm.slave.memos import from_memo, to_memo
 from tests.unit.slave.rig import Slave
 
@@ -308,3 +313,24 @@ def test_a_memo_survives_the_way(memo) -> None:
     text = to_memo(memo)
     assert (from_memo(text) or Memo()) == memo
     assert bool(text) == (memo != Memo())
+
+
+def test_a_check_that_fails_has_no_result_and_the_others_go_on(monkeypatch, caplog) -> None:
+    """For example because no descriptor is left: the slave and its processes run on."""
+
+    def read_stat(pid: int):
+        if pid == 1:
+            raise OSError(24, "Too many open files")
+        return SimpleNamespace(state="S")
+
+    monkeypatch.setattr(health, "read_stat", read_stat)
+    launchers = SimpleNamespace(has_departed=lambda _: False, root=lambda pid: pid)
+    participant = SimpleNamespace(guard=CallbackGuard())
+    checks = HealthWatch(participant, None, None, launchers)
+    held = {
+        InstanceId("p", pid): SimpleNamespace(status=SimpleNamespace(pid=pid), watched=Watch(SCAN))
+        for pid in (1, os.getpid())
+    }
+    (result,) = checks.look(held, 1.0)
+    assert (result.pid, result.look) == (os.getpid(), Observation(False))
+    assert "Too many open files" in caplog.text

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
 import socket
 import time
+from types import SimpleNamespace
 
 import hypothesis.strategies as st
 import pytest
@@ -287,3 +289,23 @@ def test_a_directory_with_a_null_byte_is_a_spawn_error():
     """`os.chdir` raises `ValueError` for it, not `OSError`."""
     with pytest.raises(spawn.SpawnError):
         spawn.spawn(("true",), {}, "/a\0b", 0, 1)
+
+
+def test_a_connection_without_a_free_descriptor_is_closed(server, tmp_path, monkeypatch):
+    """Otherwise the loop would find it again in every round, without a wait."""
+    its = server()
+    peer = endpoint.connect(str(tmp_path / "state"), 1.0)
+    refused = [OSError(errno.EMFILE, "Too many open files")]
+    listener, monkey = its._listener, SimpleNamespace()
+
+    def accept():
+        if refused:
+            raise refused.pop()
+        return listener.accept()
+
+    monkey.accept = accept
+    monkeypatch.setattr(its, "_listener", monkey)
+    its._accept()
+    assert peer.recv(1) == b""
+    assert os.fstat(its._null)
+    peer.close()

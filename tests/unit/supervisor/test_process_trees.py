@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import selectors
+import signal
 import subprocess
 
-from rosrm.core.supervisor.events import SpawnFailed
-from rosrm.core.supervisor.instance import Instance
+from rosrm.core.supervisor.events import Exited, SessionEnded, SpawnFailed
+from rosrm.core.supervisor.instance import UNKNOWN_EXIT, Instance
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import RestartRule, StopRule
-from rosrm.supervisor import procfs, takeover
+from rosrm.supervisor import descriptors, procfs, takeover
 from rosrm.supervisor.instance_record import Recorded
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import Stat
@@ -48,3 +49,51 @@ def test_a_start_whose_process_ends_during_the_take_over_failed(tmp_path, monkey
     (event,) = takeover.what_happened(recorded, str(tmp_path), core, its)
     assert isinstance(event, SpawnFailed)
     assert event.transient
+
+
+def test_leaders_without_a_free_descriptor_are_taken_over(tmp_path, monkeypatch):
+    """A supervisor may have started more of them than a process may have open descriptors."""
+    monkeypatch.setattr(descriptors, "most_watched", lambda: 1)
+    happened: list[object] = []
+    its = trees(str(tmp_path), happened)
+    sleepers = [subprocess.Popen(["sleep", "100"], start_new_session=True) for _ in range(3)]
+    try:
+        for number, sleeper in enumerate(sleepers):
+            assert its.take_over(("sleep", number), procfs.read_stat(sleeper.pid))
+        assert len(its._selector.get_map()) == 1
+        its.look(1.0)
+        assert happened == []
+        its.signal(("sleep", 2), signal.SIGKILL)
+        sleepers[2].wait()
+        assert its.deadline() == 2.0
+        its.look(1.9)
+        assert happened == []
+        its.look(2.0)
+        assert happened == [Exited(("sleep", 2), UNKNOWN_EXIT)]
+    finally:
+        for sleeper in sleepers:
+            sleeper.kill()
+            sleeper.wait()
+    its.look(3.0)
+    assert [one.instance for one in happened] == [("sleep", 2), ("sleep", 1)]
+    assert its.deadline() is None
+
+
+def test_strays_beyond_the_descriptors_are_found_when_a_watched_one_ends(tmp_path, monkeypatch):
+    """So no instance counts as ended before its last process."""
+    monkeypatch.setattr(descriptors, "most_watched", lambda: 0)
+    happened: list[object] = []
+    its = trees(str(tmp_path), happened)
+    sleepers = [subprocess.Popen(["sleep", "100"]) for _ in range(2)]
+    stats = [procfs.read_stat(one.pid) for one in sleepers]
+    monkeypatch.setattr(its, "_find", lambda _: stats[1:])
+    its.watch_strays(TALKER, stats)
+    for sleeper in sleepers:
+        assert happened == []
+        ((key, _),) = its._selector.select(0.0) or ((None, None),)
+        assert key is None
+        sleeper.kill()
+        sleeper.wait()
+        ((key, _),) = its._selector.select(5.0)
+        key.data()
+    assert happened == [SessionEnded(TALKER)]
