@@ -231,6 +231,8 @@ class Conductor:
         right = {
             field: getattr(self.config, field) for field in self.config.get_fields_and_field_types()
         }
+        runs = [one.run for one in self.reports if one.instance == self.config.source]
+        right["source_run"] = runs[-1] if runs else 0
         config = StateConfig(**{**right, "phase": phase, **other})
         plain = serialize_message(config)
         for number in (config.source, config.destination):
@@ -299,6 +301,16 @@ class Conductor:
         self.prepare()
         self.say(StateConfig.SWITCH)
         self.wait(self.config.source, HandoffReport.RELEASED)
+
+    def silence_alone(self) -> None:
+        """Silence the source with messages of the master and of a destination that does not run."""
+        source, destination = self.config.source, self.config.destination
+        self.say(StateConfig.SHADOW)
+        self.report_as(destination, HandoffReport.SHADOWING)
+        self.wait(source, HandoffReport.ATTACHED)
+        self.say(StateConfig.SWITCH)
+        self.report_as(destination, HandoffReport.SWITCHING)
+        self.wait(source, HandoffReport.RELEASED)
 
     def resume(self) -> None:
         """Undo a handoff: the source resumes."""

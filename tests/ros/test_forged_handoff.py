@@ -12,6 +12,7 @@ from rosrm.keys.handoffs import HandoffKeys, new_link
 from rosrm.keys.names import handoff_name
 from rosrm.keys.sealing import Direction
 from rosrm.node.handoff.channel import STATE
+from rosrm.node.managed_node import Mode
 from rosrm.ros.qos import HANDOFF
 from rosrm.ros.sealed_codec import decode, encode
 from rosrm.ros.sealed_topic import SealedTopic
@@ -159,6 +160,56 @@ def test_messages_of_a_stranger_do_not_hold_up_a_successor_whose_source_has_ende
     assert pair.second.count < 10**9
 
 
+def restarted(locked: Stage, pair, heard: list[Int64]) -> Counter:
+    """Return the source of a pair in a new process, after the destination has ended."""
+    locked.remove(pair.first)
+    locked.remove(pair.second)
+    again = locked.instance(Counter, 1)
+    heard.clear()
+    counts_on(locked, heard)
+    return again
+
+
+def test_recorded_messages_do_not_silence_a_node_that_was_restarted(locked) -> None:
+    """All of them open, because its key is the same; they have the number of its earlier run."""
+    counts = locked.listen(Int64, "count")
+    pair = pair_of(locked, Counter)
+    stranger = Eavesdropper(locked, pair.conductor)
+    pair.conductor.silence(pair.second)
+    channel = pair.conductor.config.channel
+    locked.spin_until(lambda: len(stranger.heard[TOPIC]) >= 4, "both phases for both nodes")
+    configs, reports = list(stranger.heard[TOPIC]), list(stranger.heard[channel])
+    pair.conductor.resume()
+    again = restarted(locked, pair, counts)
+    for data in configs:
+        stranger.send(TOPIC, data)
+    locked.spin_until(lambda: again._rosrm._source._channel, "the channel")
+    counts_on(locked, counts)
+    for data in reports:
+        stranger.send(channel, data)
+    locked.spin_until(lambda: again._rosrm._source._asked, "the report of the destination")
+    counts_on(locked, counts, 50)
+    assert again._rosrm.entities.mode is Mode.ACTIVE
+
+
+def test_a_recorded_message_does_not_end_the_silence_of_a_node_that_was_restarted(locked) -> None:
+    """Its successor may be active by then."""
+    counts = locked.listen(Int64, "count")
+    pair = pair_of(locked, Counter)
+    stranger = Eavesdropper(locked, pair.conductor)
+    pair.conductor.silence(pair.second)
+    pair.conductor.resume()
+    locked.spin_until(lambda: len(stranger.heard[TOPIC]) >= 8, "all phases for both nodes")
+    recorded = list(stranger.heard[TOPIC])
+    again = restarted(locked, pair, counts)
+    Conductor(locked, source=1, destination=3).silence_alone()
+    for data in recorded:
+        stranger.send(TOPIC, data)
+    for _ in range(20):
+        locked.spin(0.05)
+    assert again._rosrm.entities.mode is Mode.SILENT
+
+
 @pytest.mark.parametrize("keys", [KEYS, None], ids=["keys", "open"])
 def test_a_state_can_be_read_only_with_security_none(keys) -> None:
     """No message has the state, nor the key of the handoff."""
@@ -216,10 +267,7 @@ def test_a_node_that_a_stranger_silenced_counts_on_and_can_be_moved(cluster, sta
     heard = stage.listen(Int64, "/victim/count")
     counts_on(stage, heard)
     forged = conductor(cluster, stage, row, 10**6)
-    for phase in (C.SHADOW, C.SWITCH):
-        forged.say(phase)
-    forged.report_as(10**6, R.SHADOWING, R.SWITCHING)
-    forged.wait(row.number, R.RELEASED)
+    forged.silence_alone()
     stage.spin_until(lambda: "source_stranded" in cluster.kinds("victim"), "the question")
     counts_on(stage, heard)
     assert gapless(heard)

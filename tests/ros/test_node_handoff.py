@@ -762,10 +762,7 @@ def test_a_mark_with_an_impossible_number_ends_the_handoff(stage, pair, change, 
 def forge_silence(stage, destination=99):
     """Send the messages of a handoff that does not exist, as its master and its destination."""
     forged = Conductor(stage, source=1, destination=destination)
-    for phase in (C.SHADOW, C.SWITCH):
-        forged.say(phase)
-    forged.report_as(destination, R.SHADOWING, R.SWITCHING)
-    forged.wait(1, R.RELEASED)
+    forged.silence_alone()
     return forged
 
 

@@ -37,6 +37,7 @@ class Channel:
         links: of this node.
         config: message of the master with the channel and key of the handoff.
         instance: this node's own number.
+        run: random number of a source's run.
         peer: instance number of the other side.
         take_report: receives each report of the other side.
 
@@ -44,17 +45,19 @@ class Channel:
         links: as given.
         name: topic of the reports.
         destination: instance number of the destination, which identifies the handoff.
+        run: as given.
         topic: returns a topic under the key of the handoff, from message type and name.
     """
 
     def __init__(
         self, plain: Any, links: NodeLinks, config: StateConfig, *, instance: int, peer: int,
-        take_report: Callable[[HandoffReport], None],
+        take_report: Callable[[HandoffReport], None], run: int = 0,
     ) -> None:  # fmt: skip
         self._plain = plain
         self.links = links
         self.name: str = config.channel
         self.destination: int = config.destination
+        self.run = run
         self.topic: Callable[[Any, str], SealedTopic] = links.of_handoff(config)
         self._instance = instance
         self._peer = peer
@@ -91,7 +94,8 @@ class Channel:
             return
         self._last = HandoffReport(
             protocol_version=PROTOCOL_VERSION, destination=self.destination,
-            instance=self._instance, phase=phase, sequence=sequence, message=message,
+            instance=self._instance, run=self.run, phase=phase, sequence=sequence,
+            message=message,
         )  # fmt: skip
         self.repeat()
 

@@ -122,14 +122,23 @@ class HandoffSource:
     # --- a handoff -------------------------------------------------------------------------
 
     def configure(self, config: StateConfig, links: NodeLinks) -> None:
-        """Handle a message of the master about a handoff away from this node."""
+        """Handle a message of the master about a handoff away from this node.
+
+        Anyone may have recorded messages for an earlier run of this node, and they still open. So
+        only messages with the number of this run make the node silent, and a silent node ignores
+        all others.
+        """
+        is_of_this_run = config.source_run == self._run
+        is_silent = self._finishing or self._entities.mode is Mode.SILENT
+        if is_silent and not is_of_this_run:
+            return
         if self._channel is None or self._channel.name != config.channel:
             if config.phase not in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.RESUME):
                 return
             self._open(config, links)
         else:
             self._channel.repeat()
-        if config.phase == StateConfig.SWITCH:
+        if config.phase == StateConfig.SWITCH and is_of_this_run:
             self._may_switch = True
             self._switch()
         elif config.phase == StateConfig.RESUME:
@@ -141,7 +150,7 @@ class HandoffSource:
         self.close()
         channel = self._channel = Channel(
             self._entities.plain, links, config, instance=self._entities.identity.instance,
-            peer=config.destination, take_report=self._take_report,
+            peer=config.destination, take_report=self._take_report, run=self._run,
         )  # fmt: skip
         self._marks = channel.publisher(StateMark, self._mark_topic, topics.MARK)
         for part in self._parts:

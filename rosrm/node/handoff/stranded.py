@@ -33,6 +33,7 @@ class StrandedSource:
         self._entities = entities
         self._questions = channel.links.questions
         self._destination = channel.destination
+        self._run = channel.run
         self._publisher: SealedWriter | None = None
         self._timer: Any = steady_timer(entities.plain, ASK_EVERY, self._ask)
 
@@ -48,8 +49,8 @@ class StrandedSource:
             self._publisher.publish(
                 HandoffReport(
                     protocol_version=PROTOCOL_VERSION, destination=self._destination,
-                    instance=entities.identity.instance, phase=HandoffReport.SILENT,
-                    sequence=entities.sequence,
+                    instance=entities.identity.instance, run=self._run,
+                    phase=HandoffReport.SILENT, sequence=entities.sequence,
                 )
             )  # fmt: skip
 

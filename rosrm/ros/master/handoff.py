@@ -34,19 +34,37 @@ _QUESTIONS_PER_SECOND: Final = 5.0
 _MOST_ASKERS: Final = 256
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Handoff:
     """One handoff.
 
     Attributes:
+        source: instance number of the source.
         key: of the handoff; b"" with `security: none`.
         receivers: topic `state_config` for each instance of the handoff that has a key.
         subscription: to the reports of the handoff.
+        source_run: number of the source's run, from its newest report; 0: there was none.
     """
 
+    source: int
     key: bytes = field(repr=False)
     receivers: Sequence[SealedTopic]
     subscription: Any
+    source_run: int = 0
+
+
+@dataclass(slots=True)
+class _Asker:
+    """A silent source that has asked.
+
+    Attributes:
+        topic: of its questions, with the counter of the newest: otherwise a recorded question could
+            be repeated.
+        run: number of its run.
+    """
+
+    topic: SealedTopic
+    run: int = 0
 
 
 class HandoffEndpoint:
@@ -74,7 +92,7 @@ class HandoffEndpoint:
             msg.Sealed, self._names(names.STATE_CONFIG), qos.STATE_CONFIG
         )
         self._handoffs: dict[str, _Handoff] = {}
-        self._askers: OrderedDict[tuple[str, int], SealedTopic] = OrderedDict()
+        self._askers: OrderedDict[tuple[str, int], _Asker] = OrderedDict()
         self._questions_left = float(_QUESTIONS)
         self._questions_at = time.monotonic()
         participant.node.create_subscription(
@@ -94,7 +112,7 @@ class HandoffEndpoint:
                 phase=int(command.phase), process=command.process, source=command.source,
                 destination=command.destination, source_node=command.source_node,
                 destination_node=command.destination_node, channel=channel,
-                key=array("B", handoff.key),
+                key=array("B", handoff.key), source_run=self._run_of(command, handoff),
             )
         )  # fmt: skip
         for receiver in handoff.receivers:
@@ -102,6 +120,11 @@ class HandoffEndpoint:
         if command.phase is HandoffPhase.DONE:
             del self._handoffs[channel]
             self._participant.node.destroy_subscription(handoff.subscription)
+
+    def _run_of(self, command: PublishStateConfig, handoff: _Handoff) -> int:
+        """Return the number of the source's run; 0: it is not known."""
+        asker = self._askers.get((command.process, command.source))
+        return handoff.source_run or (0 if asker is None else asker.run)
 
     def _join(self, channel: str, command: PublishStateConfig) -> _Handoff:
         process, destination = command.process, command.destination
@@ -114,6 +137,7 @@ class HandoffEndpoint:
             report = reports.read(data)
             if report is not None and report.destination == destination:
                 check_bounds(report)
+                self._note_run(channel, report)
                 self._take_report(process, report)
 
         subscription = reports.subscription(
@@ -124,7 +148,8 @@ class HandoffEndpoint:
             self._topic_of(process, one, msg.StateConfig, topic)
             for one in (command.source, destination)
         )
-        return _Handoff(key or b"", [one for one in both if one is not None], subscription)
+        receivers = [one for one in both if one is not None]
+        return _Handoff(command.source, key or b"", receivers, subscription)
 
     def _topic_of(
         self, process: str, number: int, message_type: Any, topic: str
@@ -135,6 +160,11 @@ class HandoffEndpoint:
             return None
         link = new_link(key, Direction.FROM_MASTER, Direction.TO_MASTER)
         return SealedTopic(link, instance_name(process, number), message_type, topic)
+
+    def _note_run(self, channel: str, report: msg.HandoffReport) -> None:
+        handoff = self._handoffs.get(channel)
+        if handoff is not None and report.instance == handoff.source:
+            handoff.source_run = report.run
 
     def _take_report(self, process: str, report: msg.HandoffReport) -> None:
         who = f"{process}#{report.instance} in a handoff"
@@ -171,13 +201,16 @@ class HandoffEndpoint:
         asker = None if envelope is None else named_instance(envelope.principal)
         if asker is None:
             return None
-        topic = self._askers.get(asker) or self._topic_of(
-            *asker, msg.HandoffReport, self._names.stranded_sources
+        known = self._askers.get(asker)
+        topic = (
+            known.topic
+            if known is not None
+            else self._topic_of(*asker, msg.HandoffReport, self._names.stranded_sources)
         )
         report = None if topic is None else topic.read(data)
         if topic is None or report is None or report.instance != asker[1]:
             return None
-        self._askers[asker] = topic  # its counter: otherwise a recorded question could be repeated
+        self._askers[asker] = _Asker(topic, report.run)
         self._askers.move_to_end(asker)
         if len(self._askers) > _MOST_ASKERS:
             self._askers.popitem(last=False)
