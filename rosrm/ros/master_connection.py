@@ -144,7 +144,8 @@ def _greet(endpoints: Endpoints, name: str, timeout: float, begun: float) -> srv
         raise NoMaster(
             f"no master answered within {time.monotonic() - begun:.1f} s ({settings.describe()}, "
             f"namespace {settings.namespace}, {endpoints.security.described}). "
-            f"{_to_check(settings)} `rosrm key check` shows the keys"
+            f"{_to_check(settings)} `rosrm key check` shows this user's keys, and `rosrm key list` "
+            f"on the machine of the master the valid ones"
         )
     if not hello.accepted:
         raise Refused(hello.message, "version")

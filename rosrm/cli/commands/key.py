@@ -52,7 +52,7 @@ def add(
         typer.Option(
             "--role", metavar="ROLE",
             help="Role of a user: viewer (reads), submitter (changes its own processes) or "
-            "operator (everything).  [default: submitter]",
+            "operator (everything).  [default: that of its present key, else submitter]",
         ),
     ] = None,
     out: Annotated[
@@ -75,21 +75,24 @@ def add(
     named = principal_of(principal)
     allowed = [one for one in GRANTED if (one is Role.HOST) is (named.kind == "host")]
     names = [one.value for one in allowed]
-    chosen = role or ("host" if named.kind == "host" else "submitter")
+    secret, home = _secret(), key_files.key_home()
+    present = [one.role for one in key_files.read_grants(home) if one.principal == named]
+    usual = Role.HOST if named.kind == "host" else Role.SUBMITTER
+    chosen = role or (present[0] if present else usual).value
     if chosen not in names:
         raise ConfigError(f"{named} cannot have the role {chosen!r}; allowed: {', '.join(names)}")
-    secret = _secret()
     if out is None:
         _make_output_private()
-    grant = key_files.add_grant(key_files.key_home(), named, Role(chosen))
+    grant = key_files.add_grant(home, named, Role(chosen))
     made = secret.key_of(grant)
     if out is None:
         echo(key_files.text_of(made).rstrip())
     else:
         key_files.write_key(out, made)
+    former = "; its former key has ended" if present else ""
     echo(
-        f"rosrm: {named} has a new key (role {chosen}). Copy the file to ~/.config/rosrm/ of the "
-        f"user that will use it, with mode 0600",
+        f"rosrm: {named} has a new key (role {chosen}){former}. Copy the file to ~/.config/rosrm/ "
+        f"of the user that will use it, with mode 0600",
         err=True,
     )
 
@@ -127,6 +130,7 @@ def revoke(principals: Annotated[list[str], _PRINCIPAL]) -> None:
     from rosrm.keys.roles import principal_of
 
     chosen = [principal_of(text) for text in principals]
+    _secret()
     key_files.revoke(key_files.key_home(), chosen)
     echo(f"revoked: {', '.join(map(str, chosen))}")
 

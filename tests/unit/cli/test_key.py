@@ -57,7 +57,7 @@ def test_the_secret_is_created_once(rosrm, home):
 
 @pytest.mark.parametrize(
     "words",
-    [("add", "host:a"), ("list",), ("rotate", "--out", "new")],
+    [("add", "host:a"), ("list",), ("revoke", "host:a"), ("rotate", "--out", "new")],
 )  # fmt: skip
 def test_a_command_of_the_master_refuses_another_machine(rosrm, home, words):
     result = rosrm("key", *words)
@@ -67,6 +67,17 @@ def test_a_command_of_the_master_refuses_another_machine(rosrm, home, words):
         "user, or begin with `rosrm key init`\n"
     )
     assert not home.exists()
+
+
+def test_a_new_key_has_the_role_of_the_present_one(rosrm, secret):
+    """Otherwise a viewer could submit processes after its key was replaced."""
+    for words in (("--role", "viewer"), (), ("--role", "operator"), ()):
+        said = rosrm("key", "add", "user:ada", *words).err
+        assert ("its former key has ended" in said) is (listed(rosrm)[0][2] != "1")
+    assert listed(rosrm) == [("user:ada", "operator", "4")]
+    assert rosrm("key", "revoke", "user:ada").code == 0
+    assert rosrm("key", "add", "user:ada").code == 0
+    assert listed(rosrm) == [("user:ada", "submitter", "5")]
 
 
 @pytest.mark.parametrize(
