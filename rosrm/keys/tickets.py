@@ -30,6 +30,8 @@ class Ticket(NamedTuple):
         version: of the keys with which the master made it. When a key is revoked, the tickets of
             earlier versions are void.
         service: name of the slave's service, for example "read_log".
+        first: lowest number of an instance whose logs may be read. Instances of lower numbers
+            belonged to another owner of the name.
         process: the process of all requests.
         bearer: the principal that got the ticket.
     """
@@ -37,6 +39,7 @@ class Ticket(NamedTuple):
     until: int
     version: int
     service: str
+    first: int
     process: str
     bearer: Principal
 
@@ -50,7 +53,8 @@ class Ticket(NamedTuple):
 
     def text(self) -> str:
         """Return the ticket as text for messages."""
-        return f"{_PREFIX}{self.until}:{self.version}:{self.service}:{self.process}:{self.bearer}"
+        numbers = f"{self.until}:{self.version}:{self.service}:{self.first}"
+        return f"{_PREFIX}{numbers}:{self.process}:{self.bearer}"
 
     def key(self, host_key: bytes) -> bytes:
         """Return the key of the bearer, from the key of the slave's host."""
@@ -66,11 +70,15 @@ def ticket_of(text: str) -> Ticket | None:
     until, _, rest = text.removeprefix(_PREFIX).partition(":")
     version, _, rest = rest.partition(":")
     service, _, rest = rest.partition(":")
+    first, _, rest = rest.partition(":")
     process, _, bearer = rest.partition(":")
-    if not (text.startswith(_PREFIX) and _NUMBER.fullmatch(until) and _NUMBER.fullmatch(version)):
+    are_numbers = all(_NUMBER.fullmatch(one) for one in (until, version, first))
+    if not (text.startswith(_PREFIX) and are_numbers):
         return None
     try:
-        ticket = Ticket(int(until), int(version), service, process, principal_of(bearer))
+        ticket = Ticket(
+            int(until), int(version), service, int(first), process, principal_of(bearer)
+        )
     except ConfigError:
         return None
     return ticket if ticket.text() == text else None

@@ -131,10 +131,15 @@ class MasterQueries:
             return None
         return instance.host.name
 
-    def may_read_log(self, process: str, by: Requester) -> bool:
-        """Return True if a user may read the logs of a process; of a removed one an operator."""
+    def first_readable_log(self, process: str, by: Requester) -> int | None:
+        """Return the lowest number of an instance whose log a user may read; None: it may not.
+
+        Only an operator may read the logs of a removed process, and of former owners of its name.
+        """
+        if by.is_operator:
+            return 0
         known = self._state.processes.get(process)
-        return by.may_act_on("" if known is None else known.principal)
+        return None if known is None or not by.may_act_on(known.principal) else known.owned_from
 
     def has_held(self, process: str, host: str) -> bool:
         """Return True if an instance of a process runs on a host, or ended there last."""

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.errors import Refused
+from rosrm.keys.links import Link
+from rosrm.keys.security import Peer
 from rosrm.ros.bounds import MOST_LETTERS, check_bounds
 from rosrm.ros.participant import Participant, failed_response
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
@@ -24,10 +27,12 @@ from rosrm.wording import sendable
 from rosrm_msgs.msg import Answer, Envelope, MasterBeat
 from rosrm_msgs.srv import Handshake
 
-#: Ids that are remembered at least, for late repetitions, and at most. An id is never forgotten
-#: while a copy of its request is young enough to be admitted.
+#: Ids of one sender that are remembered at least, for late repetitions, and at most. An id is never
+#: forgotten while a copy of its request is young enough to be admitted.
 _REMEMBERED: Final = 10_000
 _MOST_REMEMBERED: Final = 50_000
+#: The same for long polls: a late repetition of one has no use, and a thousand slaves send polls.
+_REMEMBERED_POLLS: Final = 16
 #: Most repetitions of one request that wait for its answer.
 _MOST_WAITING: Final = 16
 #: Most letters of an id.
@@ -76,16 +81,20 @@ def check_answer(answer: Answer, who: str) -> None:
 
 
 class RequestGate:
-    """Admits or refuses requests at their receiver, and remembers answers.
+    """Admits or refuses requests of one sender at their receiver, and remembers answers.
 
     Args:
         beat: the receiver's monotonic clock, ns.
         max_age: seconds after which a request is stale.
+        remembered: ids that are remembered at least.
     """
 
-    def __init__(self, beat: Callable[[], int], max_age: float) -> None:
+    def __init__(
+        self, beat: Callable[[], int], max_age: float, remembered: int = _REMEMBERED
+    ) -> None:
         self._beat = beat
         self._max_age = max_age
+        self._remembered = remembered
         self._answers: OrderedDict[str, Any] = OrderedDict()
         self._admitted: dict[str, int] = {}
         self._waiting: dict[str, deque[SealedRequest]] = {}
@@ -126,7 +135,7 @@ class RequestGate:
 
     def _has_room(self) -> bool:
         """Return True if another id can be remembered; forget ids that are too old to be used."""
-        while len(self._answers) >= _REMEMBERED:
+        while len(self._answers) >= self._remembered:
             oldest = next(iter(self._answers))
             if (self._beat() - self._admitted[oldest]) * _NS <= self._max_age:
                 return len(self._answers) < _MOST_REMEMBERED
@@ -168,19 +177,33 @@ Handle = Callable[[Any, SealedRequest, Callable[[Any], None]], None]
 
 
 class ControlServer:
-    """Offers services behind a gate.
+    """Offers services, behind a gate for each sender.
 
     Args:
+        max_age: seconds after which a request is stale.
         epoch: returns the current one if older ones are to be refused.
     """
 
     def __init__(
-        self, endpoints: SealedEndpoints[Any], gate: RequestGate,
+        self, endpoints: SealedEndpoints[Any], max_age: float,
         epoch: Callable[[], int | None] = lambda: None,
     ) -> None:  # fmt: skip
         self._endpoints = endpoints
-        self._gate = gate
+        self._max_age = max_age
         self._epoch = epoch
+        self._gates: dict[tuple[Link, int], RequestGate] = {}
+
+    def _gate_of(self, sender: Peer, remembered: int) -> RequestGate:
+        """Return the gate of a sender, so that no member fills the gate of another one.
+
+        With `security: none` all senders share one link, and so one gate: anyone can send under any
+        number of names.
+        """
+        gate = self._gates.get((sender.link, remembered))
+        if gate is None:
+            gate = RequestGate(time.monotonic_ns, self._max_age, remembered)
+            self._gates[sender.link, remembered] = gate
+        return gate
 
     def offer(self, service_type: Any, name: str, handle: Handle, *, remember: bool = True) -> None:
         """Offer a service.
@@ -190,9 +213,10 @@ class ControlServer:
                 function that answers it.
             remember: keep the answer for repetitions (not for long polls).
         """
-        gate = self._gate
+        remembered = _REMEMBERED if remember else _REMEMBERED_POLLS
 
         def take(request: Any, open_request: SealedRequest) -> None:
+            gate = self._gate_of(open_request.peer, remembered)
             known = gate.knows(request.envelope)
             answer = None if known else gate.refusal(request.envelope, self._epoch())
             if answer is not None:

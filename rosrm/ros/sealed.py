@@ -22,6 +22,7 @@ from rosrm.keys.links import SealedMessage
 from rosrm.keys.roles import may_send
 from rosrm.keys.sealing import FORMAT, channel_of
 from rosrm.keys.security import SIGNATURE_BYTES, Peer, Security
+from rosrm.keys.tickets import Ticket
 from rosrm.ros import qos
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
@@ -125,14 +126,15 @@ class SealedRequest:
         """Return True if the request was answered."""
         return self._opened.answered
 
-    def check_process(self, process: str) -> None:
-        """Raise `Refused` if the sender has no ticket for a process."""
+    def ticket_for(self, process: str) -> Ticket:
+        """Return the sender's ticket for a process; raise `Refused` if it has none."""
         ticket = self.peer.ticket
         if ticket is None or ticket.process != process:
             raise Refused(
                 f"{self.peer.grant.principal} has no ticket of the master for {process!r}",
                 "denied",
             )
+        return ticket
 
     def answer(self, response: Any) -> None:
         """Send the response."""

@@ -43,7 +43,11 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
     """
     instance = InstanceId(query.process, query.number)
     path = log_path(state_directory, instance)
-    numbers = tuple(_logged(state_directory, query.process))
+    missing = Refused(f"this host has no log of {instance} (any more)", "unknown")
+    if query.number < query.first:
+        raise missing  # that instance belonged to another owner of the name
+    logged = _logged(state_directory, query.process)
+    numbers = tuple(number for number in logged if number >= query.first)
     for _ in range(_TRIES):
         try:
             before = log_index.base(str(path))
@@ -57,7 +61,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
             raise Refused(f"the log of {instance} cannot be read: {error.strerror}") from None
         if after == before:
             return part
-    raise Refused(f"this host has no log of {instance} (any more)", "unknown")
+    raise missing
 
 
 def newest_instance(state_directory: Path, process: str) -> InstanceId:

@@ -269,7 +269,7 @@ def strange_principals() -> Iterator[str]:
         "user:" + 128 * "x",
         513 * "x",
         100_000 * "x",
-        f"ticket:{2**63}:1:read_log:p:user:x",
+        f"ticket:{2**63}:1:read_log:0:p:user:x",
     )
     yield from ("ticket:99999999999999999999999:1:control:p:host:h0", "instance:p#1", "handoff:p#2")
     yield from (f"instance:p#{10**300}", "ticket:", "ticket:1:::", "user:rosrm-master")

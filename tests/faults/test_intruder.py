@@ -156,7 +156,7 @@ def test_forged_tickets_open_no_slave(intruder, wanted) -> None:
     fields = {"protocol_version": PROTOCOL_VERSION, "process": WITNESS}
     service = path.of_host(HOSTS[0], wanted)
     request = services(*HOSTS)[service].Request(**fields)
-    ticket = Ticket(2**63, 1, wanted, WITNESS, principal_of(NAMES[0])).text()
+    ticket = Ticket(2**63, 1, wanted, 0, WITNESS, principal_of(NAMES[0])).text()
     for security in (false_member(NAMES[0]), NoSecurity(principal_of(NAMES[0]))):
         peer = security.bearer(ticket, os.urandom(32), intruder.runs[HOSTS[0]])
         assert intruder.answer(intruder.ask(security, service, peer, request)) is None

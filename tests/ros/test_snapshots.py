@@ -385,6 +385,10 @@ def test_a_successor_of_a_lost_host_decrypts_the_replica(three, fetched):
     ballast = plain.read_bytes()[-1000:-100]
     assert ballast == bytes(900)
     assert ballast not in (stored / "copy").read_bytes()
+    record = (plain.parent / "key").read_bytes()
+    number, key = int.from_bytes(record[:8], "little"), record[8:]
+    of_number = master_security("keys").snapshot_key
+    assert key in {of_number(name, first) for first in range(1, number + 1)}
     before = copies(three, name)[process.keeper]
     if fetched:
         three.client.set_host_state(process.keeper, "cordon")
@@ -392,7 +396,7 @@ def test_a_successor_of_a_lost_host_decrypts_the_replica(three, fetched):
     assert (after == process.keeper) is not fetched
     assert wait_for_count(three, name, before)[0][0] > before
     three.wait_for_log(name, f"continues from the snapshot of {name}#")
-    assert_no_key(three, master_security("keys").snapshot_key(name))
+    assert_no_key(three, key)
     if fetched:
         three.client.set_host_state(process.keeper, "uncordon")
     process.end()

@@ -55,7 +55,16 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     check_quota(state, event.specs, event.by)
     wall, born, first = state.wall, state.next_instance, state.next_order
     processes = [
-        Process(spec, order, ProcessPhase.QUEUED, now, event.by.name, wall=wall, born=born)
+        Process(
+            spec,
+            order,
+            ProcessPhase.QUEUED,
+            now,
+            event.by.name,
+            wall=wall,
+            born=born,
+            owned_from=_owned_from(state, spec.name, event.by),
+        )
         for order, spec in enumerate(event.specs, first)
     ]
     nodes = {process.node for process in processes}
@@ -71,6 +80,14 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         state.save(process)
     warnings = "".join(f". Warning: {one}" for one in shared)
     state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
+
+
+def _owned_from(state: MasterState, name: str, by: Requester) -> int:
+    """Return the lowest number of an instance since a name belongs to the user that submits it."""
+    former = state.processes.get(name)
+    if former is not None and former.principal == by.name:
+        return former.owned_from
+    return state.next_instance
 
 
 def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:

@@ -20,7 +20,6 @@ from rosrm.ros import convert, names
 from rosrm.ros.control import (
     ControlServer,
     Handle,
-    RequestGate,
     accepted,
     refused,
     version_refusal,
@@ -69,8 +68,8 @@ class Queries(Protocol):
     def host_of(self, process: str, number: int) -> str | None:
         """Return the host of an instance; None: there is no such instance."""
 
-    def may_read_log(self, process: str, by: Requester) -> bool:
-        """Return True if a user may read the logs of a process."""
+    def first_readable_log(self, process: str, by: Requester) -> int | None:
+        """Return the lowest number of an instance whose log a user may read; None: it may not."""
 
     def has_held(self, process: str, host: str) -> bool:
         """Return True if an instance of a process runs on a host, or ended there last."""
@@ -95,7 +94,7 @@ class MasterServices:
         handle: Callable[[happened.Event], None], refuse: Refuse, strangers: Callable[[], str],
     ) -> None:  # fmt: skip
         self._endpoints = endpoints
-        self._server = ControlServer(endpoints, RequestGate(time.monotonic_ns, control.max_age))
+        self._server = ControlServer(endpoints, control.max_age)
         self._identity = identity
         self._queries = queries
         self._beat_period = control.beat_period
@@ -257,7 +256,7 @@ class MasterServices:
         sender = open_request.peer
         silent = Refused(f"the slave of {request.host} does not report to the master", "silent")
         try:
-            self._check_introduction(request, sender)
+            first = self._permitted_from(request, sender)
         except Refused as refusal:
             refuse(refusal)
             return
@@ -267,13 +266,13 @@ class MasterServices:
             refuse(silent)
             return
         # The expiry of the ticket needs the slave's clock, which is in the first reading.
-        self._links.after_first_reading(
-            link, lambda: open_request.answer(self._introduction(request, sender, link)),
+        self._links.introduce_after_first_reading(
+            link, lambda: open_request.answer(self._introduction(request, sender, link, first)),
             time.monotonic() + _FIRST_READING, lambda _: refuse(silent),
         )  # fmt: skip
 
     def _introduction(
-        self, request: srv.Introduce.Request, sender: Peer, link: HostLink
+        self, request: srv.Introduce.Request, sender: Peer, link: HostLink, first: int
     ) -> srv.Introduce.Response:
         """Return a ticket for one service of one slave."""
         if link.slave is None:
@@ -281,15 +280,19 @@ class MasterServices:
         until = int(self._links.reading_stats.beat[link.host_id]) + int(TICKET_LIFE * 1e9)
         security, whom = self._endpoints.security, sender.grant.principal
         version = ticket_version(self._identity.epoch, security)
-        ticket = Ticket(until, version, request.service, request.process, whom)
+        ticket = Ticket(until, version, request.service, first, request.process, whom)
         key = security.introduction(link.slave.peer, ticket)
         return srv.Introduce.Response(
             answer=accepted(epoch=self._identity.epoch), ticket=ticket.text(), key=key,
             run=link.slave.run,
         )  # fmt: skip
 
-    def _check_introduction(self, request: srv.Introduce.Request, sender: Peer) -> None:
-        """Raise `Refused` unless the sender may get a ticket for the service and process."""
+    def _permitted_from(self, request: srv.Introduce.Request, sender: Peer) -> int:
+        """Return the lowest number of an instance for which the sender may get a ticket.
+
+        Raises:
+            Refused: the sender may get none.
+        """
         fault = version_refusal(request.protocol_version, "a request for a ticket")
         if fault:
             raise Refused(fault, "version")
@@ -298,14 +301,17 @@ class MasterServices:
             is_allowed = request.service in (names.STORE_REPLICA, names.READ_SNAPSHOT)
             if not is_allowed or not self._queries.has_held(process, who.name):
                 raise Refused(f"{who} has no instance of {process!r}", "denied")
-        elif request.service != names.READ_LOG:
+            return 0
+        if request.service != names.READ_LOG:
             raise Refused(f"users get no ticket for {request.service!r}", "denied")
-        elif not self._queries.may_read_log(process, _requester(sender)):
+        first = self._queries.first_readable_log(process, _requester(sender))
+        if first is None:
             raise Refused(
                 f"the logs of {process!r} are for its owner and operators, and {who} is neither: "
                 f"ask one of them",
                 "denied",
             )
+        return first
 
     # --- read-only requests --------------------------------------------------------------
 

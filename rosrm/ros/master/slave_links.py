@@ -26,13 +26,15 @@ from rosrm.ros.sealed import SealedClient, SealedEndpoints
 from rosrm.ros.sealed_readings import RegisteredSlave, reading_channel
 from rosrm_msgs import srv
 
-#: Most orders and requests that wait for the next reading of one slave.
+#: Most orders and requests of one slave that wait for its next reading, and most introductions to
+#: it, which users can request in any number.
 _MOST_DEFERRED: Final = 1000
+_MOST_INTRODUCTIONS: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
 class _Deferred:
-    """An order for a slave, or a request of one, that waits for its next reading.
+    """An order for a slave, a request of it or an introduction to it, waiting for a reading.
 
     Attributes:
         deadline: monotonic seconds.
@@ -52,7 +54,8 @@ class HostLink:
     Attributes:
         slave: the registered slave; None: its key was revoked.
         incarnation: of the run that registered last; messages of a former run are ignored.
-        deferred: orders and requests that wait for its first beat.
+        deferred: orders and requests of it that wait for its first beat.
+        introductions: introductions to it that wait for its first beat.
         outbox: assignments for the answer to its open request.
         poll: answers that request; None: none is open.
         forget_poll: removes the open request from those that the master may still refuse.
@@ -63,6 +66,7 @@ class HostLink:
     control: SealedClient
     incarnation: int
     deferred: list[_Deferred] = field(default_factory=list)
+    introductions: list[_Deferred] = field(default_factory=list)
     outbox: list[Assignment] = field(default_factory=list)
     poll: Callable[[Any], None] | None = None
     forget_poll: Callable[[], None] = lambda: None
@@ -70,6 +74,19 @@ class HostLink:
     def is_of(self, sender: Peer) -> bool:
         """Return True if a sender is the slave of this host."""
         return self.slave is not None and sender.grant == self.slave.peer.grant
+
+    def take_waiting(self) -> list[_Deferred]:
+        """Remove and return all that waits for a reading, the orders first."""
+        waiting = self.deferred + self.introductions
+        self.deferred, self.introductions = [], []
+        return waiting
+
+    def take_late(self, now: float) -> list[_Deferred]:
+        """Remove and return what has waited until its deadline."""
+        late = [one for one in self.deferred + self.introductions if now >= one.deadline]
+        self.deferred = [one for one in self.deferred if now < one.deadline]
+        self.introductions = [one for one in self.introductions if now < one.deadline]
+        return late
 
     def close_poll(self) -> None:
         """Close the open request: it is answered, or its answer can reach no slave."""
@@ -166,8 +183,7 @@ class HostLinks:
     def _shut(self, link: HostLink) -> None:
         """Close the open request, and end the orders and requests that wait for the slave."""
         link.close_poll()
-        waiting, link.deferred = link.deferred, []
-        for order in waiting:
+        for order in link.take_waiting():
             order.done(None)
 
     def shut_revoked(self, has_access: Callable[[Peer], bool]) -> None:
@@ -188,9 +204,7 @@ class HostLinks:
         """Send the orders that waited for readings of these hosts."""
         for host_id in self._waiting.intersection(host_ids) if self._waiting else ():
             self._waiting.discard(host_id)
-            link = self._links[host_id]
-            waiting, link.deferred = link.deferred, []
-            for order in waiting:
+            for order in self._links[host_id].take_waiting():
                 order.send()
 
     def after_first_reading(
@@ -205,6 +219,19 @@ class HostLinks:
             send()
         else:
             self._wait(link, _Deferred(deadline, send, done))
+
+    def introduce_after_first_reading(
+        self, link: HostLink, send: Callable[[], None], deadline: float,
+        done: Callable[[None], None],
+    ) -> None:  # fmt: skip
+        """Do the same for an introduction to the slave; `done` is also called if too many wait."""
+        if self.reading_stats.beat[link.host_id]:
+            send()
+        elif len(link.introductions) >= _MOST_INTRODUCTIONS:
+            done(None)
+        else:
+            link.introductions.append(_Deferred(deadline, send, done))
+            self._waiting.add(link.host_id)
 
     def _wait(self, link: HostLink, order: _Deferred) -> None:
         if len(link.deferred) >= _MOST_DEFERRED:
@@ -270,7 +297,8 @@ class HostLinks:
         """
         if not assignment.has_snapshots:
             return assignment
-        key = self._endpoints.security.snapshot_key(assignment.spec.name)
+        first = assignment.snapshots_from
+        key = self._endpoints.security.snapshot_key(assignment.spec.name, first)
         return replace(assignment, state_key=key)
 
     # --- orders --------------------------------------------------------------------------
@@ -308,9 +336,8 @@ class HostLinks:
         self._client.expire(now)
         for host_id in list(self._waiting):
             link = self._links[host_id]
-            late = [order for order in link.deferred if now >= order.deadline]
-            link.deferred = [order for order in link.deferred if now < order.deadline]
-            if not link.deferred:
+            late = link.take_late(now)
+            if not (link.deferred or link.introductions):
                 self._waiting.discard(host_id)
             for order in late:
                 order.done(None)

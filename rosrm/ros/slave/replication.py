@@ -119,7 +119,7 @@ class ReplicationEndpoint:
                 answer(NotStored("version", fault))
                 return
             try:
-                open_request.check_process(request.process)
+                open_request.ticket_for(request.process)
             except Refused as refusal:
                 answer(NotStored("denied", str(refusal)))
                 return
@@ -141,7 +141,7 @@ class ReplicationEndpoint:
             if fault:
                 open_request.answer(srv.ReadSnapshot.Response(answer=refused("version", fault)))
                 return
-            open_request.check_process(request.process)
+            open_request.ticket_for(request.process)
             age = (request.number, request.sequence)
             size = min(request.max_bytes or MOST, MOST)
             host.read_part(request.process, age, request.offset, size, answer)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -15,7 +14,7 @@ from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetR
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
 from rosrm.ros import names
-from rosrm.ros.control import ControlServer, RequestGate, accepted, refused, version_refusal
+from rosrm.ros.control import ControlServer, accepted, refused, version_refusal
 from rosrm.ros.orders import order_from_msg
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
 from rosrm_msgs import srv
@@ -23,7 +22,11 @@ from rosrm_msgs import srv
 
 @dataclass(frozen=True, slots=True)
 class LogQuery:
-    """Requested part of a log; the fields are those of `ReadLog`."""
+    """Requested part of a log; the fields are those of `ReadLog`.
+
+    Attributes:
+        first: lowest number of an instance whose log the sender may read.
+    """
 
     process: str
     number: int = 0
@@ -31,6 +34,7 @@ class LogQuery:
     tail: int = 0
     since: float = 0.0
     max_bytes: int = 0
+    first: int = 0
 
 
 class ExecutorOutcome(NamedTuple):
@@ -87,7 +91,7 @@ class SlaveServices:
     ) -> None:  # fmt: skip
         self._duties = duties
         path = names.Names(endpoints.participant.settings.namespace)
-        server = ControlServer(endpoints, RequestGate(time.monotonic_ns, max_age), epoch)
+        server = ControlServer(endpoints, max_age, epoch)
         server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
         endpoints.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
 
@@ -136,11 +140,11 @@ class SlaveServices:
             open_request.answer(srv.ReadLog.Response(answer=refused("version", fault)))
             return
         try:
-            open_request.check_process(request.process)
+            ticket = open_request.ticket_for(request.process)
             part = self._duties.read_log(
                 LogQuery(
                     request.process, request.number, request.offset, request.tail, request.since,
-                    request.max_bytes,
+                    request.max_bytes, ticket.first,
                 )
             )  # fmt: skip
         except Refused as refusal:

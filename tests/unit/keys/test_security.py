@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import pickle
 import time
 from types import SimpleNamespace
@@ -169,10 +170,33 @@ def test_all_principals_recognize_the_signature_of_the_master(master: MasterSecu
     assert not member(ROBOT).is_signed(b"beat", b"")
 
 
+def test_a_stranger_causes_no_check_of_a_signature(master: MasterSecurity, monkeypatch) -> None:
+    """A check of the tag, which a stranger cannot make, takes a fiftieth of the time."""
+    checked: list[bytes] = []
+    monkeypatch.setattr(
+        security, "crypto_sign_open", lambda signed, _: checked.append(signed) or b""
+    )
+    robot, genuine = member(ROBOT), master.signature(b"beat")
+    for forged in (bytes(80), os.urandom(80), master.signature(b"other"), genuine[16:] + genuine):
+        assert not robot.is_signed(b"beat", forged)
+    assert checked == []
+    assert robot.is_signed(b"beat", genuine)
+    assert checked
+
+
+def test_another_submission_of_a_process_has_another_key_of_its_snapshots(
+    master: MasterSecurity,
+) -> None:
+    """The name may belong to another user by then."""
+    keys = {master.snapshot_key(name, first) for name in "pq" for first in (1, 8)}
+    assert len(keys) == 4
+
+
 def introduced(master: MasterSecurity, until: float = 59.0) -> tuple[Peer, Ticket, MemberSecurity]:
     """Return robot-1 as ada sees it, ada's ticket, and robot-1's own security."""
     robot = member(ROBOT)
-    ticket = Ticket(time.monotonic_ns() + int(until * 1e9), 3, "read_log", "talker", ADA.principal)
+    expiry = time.monotonic_ns() + int(until * 1e9)
+    ticket = Ticket(expiry, 3, "read_log", 7, "talker", ADA.principal)
     key = master.introduction(master.peer("host:robot-1", 3), ticket)
     return member(ADA).bearer(ticket.text(), key, robot.run), ticket, robot
 
@@ -208,7 +232,7 @@ def test_no_valid_ticket_is_forgotten(master: MasterSecurity, monkeypatch) -> No
 
     def asks(bearer: str, until: int) -> bool:
         """Let a bearer send its first request with a ticket."""
-        ticket = Ticket(until, 3, "read_log", "talker", Principal("user", bearer))
+        ticket = Ticket(until, 3, "read_log", 7, "talker", Principal("user", bearer))
         key = master.introduction(master.peer("host:robot-1", 3), ticket)
         slave = member(ADA).bearer(ticket.text(), key, robot.run)
         return opened(robot, slave.name, 0, said(slave))
@@ -222,7 +246,8 @@ def test_no_valid_ticket_is_forgotten(master: MasterSecurity, monkeypatch) -> No
 
 
 @pytest.mark.parametrize(
-    "changes", [{"process": "other"}, {"service": "control"}, {"until": 2**63}]
+    "changes",
+    [{"process": "other"}, {"service": "control"}, {"until": 2**63}, {"first": 0}],
 )
 def test_a_changed_ticket_opens_nothing(master: MasterSecurity, changes: dict) -> None:
     """The key is derived from the text of the ticket."""

@@ -15,7 +15,7 @@ from rosrm.master.queries import MasterQueries
 from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.rows import PluginRow
 from rosrm_msgs import srv
-from tests.unit.core.cluster import Cluster, Machine, process
+from tests.unit.core.cluster import Cluster, Machine, job, process
 
 SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")
 
@@ -130,3 +130,30 @@ def test_environment_and_parameters_are_shown_to_owner_and_operators(
     assert reasons["q"] == (refusal if details else refusal.partition("\n")[0])
     assert ("secret" in f"{listed} {story} {queries.explain('q', by)}") is details
     assert "/secret/key" not in f"{listed} {story}"
+
+
+def test_a_new_owner_of_a_name_reads_no_log_of_the_former_owner() -> None:
+    """The owner reads the logs of all its own submissions in a row, an operator those of all."""
+    ada, bob = Requester("user:ada"), Requester("user:bob")
+    cluster = Cluster("a")
+    queries = MasterQueries(
+        "m", cluster.state, SimpleNamespace(last_sequence=0), [],
+        uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
+    )  # fmt: skip
+
+    def run(by: Requester) -> int:
+        """Submit the process, run it to its end, and return the number of its instance."""
+        assert cluster.ask(happened.SubmissionReceived, (job("p"),), by).accepted
+        number = cluster["p"].owner
+        cluster.finish("p")
+        return number
+
+    adas = [run(ada), run(ada)]
+    assert queries.first_readable_log("p", ada) <= min(adas)
+    assert queries.first_readable_log("p", bob) is None
+    assert cluster.ask(happened.PruneRequested, ("p",), (), OPERATOR).accepted
+    assert [queries.first_readable_log("p", by) for by in (ada, bob, OPERATOR)] == [None, None, 0]
+    bobs = run(bob)
+    assert max(adas) < queries.first_readable_log("p", bob) <= bobs
+    assert queries.first_readable_log("p", ada) is None
+    assert queries.first_readable_log("p", OPERATOR) == 0

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import time
+from types import SimpleNamespace
+
 import pytest
 
-from rosrm.ros.control import RequestGate, check_answer, refused, version_refusal
+from rosrm.keys.cluster import ClusterSecret
+from rosrm.keys.security import MasterSecurity
+from rosrm.ros import control
+from rosrm.ros.callback_guard import CallbackGuard
+from rosrm.ros.control import (
+    ControlServer,
+    RequestGate,
+    accepted,
+    check_answer,
+    refused,
+    version_refusal,
+)
 from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import srv
 from rosrm_msgs.msg import Envelope
 
 S = 10**9
@@ -161,3 +176,69 @@ def test_check_answer_raises_the_refusal() -> None:
     with pytest.raises(Refused, match="the master speaks version 99"):
         check_answer(stranger, "the master")
     assert version_refusal(PROTOCOL_VERSION, "x") == ""
+
+
+class Served:
+    """A control server of a master without ROS, and the requests that it admits."""
+
+    def __init__(self) -> None:
+        self.handled: list[str] = []
+        self.endpoints = SimpleNamespace(
+            participant=SimpleNamespace(guard=CallbackGuard()), serve=self._serve
+        )
+        self.server = server = ControlServer(self.endpoints, 5.0)
+        server.offer(srv.Cancel, "/rosrm/cancel", self._handle)
+        server.offer(srv.RequestProcess, "/rosrm/poll", lambda *_: None, remember=False)
+
+    def _serve(self, kind, _name, take) -> None:
+        setattr(self, kind.__name__, take)
+
+    def _handle(self, request, _sealed, respond) -> None:
+        self.handled.append(request.envelope.request_id)
+        respond(srv.Cancel.Response(answer=accepted()))
+
+    def cancel(self, sender, number: int) -> None:
+        request = Requested()
+        request.peer = sender
+        self.Cancel(srv.Cancel.Request(envelope=self._fresh(f"{number}")), request)
+        (response,) = request.answers
+        self.refusal = response.answer.message
+
+    def poll(self, sender, number: int) -> None:
+        request = Requested()
+        request.peer = sender
+        self.RequestProcess(srv.RequestProcess.Request(envelope=self._fresh(f"{number}")), request)
+
+    @staticmethod
+    def _fresh(request_id: str) -> Envelope:
+        return envelope(time.monotonic_ns(), request_id=request_id)
+
+
+def test_a_member_that_floods_the_gate_is_refused_alone(monkeypatch) -> None:
+    """The requests of others are admitted, and their repetitions are recognized."""
+    monkeypatch.setattr(control, "_REMEMBERED", 10)
+    monkeypatch.setattr(control, "_MOST_REMEMBERED", 100)
+    security = MasterSecurity(ClusterSecret(bytes(32)))
+    ada, eve = security.peer("user:ada", 0), security.peer("user:eve", 0)
+    served = Served()
+    served.cancel(ada, 1)
+    for number in range(200):
+        served.cancel(eve, number)
+    assert "more than 100 requests came" in served.refusal
+    served.cancel(ada, 1)
+    served.cancel(ada, 2)
+    assert served.handled == ["1", *(str(number) for number in range(100)), "2"]
+
+
+def test_long_polls_take_little_memory_of_a_gate(monkeypatch) -> None:
+    """A thousand slaves send them for months."""
+    monkeypatch.setattr(control, "time", clock := Clock())
+    clock.monotonic_ns = clock
+    slave = MasterSecurity(ClusterSecret(bytes(32))).peer("host:a", 0)
+    served = Served()
+    served._fresh = lambda name: envelope(clock(), request_id=name)
+    for number in range(1000):
+        served.poll(slave, number)
+        clock.now += 30.0
+    (gate,) = served.server._gates.values()
+    assert len(gate._answers) <= 16

@@ -126,7 +126,7 @@ def test_a_ticket_from_before_a_revocation_is_refused() -> None:
     )
     service.security.tickets_from = 7
     for version, code in ((6, "stale"), (7, None), (8, None)):
-        name = Ticket(1, version, "read_log", "p", Principal("user", "ada")).text()
+        name = Ticket(1, version, "read_log", 0, "p", Principal("user", "ada")).text()
         bearer = NoSecurity(host).bearer(name, b"", service.security.run)
         answers = service.answers(sender=bearer)
         assert code is None or answers[-1].answer.code == code

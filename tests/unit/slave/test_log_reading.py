@@ -348,3 +348,14 @@ def test_a_loop_of_crashes_without_output_does_not_let_an_index_grow(tmp_path, k
         keeper.release((P.process, P.number))
     with log_index.Index(str(log_path(tmp_path, P))) as index:
         assert [mark[1:] for mark in index.marks(0, 99)] == [(0, 30), (7, 0), (7, 49)]
+
+
+def test_a_log_of_a_former_owner_of_the_name_is_not_there(tmp_path, log) -> None:
+    """Neither its content nor its number is shown to a reader with a ticket from a later number."""
+    log_path(tmp_path, InstanceId(P.process, 5)).write_bytes(b"new")
+    assert read(tmp_path, first=3).numbers == (3, 5)
+    with pytest.raises(Refused, match=r"no log of robot/p#3 \(any more\)") as refusal:
+        read(tmp_path, first=4)
+    assert refusal.value.code == "unknown"
+    part = read_log(tmp_path, LogQuery(P.process, 5, first=4), ended=False)
+    assert (part.content, part.numbers) == (b"new", (5,))

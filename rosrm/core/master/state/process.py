@@ -151,7 +151,7 @@ class Image:
 #: Fields of a process that are journaled unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
-    "principal",
+    "principal", "owned_from",
 )  # fmt: skip
 
 
@@ -170,6 +170,8 @@ class Process:
         wanted: desired state.
         born: lowest number of an instance since the submission; snapshots of lower numbers are
             void.
+        owned_from: lowest number of an instance since the name belongs to its principal; logs of
+            lower numbers are of another owner.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
         excluded: host name to the reason why the process cannot run there.
@@ -198,6 +200,7 @@ class Process:
     reason: str = ""
     excluded: dict[str, str] = field(default_factory=dict)
     born: int = 0
+    owned_from: int = 0
     migrations: int = 0
     moved_at: float = -inf
     exit_code: int | None = None

@@ -114,6 +114,36 @@ def test_waiting_requests_of_one_slave_are_bounded(links):
     assert sent == list(range(200, 1200))
 
 
+def test_introductions_take_no_place_of_an_order(links):
+    """Users can request any number of introductions; beyond the bound each gets no answer."""
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    link, sent = links.find(HOST, RUN, SLAVE), []
+    links.after_first_reading(link, partial(sent.append, "order"))
+    for _ in range(1200):
+        links.introduce_after_first_reading(
+            link, partial(sent.append, "introduction"), 5.0, lambda _: sent.append("refused")
+        )
+    assert sent == 1100 * ["refused"]
+    receive_reading(links, beat=100, sequence=1)
+    assert sent[1100:] == ["order", *100 * ["introduction"]]
+
+
+def test_an_introduction_ends_at_its_deadline(links):
+    """An order that waits beside it stays."""
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    link, ended = links.find(HOST, RUN, SLAVE), []
+    links._client.expire = lambda now: None
+    links.after_first_reading(link, lambda: ended.append("sent"))
+    links.introduce_after_first_reading(link, lambda: None, 5.0, ended.append)
+    links.expire(4.9)
+    assert ended == []
+    links.expire(5.0)
+    links.expire(6.0)
+    assert ended == [None]
+    receive_reading(links, beat=100, sequence=1)
+    assert ended == [None, "sent"]
+
+
 def test_the_link_of_a_slave_with_a_revoked_key_is_closed(links) -> None:
     """Orders and requests that wait for it end without an answer."""
     links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
@@ -153,7 +183,7 @@ def test_only_the_messages_have_the_key_and_only_for_a_process_with_snapshots(li
     links.open_poll(link, answers.append, lambda: None)
     links.flush(0)
     keys = [bytes(one.state_key) for one in answers[0].assignments]
-    assert keys == [SECURITY.snapshot_key("stateful"), b""]
+    assert keys == [SECURITY.snapshot_key("stateful", 1), b""]
     receive_reading(links, beat=100, sequence=1)
     for number, one in enumerate(kept):
         links.order(SendOrder(number, HOST, StartInstance(one)), now=0.0)
