@@ -176,6 +176,26 @@ def test_forged_reports_and_questions_have_no_effect():
         stage.close()
 
 
+def test_the_messages_have_the_run_of_the_source(stage):
+    """As in its reports in this handoff, or, after the handoff, as in its question."""
+    configs = stage.listen(1)
+
+    def run_in(phase: HandoffPhase) -> int:
+        stage.say(phase)
+        stage.wait(lambda: configs and configs[-1].phase == phase, "the message")
+        return configs[-1].source_run
+
+    assert run_in(HandoffPhase.SHADOW) == 0
+    stage.report(11, run=5)
+    stage.report(1, instance=1, run=77)
+    stage.wait(lambda: len(stage.events) == 2, "both reports")
+    assert run_in(HandoffPhase.SWITCH) == 77
+    assert run_in(HandoffPhase.DONE) == 77
+    stage.asker(1).publish(question(1, run=78))
+    stage.wait(lambda: len(stage.events) == 3, "the question")
+    assert run_in(HandoffPhase.RESUME) == 78
+
+
 def test_earlier_reports_reach_the_master(stage):
     """Reports from before the subscription arrive, as after a restart of the master."""
     stage.report(11, message="waits for /scan")

@@ -54,6 +54,8 @@ _ACK_PATIENCE: Final = 2.0
 #: accepted: of two masters at once the younger gives way, and a beat alone proves no master.
 _MISSED_BEATS: Final = 10
 _MISSED_BY_ANOTHER: Final = 3
+#: Seconds after which the slave logs that the master receives none of its messages.
+_SILENCE_LOGGED: Final = 5.0
 #: Seconds between two reports of messages without a valid key, and the highest number in one.
 _STRANGERS_EVERY: Final = 10.0
 _MOST_STRANGERS: Final = 2**32 - 1
@@ -123,6 +125,7 @@ class SlaveEndpoint:
         self._poll_at = 0.0
         self._poll_again = _FIRST_POLL_AGAIN
         self._status_sequence = 0
+        self._silent_since = math.inf  # -inf: the silence is logged
         self._strangers = 0
         self._strangers_at = -math.inf
         endpoints.refused = self._note_stranger
@@ -315,10 +318,27 @@ class SlaveEndpoint:
         sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))
-        if self.link is MasterLink.REGISTERED and self.host_id not in beat.silent_hosts:
-            self._take(events.ContactConfirmed(sent_at))
+        if self.link is MasterLink.REGISTERED:
+            self._note_contact(now, sent_at, is_silent=self.host_id in beat.silent_hosts)
         if self.link is MasterLink.LISTENING:
             self._register_if_known()
+
+    def _note_contact(self, now: float, sent_at: float, *, is_silent: bool) -> None:
+        """Confirm the contact with the master, or log once that it receives nothing from here."""
+        if not is_silent:
+            self._silent_since = math.inf
+            self._take(events.ContactConfirmed(sent_at))
+            return
+        before = self._silent_since
+        self._silent_since = min(before, now)
+        if before <= now - _SILENCE_LOGGED:
+            self._silent_since = -math.inf
+            if before > -math.inf:
+                _log.info(
+                    "the master receives no messages of this host: the network is cut, or the key "
+                    "of %s was revoked or replaced (`rosrm key list` on the machine of the master)",
+                    self._master.name,
+                )  # fmt: skip
 
     def _is_of_master(self, beat: msg.MasterBeat) -> bool:
         """Return True if a beat is that of the master with which this slave speaks."""

@@ -447,3 +447,24 @@ def test_messages_without_a_valid_key_are_reported_at_a_bounded_rate(slave) -> N
     assert len(published) == 1
     slave.pass_time(30.0, master)
     assert [one.strangers for one in published] == [1, 5000]
+
+
+def test_a_slave_that_the_master_does_not_receive_says_so_once(slave, caplog) -> None:
+    """For example after its key was revoked; the beats of the master still arrive."""
+    master = Master(slave, 11)
+    slave.join(master)
+
+    def lines(seconds: float, *silent: int) -> int:
+        for _ in range(round(seconds / PERIOD)):
+            slave.clock.now += PERIOD
+            master.beat(silent_hosts=silent)
+        said = sum("the key of host:h0 was revoked" in line for line in caplog.messages)
+        caplog.clear()
+        return said
+
+    assert lines(4.0, 1) == 0
+    assert lines(0.2) == 0
+    assert lines(4.8, 1) == 0
+    assert lines(60.0, 1) == 1
+    assert lines(1.0) == 0
+    assert lines(6.0, 1) == 1
