@@ -386,19 +386,22 @@ class NodeEntities:
         self, timers_due: Sequence[int], since: float, settle: Sequence[Callable[[], None]]
     ) -> Iterator[None]:
         """Start timers and services in steps of some ms; new messages are served between steps."""
-        if self.mode is not Mode.ACTIVE:
+        if not self._is_active():
             return
         self._start_timers(timers_due, time.monotonic() - since)
         self._due_at_start = None
         for opening in list(self._openings):
             yield
-            if self.mode is not Mode.ACTIVE:
+            if not self._is_active():
                 return
             if opening in self._openings:
                 opening.open()
         for call in settle:
             yield
             call()
+
+    def _is_active(self) -> bool:
+        return self.mode is Mode.ACTIVE
 
     def _start_timers(self, timers_due: Sequence[int], passed: float) -> None:
         for timer, due in itertools.zip_longest(list(self.timers), timers_due):
