@@ -24,7 +24,7 @@ The public names, by purpose:
 Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
-                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health
+                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
                 ResourceDescription, Reading
@@ -145,6 +145,7 @@ if TYPE_CHECKING:
         IsolationPolicy,
         Kind,
         MigrationPolicy,
+        NeighbourRule,
         ProcessSpec,
         Readiness,
         Reading,
@@ -164,7 +165,7 @@ __all__ = [
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
     "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
-    "MigrationStrategy", "Move", "NoMaster", "NoOptions", "PeriodicImaging", "Plan",
+    "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging", "Plan",
     "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
     "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
@@ -202,7 +203,7 @@ _NAMES: Final = {
     "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind MigrationPolicy "
-        "ProcessSpec Readiness Reading ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
+        "NeighbourRule ProcessSpec Readiness Reading ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {

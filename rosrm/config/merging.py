@@ -69,6 +69,16 @@ def _pairs(node: Node) -> Node:
     return Node(members, node.place, node.key_place)
 
 
+def _neighbours(node: Node) -> Node:
+    """Convert `camera` and `[camera, {processes: [map]}]` to a list of mappings."""
+    items = node.value if isinstance(node.value, tuple) else (node,)
+    names = tuple(item for item in items if not isinstance(item.value, Mapping))
+    rules = tuple(item for item in items if isinstance(item.value, Mapping))
+    if names:
+        rules = (Node({"processes": Node(names, node.place)}, node.place), *rules)
+    return Node(rules, node.place, node.key_place)
+
+
 _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "restart": _word("when"),
     "migration": _word("strategy"),
@@ -77,4 +87,7 @@ _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "isolation": _word("then"),
     "standby": _word("wanted"),
     "remappings": _pairs,
+    "near": _neighbours,
+    "apart": _neighbours,
+    "spread": _word("by"),
 }

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
-from rosrm.model.description_checks import is_namespace
+from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.values import (
     EMPTY,
     Health,
@@ -21,6 +21,7 @@ from rosrm.model.values import (
     IsolationPolicy,
     Kind,
     MigrationPolicy,
+    NeighbourRule,
     ProcessSpec,
     Readiness,
     ReadinessKind,
@@ -122,6 +123,24 @@ class LabelsInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class NeighboursInFile:
+    """Processes near which a process runs, or apart from which."""
+
+    processes: tuple[Text, ...]
+    by: Text = ""
+    prefer: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SpreadInFile:
+    """Group whose processes run apart from each other; the default is the process itself."""
+
+    by: Text = ""
+    group: Text = ""
+    prefer: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessInFile:
     """One process, with the keys of ROS 2 launch; shorthands are in long form."""
 
@@ -149,6 +168,9 @@ class ProcessInFile:
     isolation: IsolationInFile = field(default_factory=IsolationInFile)
     standby: StandbyInFile = field(default_factory=lambda: StandbyInFile(wanted=False))
     health: HealthInFile | None = None
+    near: tuple[NeighboursInFile, ...] = ()
+    apart: tuple[NeighboursInFile, ...] = ()
+    spread: SpreadInFile | None = None
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -173,7 +195,18 @@ class ProcessInFile:
             isolation=_same(IsolationPolicy, self.isolation),
             standby=_same(StandbyPolicy, self.standby),
             health=Health() if self.health is None else _same(Health, self.health),
+            neighbours=tuple(self._neighbour_rules()),
         )
+
+    def _neighbour_rules(self) -> Iterator[NeighbourRule]:
+        for one in self.near:
+            yield NeighbourRule("near", one.processes, by=one.by, prefer=one.prefer)
+        for one in self.apart:
+            yield NeighbourRule("apart", one.processes, by=one.by, prefer=one.prefer)
+        spread = self.spread
+        if spread is not None:
+            group = spread.group or self.name
+            yield NeighbourRule("apart", group=group, by=spread.by, prefer=spread.prefer)
 
 
 def _same(wanted: type[_Value], of: Any, **others: Any) -> _Value:
@@ -240,6 +273,19 @@ def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
     if spec.host_loss.delay and spec.host_loss.then == "wait":
         text = "host_loss.delay requires `then: elsewhere` or `then: stop`"
         yield Complaint(("host_loss", "delay"), text)
+
+
+def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
+    for rule in spec.neighbours:
+        key = rule.relation
+        if not rule.processes and not rule.group:
+            yield Complaint((key,), f"{key}: at least one process is required")
+        for name in rule.processes:
+            fault = name_fault(name, "process")
+            if name == spec.name:
+                fault = f"{name} names itself; only other processes are allowed"
+            if fault:
+                yield Complaint((key,), f"{key}: {fault}")
 
 
 def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -333,4 +379,5 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_restarts, ("restart",)),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
+    (_about_neighbours, ("name", "near", "apart", "spread")),
 )

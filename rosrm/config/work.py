@@ -58,7 +58,7 @@ def checked_work(
     nodes = [
         node
         for entry in entries
-        for node in expanded(merged(defaults, written_out(entry)), problems)
+        for node in expanded(_with_group(merged(defaults, written_out(entry))), problems)
     ]
     specs = [_process(node, path, plugins, problems) for node in nodes]
     refuse_namesakes(nodes, "process", problems)
@@ -99,6 +99,22 @@ def _defaults(root: Node, problems: Problems) -> Node:
             text = f"defaults: {name} is allowed in a process only"
             problems.add(node.key_place or node.place, text)
     return written_out(defaults)
+
+
+def _with_group(entry: Node) -> Node:
+    """Return an entry with `foreach` whose processes are a group, unless `spread` names one.
+
+    The group is the entry's name before the values of `foreach` are put into it.
+    """
+    name, spread = entry.get("name"), entry.get("spread")
+    if name is None or not isinstance(name.value, str) or spread is None:
+        return entry
+    if entry.get("foreach") is None or not spread.items or "group" in spread.items:
+        return entry
+    kept = name.value.replace("{", "{{").replace("}", "}}")
+    members = {**spread.items, "group": Node(kept, spread.place)}
+    spread = Node(members, spread.place, spread.key_place)
+    return Node({**entry.items, "spread": spread}, entry.place, entry.key_place)
 
 
 def _process(

@@ -61,6 +61,7 @@ class EventKind(str, Enum):
     FENCED = "fenced", "a host runs an instance that has a successor: it is killed"
     GIVEN_UP = "given_up", "the host of the instance is lost, and the instance is given up"
     READOPTED = "readopted", "the lost host rejoined, and its instance owns the name again"
+    SEPARATED = "separated", "the process no longer runs near another one, with the reason"
 
     # --- hosts ---------------------------------------------------------------------------
 

@@ -30,6 +30,7 @@ ReadinessKind = Literal["auto", "graph", "running"]
 HostLossAction = Literal["wait", "elsewhere", "stop"]
 IsolationAction = Literal["keep", "stop"]
 Accounting = Literal["attributed", "shared", "countable"]
+Relation = Literal["near", "apart"]
 
 
 class Kind(str, Enum):
@@ -153,6 +154,25 @@ class StandbyPolicy:
 
 
 @dataclass(frozen=True, slots=True)
+class NeighbourRule:
+    """Rule on the hosts of a process, relative to the hosts of other processes.
+
+    Attributes:
+        relation: "near": on the host of each of the others; "apart": on another host.
+        processes: names of the others.
+        group: name of a group; the others are all processes with a rule of this group; "": none.
+        by: host label; hosts with the same value of it count as one place; "": each host is one.
+        prefer: True: where the rule cannot be kept, the process runs elsewhere instead of waiting.
+    """
+
+    relation: Relation
+    processes: tuple[str, ...] = ()
+    group: str = ""
+    by: str = ""
+    prefer: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Health:
     """Health checks of a running process; an unhealthy process has failed.
 
@@ -187,6 +207,7 @@ class ProcessSpec:
         preferred_labels: of the hosts that fit, those with more of these labels are preferred.
         avoided_labels: a host with any of these labels is chosen only if no other host fits.
         priority: processes with a higher number are placed first.
+        neighbours: rules on its hosts, relative to other processes.
     """
 
     name: str
@@ -215,6 +236,7 @@ class ProcessSpec:
     isolation: IsolationPolicy = IsolationPolicy()
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
+    neighbours: tuple[NeighbourRule, ...] = ()
 
     def __post_init__(self) -> None:
         """Set the default of `ros`, which depends on `package`."""

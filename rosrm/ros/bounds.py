@@ -44,6 +44,8 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.preferred_labels": 256,
     "ProcessSpec.avoided_labels": 256,
     "StandbyPolicy.apart_by": 256,
+    "ProcessSpec.neighbours": 256,
+    "NeighbourRule.processes": 1024,
     "ProcessStatusBatch.failing": 1000,
     "ProcessUsage.others": 16,
     "Sealed.body": 1 << 24,

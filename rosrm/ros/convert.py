@@ -107,6 +107,13 @@ _known_fields: Final[Callable[[Any], tuple[tuple[str, str, _Convert, _Convert], 
 def _forms(hint: Any) -> tuple[_Convert, _Convert]:
     if isinstance(hint, type) and is_dataclass(hint):
         return partial(_to_msg, getattr(msg, hint.__name__)), partial(_from_msg, hint)
+    entries = get_args(hint)
+    if entries[1:] == (Ellipsis,) and is_dataclass(entries[0]):
+        to_msg, from_msg = _forms(entries[0])
+        return (
+            lambda known: [to_msg(one) for one in known],
+            lambda received: tuple(from_msg(one) for one in received),
+        )
     return _FORMS.get(hint, (_unchanged, _unchanged))
 
 
@@ -182,7 +189,12 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         return "give exactly one of package + executable, module, command"
     if bool(message.package) != bool(message.executable):
         return "package and executable go together"
-    return _word_fault(message) or _needs_fault(message) or _times_fault(message)
+    return (
+        _word_fault(message)
+        or _needs_fault(message)
+        or _times_fault(message)
+        or _neighbours_fault(message)
+    )
 
 
 def _name_fault(message: msg.ProcessSpec) -> str:
@@ -203,6 +215,20 @@ def _needs_fault(message: msg.ProcessSpec) -> str:
             return f"it needs {need.resource!r:.100}, which is no name of a resource"
         if not 0.0 <= need.amount <= _MOST_NEEDED:
             return f"it needs {need.amount} of {need.resource}; allowed: 0 to {_MOST_NEEDED:g}"
+    return ""
+
+
+def _neighbours_fault(message: msg.ProcessSpec) -> str:
+    for rule in message.neighbours:
+        if rule.relation not in get_args(values.Relation):
+            allowed = ", ".join(get_args(values.Relation))
+            return f"neighbours: {rule.relation!r:.100}; allowed: {allowed}"
+        if bool(rule.processes) == bool(rule.group):
+            return "neighbours: give either processes or a group"
+        for name in rule.processes:
+            fault = name_fault(name, "process")
+            if fault:
+                return f"neighbours: {fault}"
     return ""
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from rosrm.core.master.assignment.assign import decide_now
+from rosrm.core.master.assignment.neighbours import awaited_neighbour
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
@@ -172,6 +173,10 @@ def _replicas(state: MasterState, process: Process, now: float) -> list[Mapping[
 
 def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
     position = row.queue_position
+    if process.name in state.neighbours.separated:
+        return state.neighbours.separated[process.name][0]
+    if position and awaited_neighbour(state, process):
+        return awaited_neighbour(state, process)
     if process.phase is not ProcessPhase.QUEUED or position <= 1:
         awaited = _awaited_node(process, state.instances.get(process.owner))
         return reason_of(state, process) or awaited

@@ -22,6 +22,7 @@ from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.migration import Migration, migration_to_dict
+from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
@@ -120,6 +121,7 @@ class MasterState:
         self.wants_standby: dict[str, None] = {}
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
+        self.neighbours = NeighbourRules()
         self.set_aside: set[str] = set()
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
@@ -283,9 +285,12 @@ class MasterState:
             self.terminal.pop(process.name, None)
             if process.spec.standby.wanted:
                 self.wants_standby.setdefault(process.name)
+            if process.spec.neighbours:
+                self.neighbours.add(process.spec)
         else:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
+            self.neighbours.remove(process.name)
 
     def collect_garbage(self) -> None:
         """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
@@ -396,6 +401,7 @@ class MasterState:
         host.instances.add(instance.number)
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
+        self.neighbours.note_change(instance.process)
         return added
 
     def reserve(self, instance: InstanceId, host: Host, now: float, ranking: Ranking) -> None:
@@ -411,6 +417,7 @@ class MasterState:
         if not self.unowned_instances.get(name, True):
             del self.unowned_instances[name]
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
+        self.neighbours.note_change(name)
 
     def assignment(
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,

@@ -11,6 +11,7 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.checkpoint import image_requests, images, replication
 from rosrm.core.master.commands import Reply
+from rosrm.core.master.contradictions import neighbour_fault
 from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import MasterState
@@ -156,7 +157,8 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
         if spec.standby.wanted and not state.declared.capabilities_of(spec).shadow:
             fault = no_standby(strategy, state.declared.capabilities)
             return f"{spec.name}: {fault}. Nothing was queued"
-    return ""
+    fault = neighbour_fault(state, event.specs)
+    return f"{fault}. Nothing was queued" if fault else ""
 
 
 def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:

@@ -17,6 +17,7 @@ from rosrm.core.master.hosts.registration import review_departures
 from rosrm.core.master.lifecycle import stop_instance
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import evict_from_hosts
+from rosrm.core.master.migration.reunion import review_separated
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
@@ -46,6 +47,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     _review_forged_batches(state, now)
     capabilities.ask_hosts(state, now)
     images.review(state, now)
+    review_separated(state, now)
     evict_from_hosts(state, now)
     replication.review(state, now)
     periodic.review(state, now)

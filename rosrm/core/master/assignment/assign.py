@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import replace
 from math import inf
 from typing import Any, Final
 
 import numpy as np
 
+from rosrm.core.master.assignment.neighbours import (
+    awaited_neighbour,
+    neighbours_of,
+    waiting_with,
+)
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign
 from rosrm.core.master.hosts import capabilities
@@ -26,7 +33,7 @@ from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import EMPTY
-from rosrm.wording import listed
+from rosrm.wording import counted, listed
 
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACHED)
 _AWAITS_SNAPSHOT: Final = "a host that may have its snapshot has not rejoined yet"
@@ -37,16 +44,23 @@ _FIRST_REQUEST: Final = 1.0
 def demand_of(state: MasterState, process: Process) -> Demand:
     """Return the demand of a process.
 
-    A change of the learned needs, or of the hosts with a replica of its snapshot, rebuilds it.
+    A change of the learned needs, of the hosts with a replica of its snapshot, or of the hosts of
+    its neighbours rebuilds it.
     """
     version = state.learned.version
     near = state.replication.replicas.hosts_of(process.name, process.born)
+    neighbours = neighbours_of(state, process)
     known = process.demand
-    if known is None or known[0] != version or known[1].near != near:
+    if (
+        known is None
+        or known[0] != version
+        or known[1].near != near
+        or known[1].neighbours != neighbours
+    ):
         needs = state.estimate(process.spec)
         demand = Demand(
             process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
-            reads=state.declared.reads,
+            neighbours=neighbours, reads=state.declared.reads,
         )  # fmt: skip
         # Equal processes share one demand, because thousands of them may wait.
         known = process.demand = (version, state.demands.setdefault(demand.key, demand))
@@ -55,19 +69,23 @@ def demand_of(state: MasterState, process: Process) -> Demand:
 
 def demand_to_move(
     state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float,
-    lacking: Mapping[str, str] = EMPTY,
+    lacking: Mapping[str, str] = EMPTY, *, together: AbstractSet[str] = frozenset(),
 ) -> Demand:  # fmt: skip
     """Return the demand of a running process at the destination of its migration.
 
-    `lacking`: hosts without a needed executor, each with the reason.
+    Args:
+        lacking: hosts without a needed executor, each with the reason.
+        together: names of the processes that move with it to the same host.
     """
     excluded = {
         **process.excluded, **unable(state, process, source), **lacking,
         source: "it is the source of the move",
     }  # fmt: skip
     amounts, guessed = demand_amounts(state, process, measured_need(state, seen))
-    reads = state.declared.reads
-    return Demand(process.spec, amounts, guessed, excluded, headroom, reads=reads)
+    return Demand(
+        process.spec, amounts, guessed, excluded, headroom,
+        neighbours=neighbours_of(state, process, together=together), reads=state.declared.reads,
+    )  # fmt: skip
 
 
 def measured_need(state: MasterState, seen: Mapping[str, float]) -> Mapping[str, float]:
@@ -77,7 +95,10 @@ def measured_need(state: MasterState, seen: Mapping[str, float]) -> Mapping[str,
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
     """Return the demand of a process on the host of its image, where it is to be restored."""
-    return Demand(process.spec, *demand_amounts(state, process, seen), reads=state.declared.reads)
+    return Demand(
+        process.spec, *demand_amounts(state, process, seen),
+        neighbours=neighbours_of(state, process), reads=state.declared.reads,
+    )  # fmt: skip
 
 
 def demand_amounts(
@@ -92,6 +113,33 @@ def demand_amounts(
     amounts = {name: max(needs.amounts.get(name, 0.0), seen.get(name, 0.0)) for name in names}
     guessed = {name for name in needs.estimated if amounts[name] > seen.get(name, 0.0)}
     return amounts, frozenset(guessed)
+
+
+def joint_demand(state: MasterState, demands: Mapping[str, Demand]) -> Demand:
+    """Return the demand of the first process for a host that takes all of the processes.
+
+    `demands`: the demand of each process by its name.
+    """
+    demand, *others = demands.values()
+    if not others:
+        return demand
+    table, excluded = state.hosts, dict(demand.excluded)
+    for name, other in list(demands.items())[1:]:
+        ranking = ranking_of(state, other)
+        for host in table.listed():
+            if not ranking.fits(host.column):
+                excluded.setdefault(host.name, f"it cannot take {name}, which must run beside it")
+    for column in np.flatnonzero(table.bound - table.processes < len(demands)):
+        why = f"it accepts no {counted(len(demands), 'more process', 'more processes')} now"
+        excluded.setdefault(table.hosts[column].name, why)
+    amounts: dict[str, float] = {}
+    for one in demands.values():
+        for resource, amount in one.amounts.items():
+            amounts[resource] = amounts.get(resource, 0.0) + amount
+    declared = frozenset[str]().union(*(one.declared for one in demands.values()))
+    return replace(
+        demand, amounts=amounts, estimated=frozenset(amounts) - declared, excluded=excluded
+    )
 
 
 def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
@@ -138,10 +186,13 @@ def place_waiting(state: MasterState, now: float) -> None:
         state.processes[head].reason = state.processes[head].reason or why
         return
     passed_over = _passed_over(state, now)
-    if state.settings.backfill:
-        _place_any(state, passed_over, now)
-    else:
-        _place_in_order(state, passed_over, now)
+    awaiting: frozenset[str] | None = None
+    while awaiting != (found := _awaiting_neighbours(state, now)):
+        awaiting = found
+        if state.settings.backfill:
+            _place_any(state, passed_over | awaiting, now)
+        else:
+            _place_in_order(state, passed_over | awaiting, now)
     if not passed_over:
         state.placed_at = _versions(state)
 
@@ -171,6 +222,18 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     for name in names:
         _record_wait_reason(state, state.processes[name], _AWAITS_SNAPSHOT, now)
     return frozenset(names)
+
+
+def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
+    """Return the processes that wait for a neighbour and do not block those behind them."""
+    found = []
+    for name in state.neighbours.declared:
+        if name in state.queue:
+            why = awaited_neighbour(state, state.processes[name])
+            if why:
+                _record_wait_reason(state, state.processes[name], why, now)
+                found.append(name)
+    return frozenset(found)
 
 
 def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
@@ -211,7 +274,8 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     ranking = ranking_of(state, demand)
     column = ranking.best()
     if column >= 0:
-        _assign(state, process, ranking, column, now)
+        decision = _decide_jointly(state, process, ranking, column)
+        _assign(state, process, ranking, decision, now)
         return True
     never = why_never(state.hosts, demand)
     if never:
@@ -221,10 +285,25 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     return False
 
 
+def _decide_jointly(state: MasterState, process: Process, ranking: Ranking, best: int) -> Decision:
+    """Return the decision for the best host; if possible, for one with room for all tied to it."""
+    others = waiting_with(state, process) if state.neighbours.concern(process.name) else ()
+    if others:
+        names = {process.name, *(one.name for one in others)}
+        demands = {process.name: ranking.demand}
+        for one in others:
+            neighbours = neighbours_of(state, one, together=names)
+            demands[one.name] = replace(demand_of(state, one), neighbours=neighbours)
+        joint = ranking_of(state, joint_demand(state, demands))
+        if joint.best() >= 0:
+            return decide(joint)
+    return decide(ranking, chosen=best)
+
+
 def _assign(
-    state: MasterState, process: Process, ranking: Ranking, column: int, now: float
+    state: MasterState, process: Process, ranking: Ranking, decision: Decision, now: float
 ) -> None:
-    decision = decide(ranking, chosen=column)
+    column = decision.column
     host = state.hosts.hosts[column]
     instance = state.new_instance_id(process)
     state.queue.remove(process.name)

@@ -8,22 +8,25 @@ has room, no process moves.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from typing import Final
 
 from rosrm.core.master.assignment.assign import (
     demand_amounts,
     demand_to_move,
+    joint_demand,
     measured_need,
     ranking_of,
 )
+from rosrm.core.master.assignment.neighbours import moving_neighbour, running_with
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.start import (
     begin_move,
     moves_under_way,
     plan_move,
+    why_busy,
     why_immovable,
     why_never_movable,
     why_no_executor,
@@ -35,6 +38,7 @@ from rosrm.core.master.scheduling.feasibility import may_ever_take
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import DesiredState, Instance, Process
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
@@ -175,36 +179,83 @@ def try_move(
 ) -> Rejected | None:  # fmt: skip
     """Move a process to the host with the largest margin, or to a given one.
 
-    A host that lacks an executor of the plan is skipped, unless it was given.
+    The processes that must stay on one host with it move along. A host that lacks an executor of a
+    plan is skipped, unless it was given.
 
     Returns:
         None; or the reason why the process cannot be moved, and nothing has changed.
     """
-    refusal = why_immovable(state, process)
+    moving = [process, *running_with(state, process)]
+    refusal = why_immovable(state, process) or _why_bound(state, moving)
     if refusal:
         return Rejected(refusal)
-    source, lacking = state.instances[process.owner], dict[str, str]()
-    measured = source.measured
+    source, lacking = state.instances[process.owner].host, dict[str, str]()
     while True:
-        demand = demand_to_move(state, process, measured, source.host.name, headroom, lacking)
-        ranking = ranking_of(state, demand)
-        destination = _destination(state, process, ranking, source.host, host)
+        rankings = _rankings_to_move(state, moving, headroom, lacking)
+        demands = {name: ranking.demand for name, ranking in rankings.items()}
+        ranking = ranking_of(state, joint_demand(state, demands))
+        destination = _destination(state, process, ranking, source, host)
         if isinstance(destination, Rejected):
             return Rejected("; ".join(dict.fromkeys(lacking.values()))) if lacking else destination
-        migration = plan_move(state, process, destination, cause, now)
+        migrations = _planned_moves(state, moving, destination, cause, now)
+        if isinstance(migrations, Rejected):
+            return migrations
+        unfit = next((one for one in migrations if why_no_executor(state, one)), None)
+        if unfit is None:
+            break
+        hosts, shared = without_executor(state, unfit)
+        if host is not None or not hosts:
+            return Rejected(why_no_executor(state, unfit))
+        lacking.update(dict.fromkeys(hosts, shared))
+    for one, migration in zip(moving, migrations, strict=True):
+        judged = ranking if one is process else rankings[one.name]
+        decision = decide(judged, chosen=destination.column)
+        begin_move(state, one, migration, rankings[one.name], now)
+        state.note_decision(one, decision, "migrated", now)
+    return None
+
+
+def _why_bound(state: MasterState, moving: Sequence[Process]) -> str:
+    """Return why a process cannot move for the sake of those near it; "": they move, too."""
+    process, *others = moving
+    for one in others:
+        refusal = why_immovable(state, one)
+        if refusal:
+            return f"{process.name} must stay near {one.name}, and {refusal}"
+    for one in moving:
+        other = moving_neighbour(state, one)
+        if other:
+            return f"{one.name} must stay near {other}, and {why_busy(state.migrations[other])}"
+    return ""
+
+
+def _rankings_to_move(
+    state: MasterState, moving: Sequence[Process], headroom: float, lacking: Mapping[str, str]
+) -> dict[str, Ranking]:
+    """Return the ranking of each process, as if the others had moved already."""
+    names = {one.name for one in moving}
+    rankings = {}
+    for one in moving:
+        source = state.instances[one.owner]
+        demand = demand_to_move(
+            state, one, source.measured, source.host.name, headroom, lacking, together=names
+        )
+        rankings[one.name] = ranking_of(state, demand)
+    return rankings
+
+
+def _planned_moves(
+    state: MasterState, moving: Sequence[Process], destination: Host, cause: str, now: float
+) -> list[Migration] | Rejected:
+    """Return the plan of each process, or the first reason why there is none."""
+    planned = []
+    for one in moving:
+        migration = plan_move(state, one, destination, cause, now)
         if isinstance(migration, Rejected):
             return migration
-        refusal = why_no_executor(state, migration)
-        if not refusal:
-            break
-        hosts, shared = without_executor(state, migration)
-        if host is not None or not hosts:
-            return Rejected(refusal)
-        lacking.update(dict.fromkeys(hosts, shared))
-    decision = decide(ranking, chosen=destination.column)
-    begin_move(state, process, migration, ranking, now)
-    state.note_decision(process, decision, "migrated", now)
-    return None
+        planned.append(migration)
+        cause = f"it must run near {moving[0].name}, which moves there"
+    return planned
 
 
 def _destination(
@@ -216,7 +267,7 @@ def _destination(
         if column < 0:
             if _is_alone(state, source):
                 return Rejected(_ALONE)
-            why = _and_why(state, process, source)
+            why = _and_neighbours(ranking.demand) + _and_why(state, process, source)
             return Rejected(f"no host has room for {process.name}{why}")
         return state.hosts.hosts[column]
     if host is source:
@@ -235,6 +286,16 @@ def _and_why(state: MasterState, process: Process, source: Host) -> str:
     """Return the first reasons of the strategy against hosts; "" for none."""
     faults = capabilities.faults(state, process.spec.migration.strategy or "", source)
     return "".join(f"; {fault}" for fault in few(faults, _MOST_REASONS))
+
+
+def _and_neighbours(demand: Demand) -> str:
+    """Return a phrase on each required rule of a demand on its neighbours; "" for none."""
+    rules = [rule for rule in demand.neighbours if not rule.prefer and rule.at]
+    return "".join(
+        f"; it must run {rule.relation} {'' if rule.relation == 'near' else 'from '}"
+        f"{listed(dict.fromkeys(name for _, name in rule.at))}"
+        for rule in rules
+    )
 
 
 # --- drain ------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ has ended               the standby is stopped
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from rosrm.core.master import lifecycle
@@ -97,12 +98,20 @@ def _can_wait(migration: Migration) -> bool:
 
 
 def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
-    """Return the demand of a standby: that of the process, without hosts too near the primary."""
+    """Return the demand of a standby: that of the process, without hosts too near the primary.
+
+    A standby need not run near the neighbours of the process, but must run apart from others.
+    """
     own = demand_of(state, process)
     excluded = {**process.excluded, primary.name: "the primary runs there"}
     labels = primary.description.labels
+    spread = [rule.by for rule in process.spec.neighbours if rule.group and not rule.prefer]
+    apart_by = dict.fromkeys((*process.spec.standby.apart_by, *filter(None, spread)))
+    neighbours = tuple(
+        replace(rule, prefer=rule.prefer or rule.relation == "near") for rule in own.neighbours
+    )
     for host in state.hosts.hosts:
-        for label in process.spec.standby.apart_by:
+        for label in apart_by:
             value = host.description.labels.get(label)
             if value is None:
                 why = f"it has no label {label!r}, in which the standby must differ"
@@ -110,7 +119,10 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
             elif value == labels.get(label):
                 why = f"it has {label}={value}, as the host of the primary"
                 excluded.setdefault(host.name, why)
-    return Demand(process.spec, own.amounts, own.estimated, excluded, reads=state.declared.reads)
+    return Demand(
+        process.spec, own.amounts, own.estimated, excluded, neighbours=neighbours,
+        reads=state.declared.reads,
+    )  # fmt: skip
 
 
 def _wait(state: MasterState, process: Process, why: str, now: float) -> None:

@@ -3,6 +3,7 @@
 filters.py      placement rules: masks over hosts, with the reasons against hosts
 ranking.py      filter, score, pick
 decision.py     outcome with its reasons, for `rosrm explain`
+proximity.py    hosts near other processes or apart from them
 feasibility.py  hosts that may ever take a process
 candidates.py, host_views.py   views of hosts for filters and for scoring policies
 """

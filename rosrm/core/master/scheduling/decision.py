@@ -15,6 +15,7 @@ import numpy as np
 from rosrm.core.master.scheduling.candidates import Candidates, candidates
 from rosrm.core.master.scheduling.filters import BY_ASSIGNMENT, Refusal, first_of, refusals
 from rosrm.core.master.scheduling.host_views import host_view, process_view
+from rosrm.core.master.scheduling.proximity import unmet
 from rosrm.core.master.scheduling.ranking import TIE, NamedPolicy, Ranking
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.lazy import Lazy
@@ -187,6 +188,7 @@ def _verdict(
     if value < np.inf:
         score = value - TIE * float(moment.hosts.processes[at])
         reason = _policy_reason(moment, scores, at, veto=False)
+        reason = "; ".join(filter(None, (reason, unmet(moment.hosts, at))))
         return Verdict(name, "chosen" if chosen else "fits", score, reason)
     if refused is not None:
         return Verdict(name, refused.filter.verdict, None, refused.reason)

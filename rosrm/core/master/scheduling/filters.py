@@ -13,7 +13,9 @@ from typing import Final, Literal
 
 import numpy as np
 
+from rosrm.core.master.scheduling import proximity
 from rosrm.core.master.scheduling.candidates import Candidates
+from rosrm.core.master.state.demand import Neighbour
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.wording import amount, counted
@@ -31,6 +33,7 @@ class Lasts(Enum):
     MOMENT = "until a message or the end of a process changes it"
     RETURN = "until the slave reports to this run of the master, which is expected"
     AWAY = "until the host registers or rejoins, or a user uncordons it"
+    NEIGHBOURS = "until an instance of another process starts, moves or ends"
     PERMANENT = "until the host registers with other labels, resources or plugins"
 
 
@@ -44,8 +47,8 @@ class Filter:
         reason: returns why the host of a row fails, as a predicate without the host's name, with
             the limiting setting if there is one. Called only for rows where `mask` is False.
         lasts: how long a host fails the filter. A process is set aside, and does not block the
-            queue, if each host fails a permanent filter even as an empty host. A host that is away
-            counts as failing, unless all hosts are away.
+            queue, if each host fails a permanent filter even as an empty host, or a rule on
+            neighbours. A host that is away counts as failing, unless all hosts are away.
         by_assignment: True if an assignment changes the mask. Mask and reason then may read only
             the demand and the arrays of the candidates, because a decision copies those alone and
             formats the reason later.
@@ -144,6 +147,31 @@ def _why_no_resources(hosts: Candidates, row: int) -> str:
     needs = zip(hosts.resources, hosts.need[:, row].tolist(), strict=True)
     there = {name for name, need in needs if need < np.inf}
     return f"it has no {min(hosts.demand.declared - there)}"
+
+
+# --- neighbours -------------------------------------------------------------------------------
+
+
+def _keeps_neighbours(hosts: Candidates) -> BoolArray | None:
+    rules = _required_neighbours(hosts)
+    if not rules:
+        return None
+    kept = [proximity.keeping(hosts.table, rule)[hosts.columns] for rule in rules]
+    allowed: BoolArray = np.logical_and.reduce(kept)
+    return allowed
+
+
+def _why_not_kept(hosts: Candidates, row: int) -> str:
+    column = hosts.host(row).column
+    return next(
+        proximity.why_not_kept(hosts, row, rule)
+        for rule in _required_neighbours(hosts)
+        if not proximity.keeping(hosts.table, rule)[column]
+    )
+
+
+def _required_neighbours(hosts: Candidates) -> list[Neighbour]:
+    return [rule for rule in hosts.demand.neighbours if not rule.prefer]
 
 
 # --- presence of the host ---------------------------------------------------------------------
@@ -248,11 +276,13 @@ def _why_no_room(hosts: Candidates, row: int) -> str:
 # --- the list ---------------------------------------------------------------------------------
 
 EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
+NEIGHBOURS: Final = Filter("neighbours", _keeps_neighbours, _why_not_kept, Lasts.NEIGHBOURS)
 #: In order: if a host fails several, the first one gives the reason.
 FILTERS: Final = (
     EXCLUSION,
     Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),
     Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
+    NEIGHBOURS,
     Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
     Filter("expected", _is_not_expected, _why_not_up, Lasts.RETURN),
     Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),

@@ -25,6 +25,7 @@ from rosrm.core.master.scheduling.filters import (
     refusals,
 )
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
+from rosrm.core.master.scheduling.proximity import preference
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
@@ -49,7 +50,8 @@ class Ranking:
 
     Attributes:
         need: (R, H) fractions of each host's capacity.
-        value: (H,) score plus tie-break; inf where the host does not fit now.
+        value: (H,) score, term of preferred neighbours and tie-break; inf where the host does not
+            fit now.
         judge: the policy in use; None: every policy was left out, and each fitting host scores 0.
         plugins: guards every call of a policy.
         failure: why policies were left out.
@@ -71,6 +73,7 @@ class Ranking:
         self._standing = passing(STANDING, candidates(table, demand, self.need, every))
         self._refusals: dict[int, Refusal | None] = {}
         self._tier = _tiers(table, demand)
+        self._preference = preference(table, demand)
         self._lowest: list[int] | None = None
         self._own = -1
         self._ahead: dict[int, list[float]] = {}
@@ -184,6 +187,8 @@ class Ranking:
         if not np.count_nonzero(fits):
             return np.full(len(fits), np.inf)
         tie = TIE * judged.processes
+        if self._preference is not None:
+            tie = tie + self._preference[columns]
         if not self._left:
             return np.where(fits, tie, np.inf)
         hosts, process = host_view(judged), process_view(judged)

@@ -8,13 +8,30 @@ from operator import attrgetter
 from typing import Any, Final
 
 from rosrm.extensions.declared_fields import STANDARD_FIELDS
-from rosrm.model.values import EMPTY, ProcessSpec
+from rosrm.model.values import EMPTY, ProcessSpec, Relation
 
 _MAPPINGS: Final = tuple(
     name for name in STANDARD_FIELDS if isinstance(getattr(ProcessSpec(""), name), Mapping)
 )
 _mappings_of: Final = attrgetter(*_MAPPINGS)
 _plain_fields_of: Final = attrgetter(*(name for name in STANDARD_FIELDS if name not in _MAPPINGS))
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbour:
+    """A rule of or about a process, with the current hosts of the other processes.
+
+    Attributes:
+        relation, by, prefer: as in `NeighbourRule`.
+        at: (host, process) of each instance of the others, in order.
+        absent: why there is no host near which the process could run; "": there is one.
+    """
+
+    relation: Relation
+    by: str
+    prefer: bool
+    at: tuple[tuple[str, str], ...] = ()
+    absent: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +44,7 @@ class Demand:
         excluded: host name to the reason why the process must not run there.
         headroom: fraction by which a host must stay under each limit.
         near: hosts with a replica of its snapshot; each counts as one more preferred label.
+        neighbours: rules on its hosts, relative to other processes.
         reads: fields of the spec that scoring policies read beyond the standard ones.
         key: equal for demands with equal rankings.
     """
@@ -37,6 +55,7 @@ class Demand:
     excluded: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     headroom: float = 0.0
     near: tuple[str, ...] = ()
+    neighbours: tuple[Neighbour, ...] = ()
     reads: tuple[str, ...] = ()
     key: tuple[Any, ...] = field(init=False, compare=False)
 
@@ -44,6 +63,7 @@ class Demand:
         key = (
             *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
+            self.neighbours,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
             *(repr(getattr(self.spec, name)) for name in self.reads),
         )  # fmt: skip

@@ -122,7 +122,7 @@ class HostTable(HostColumns):
         self.hosts: list[Host] = []
         self.version = 0
         self.touched: list[int] = []
-        self._labelled: dict[tuple[str, str], BoolArray] = {}
+        self._labelled: dict[tuple[str, str | None], BoolArray] = {}
         self._listed: list[Host] | None = None
 
     # --- registration --------------------------------------------------------------------
@@ -201,8 +201,11 @@ class HostTable(HostColumns):
             self._listed = [host for host in self.hosts if not host.pruned]
         return self._listed
 
-    def labelled(self, key: str, value: str) -> BoolArray:
-        """Return the mask, (H,), of hosts with this label; cached until a host registers."""
+    def labelled(self, key: str, value: str | None) -> BoolArray:
+        """Return the mask, (H,), of hosts with this label; cached until a host registers.
+
+        `value` None: the hosts without any label of this key.
+        """
         known = self._labelled.get((key, value))
         if known is None or len(known) != len(self):
             found = [host.description.labels.get(key) == value for host in self.hosts]

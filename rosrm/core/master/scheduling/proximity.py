@@ -1,0 +1,115 @@
+"""Hosts near a process or apart from it: masks, the term of preferred rules, and reasons."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+
+from rosrm.core.master.scheduling.candidates import Candidates
+from rosrm.core.master.state.demand import Demand, Neighbour
+from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
+from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.wording import listed
+
+#: Added to the score for each neighbour that a host should be near or apart from, and is not. It is
+#: as large as the score of a full host by Eq. 1.
+TERM: Final = 1.0
+
+
+def keeping(table: HostTable, neighbour: Neighbour) -> BoolArray:
+    """Return the mask, (H,), of the hosts that keep a rule."""
+    beside = _neighbours_beside(table, neighbour) > 0.0
+    if neighbour.relation == "near":
+        return beside
+    return ~(beside | table.labelled(neighbour.by, None)) if neighbour.by else ~beside
+
+
+def preference(table: HostTable, demand: Demand) -> FloatArray | None:
+    """Return the term, (H,), of the preferred rules in the score; None: there are none."""
+    term = None
+    for neighbour in demand.neighbours:
+        if neighbour.prefer and neighbour.at:
+            beside = _neighbours_beside(table, neighbour)
+            unmet = beside == 0.0 if neighbour.relation == "near" else beside
+            term = TERM * unmet if term is None else term + TERM * unmet
+    return term
+
+
+def why_not_kept(hosts: Candidates, row: int, neighbour: Neighbour) -> str:
+    """Return a predicate: why a host does not keep a hard rule."""
+    host, by = hosts.host(row), neighbour.by
+    if neighbour.absent:
+        return neighbour.absent
+    others = listed(_names(neighbour.at))
+    if neighbour.relation == "near":
+        where = " or ".join(sorted({_place(hosts.table, name, by) for name, _ in neighbour.at}))
+        return f"{others}, near which the process must run, runs on {where}"
+    beside = listed(_names(_beside(hosts.table, host, neighbour)))
+    if not by:
+        return f"it runs {beside}, apart from which the process must run"
+    value = host.description.labels.get(by)
+    if value is None:
+        return f"it has no label {by!r}, by which the process must run apart from others"
+    return f"it has {by}={value}, as the host of {beside}, apart from which the process must run"
+
+
+def unmet(hosts: Candidates, row: int) -> str:
+    """Return a phrase on each preferred rule that adds to the score of a host; "": none."""
+    host, phrases = hosts.host(row), []
+    for neighbour in hosts.demand.neighbours:
+        if not neighbour.prefer or not neighbour.at:
+            continue
+        beside = _beside(hosts.table, host, neighbour)
+        if neighbour.relation == "near" and not beside:
+            phrases.append(f"+{TERM:g}: not near {listed(_names(neighbour.at))}")
+        elif neighbour.relation == "apart" and beside:
+            phrases.append(f"+{TERM * len(beside):g}: not apart from {listed(_names(beside))}")
+    return "; ".join(phrases)
+
+
+def _neighbours_beside(table: HostTable, neighbour: Neighbour) -> FloatArray:
+    """Return the number of instances, (H,), on each host or in its place by the label."""
+    found = np.zeros(len(table))
+    places = Counter(_value(table, name, neighbour.by) for name, _ in neighbour.at)
+    for place, count in places.items():
+        if place is not None and neighbour.by:
+            found += count * table.labelled(neighbour.by, place)
+        elif place is not None:
+            found[table.by_name[place].column] += count
+    return found
+
+
+def _beside(table: HostTable, host: Host, neighbour: Neighbour) -> list[tuple[str, str]]:
+    """Return the instances of a neighbour on a host or in its place by the label."""
+    here = _value(table, host.name, neighbour.by)
+    if here is None:
+        return []
+    return [one for one in neighbour.at if _value(table, one[0], neighbour.by) == here]
+
+
+def _value(table: HostTable, name: str, by: str) -> str | None:
+    """Return the place of a host by a label; None: it has none."""
+    host = table.by_name.get(name)
+    if host is None or not by:
+        return None if host is None else name
+    return host.description.labels.get(by)
+
+
+def _place(table: HostTable, name: str, by: str) -> str:
+    value = _value(table, name, by)
+    return f"{name} with {by}={value}" if by and value is not None else name
+
+
+def _names(at: Iterable[tuple[str, str]]) -> list[str]:
+    return list(dict.fromkeys(process for _, process in at))
+
+
+def same_place(one: Host, other: Host, by: str) -> bool:
+    """Return True if two hosts are one place by a label; without a label if they are one host."""
+    if not by:
+        return one is other
+    value = one.description.labels.get(by)
+    return value is not None and value == other.description.labels.get(by)
