@@ -18,7 +18,8 @@ def neighbour_fault(state: MasterState, submitted: Sequence[ProcessSpec]) -> str
     specs = {spec.name: spec for spec in (*live, *submitted)}
     for name, rule in _required(specs.values()):
         if name in rule.processes:
-            return f"{name}: it is {rule.relation} itself; only other processes are allowed"
+            relation = "near" if rule.relation == "near" else "apart from"
+            return f"{name}: it must run {relation} itself; only other processes are allowed"
     labels = {rule.by for _, rule in _required(specs.values())}
     faults = (_fault_in_places(specs, by) for by in sorted(labels | {""}))
     return next(filter(None, faults), "")
@@ -90,10 +91,11 @@ def _both(specs: _Specs, name: str, other: str, apart_by: str, near_by: str) -> 
 def _fault_of_labels(specs: _Specs, by: str, places: Mapping[str, str]) -> str:
     """Return two processes of one place that require different values of a label; "": none."""
     first: dict[tuple[str, str], str] = {}
-    for name in places:
-        required = specs[name].required_labels if name in specs else {}
-        for key, value in required.items():
-            other = name if by and key != by else first.setdefault((places[name], key), name)
+    for name, spec in specs.items():
+        for key, value in spec.required_labels.items() if name in places else ():
+            if by and key != by:
+                continue
+            other = first.setdefault((places[name], key), name)
             wanted = specs[other].required_labels[key]
             if wanted != value:
                 return (

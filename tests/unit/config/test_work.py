@@ -8,11 +8,13 @@ import pytest
 
 from rosrm.config.process import ProcessInFile
 from rosrm.config.work import load_work
+from rosrm.errors import ConfigError
 from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (
     Kind,
     MigrationPolicy,
+    NeighbourRule,
     ProcessSpec,
     Readiness,
     RestartPolicy,
@@ -31,7 +33,8 @@ def one(path):
 def test_every_key_of_a_process_reaches_its_spec():
     """A key that is only in the form of the file would be accepted without an effect."""
     in_file = {field.name for field in fields(ProcessInFile)}
-    assert in_file - {field.name for field in fields(ProcessSpec)} == {"labels"}
+    others = {"labels", "near", "apart", "spread"}
+    assert in_file - {field.name for field in fields(ProcessSpec)} == others
 
 
 def test_every_key_is_read(file):
@@ -90,12 +93,74 @@ def test_every_key_is_read(file):
         ("command: x, readiness: running", "readiness", Readiness("running")),
         ("package: p, executable: e", "ros", True),
         ("package: p, executable: e, ros: false", "ros", False),
+        ("command: x, near: b", "neighbours", (NeighbourRule("near", ("b",)),)),
+        ("command: x, near: []", "neighbours", ()),
+        (
+            "command: x, apart: [b, {processes: [d], by: rack, prefer: true}, 5]",
+            "neighbours",
+            (
+                NeighbourRule("apart", ("b", "5")),
+                NeighbourRule("apart", ("d",), by="rack", prefer=True),
+            ),
+        ),
+        (
+            "command: x, spread: rack",
+            "neighbours",
+            (NeighbourRule("apart", group="a", by="rack"),),
+        ),
+        (
+            "command: x, spread: {group: g, prefer: true}",
+            "neighbours",
+            (NeighbourRule("apart", group="g", prefer=True),),
+        ),
         ("module: m", "ros", False),
         ("module: m, ros: true, remappings: [[a, b]]", "remappings", {"a": "b"}),
     ],
 )
 def test_shorthands_stand_for_the_long_forms(file, entry, field, value):
     assert getattr(one(file(f"processes: [{{name: a, {entry}}}]")), field) == value
+
+
+def test_the_processes_of_one_entry_are_one_group(file):
+    """The group has the name of the entry; a name that the file gives stays."""
+    specs = load_work(
+        file(
+            """
+            defaults: {command: x, spread: rack}
+            processes:
+              - {name: "{{a}}_{i}", foreach: {i: "range(0, 2)"}, near: "cam_{i}"}
+              - {name: "b_{i}", foreach: {i: [1]}, spread: {group: "g_{i}", by: ""}}
+            """
+        )
+    )
+    groups = [rule.group for spec in specs for rule in spec.neighbours if rule.group]
+    assert groups == ["{{a}}_{i}", "{{a}}_{i}", "g_1"]
+    assert [spec.neighbours[0].processes for spec in specs] == [("cam_0",), ("cam_1",), ()]
+
+
+@pytest.mark.parametrize(
+    ("entry", "text"),
+    [
+        ("near: [a]", "near: a names itself; only other processes are allowed"),
+        ("apart: {processes: [a]}", "apart: a names itself"),
+        ("apart: {processes: []}", "apart: at least one process is required"),
+        ("near: {by: rack}", "near[0].processes: is missing"),
+        ("near: [../b]", "near: "),
+        ("near: [[b]]", "near[0].processes[0]: text is required, not a list"),
+        ("spread: {groups: g}", "unknown key 'groups' in spread; did you mean 'group'?"),
+        ("near: {processes: [b], prefer: 1}", "near[0].prefer: true or false is required, not 1"),
+    ],
+)
+def test_faults_of_neighbours_are_named(file, entry, text):
+    path = file(
+        f"""
+        processes:
+          - {{name: a, command: x, {entry}}}
+        """
+    )
+    with pytest.raises(ConfigError) as error:
+        load_work(path)
+    assert text in str(error.value)
 
 
 def test_defaults_lie_under_each_process_in_depth(file):

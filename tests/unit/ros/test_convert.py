@@ -180,6 +180,10 @@ def value(text: str) -> list[msg.KeyValue]:
     return [msg.KeyValue(key="a", value=text)]
 
 
+def neighbour(**fields: object) -> list[msg.NeighbourRule]:
+    return [msg.NeighbourRule(**{"relation": "near", "processes": ["q"], **fields})]
+
+
 NAN, INF = float("nan"), float("inf")
 NONSENSE_IN_SPECS = {
     "no name": lambda m: setattr(m, "name", ""),
@@ -218,6 +222,11 @@ NONSENSE_IN_SPECS = {
     "a parameter too deep": lambda m: setattr(m, "parameters", value("[" * 100_000)),
     "migration options": lambda m: setattr(m.migration, "options", "[1]"),
     "options too deep": lambda m: setattr(m.migration, "options", '{"a":' * 100_000),
+    "a relation": lambda m: setattr(m, "neighbours", neighbour(relation="above")),
+    "a rule about none": lambda m: setattr(m, "neighbours", neighbour(processes=[])),
+    "a rule about both": lambda m: setattr(m, "neighbours", neighbour(group="g")),
+    "a neighbour that is a path": lambda m: setattr(m, "neighbours", neighbour(processes=["../q"])),
+    "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
 }
 
 
