@@ -10,7 +10,7 @@ from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 from hypothesis import strategies as st
 
 from rosrm.model.durations import LONGEST
-from rosrm.model.values import ProcessSpec
+from rosrm.model.values import NeighbourRule, ProcessSpec
 
 Drawn = st.SearchStrategy[Any]
 
@@ -92,9 +92,16 @@ _PROGRAMS: Final = st.one_of(
     st.fixed_dictionaries({"module": NAMES}),
     st.fixed_dictionaries({"command": st.lists(WORDS, min_size=1, max_size=3).map(tuple)}),
 )
+_NEIGHBOURS: Final = st.one_of(
+    drawn(
+        NeighbourRule, group=st.just(""),
+        processes=st.lists(PROPER_NAMES, min_size=1, max_size=3).map(tuple),
+    ),
+    drawn(NeighbourRule, group=NAMES, processes=st.just(())),
+)  # fmt: skip
 #: Specs with one program, as a master accepts them.
 SPECS: Final = st.builds(
     lambda spec, program: replace(spec, **{**_NO_PROGRAM, **program}),
-    drawn(ProcessSpec),
+    drawn(ProcessSpec, neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple)),
     _PROGRAMS,
 )

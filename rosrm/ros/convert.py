@@ -107,13 +107,6 @@ _known_fields: Final[Callable[[Any], tuple[tuple[str, str, _Convert, _Convert], 
 def _forms(hint: Any) -> tuple[_Convert, _Convert]:
     if isinstance(hint, type) and is_dataclass(hint):
         return partial(_to_msg, getattr(msg, hint.__name__)), partial(_from_msg, hint)
-    entries = get_args(hint)
-    if entries[1:] == (Ellipsis,) and is_dataclass(entries[0]):
-        to_msg, from_msg = _forms(entries[0])
-        return (
-            lambda known: [to_msg(one) for one in known],
-            lambda received: tuple(from_msg(one) for one in received),
-        )
     return _FORMS.get(hint, (_unchanged, _unchanged))
 
 
@@ -157,6 +150,7 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
         migration=_to_msg(
             msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
         ),
+        neighbours=[_to_msg(msg.NeighbourRule, rule) for rule in spec.neighbours],
     )  # fmt: skip
 
 
@@ -176,6 +170,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
             values.MigrationPolicy, message.migration,
             options=json_object(message.migration.options, "migration options"),
         ),
+        neighbours=tuple(_from_msg(values.NeighbourRule, rule) for rule in message.neighbours),
     )  # fmt: skip
 
 

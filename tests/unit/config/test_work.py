@@ -128,13 +128,13 @@ def test_the_processes_of_one_entry_are_one_group(file):
             """
             defaults: {command: x, spread: rack}
             processes:
-              - {name: "{{a}}_{i}", foreach: {i: "range(0, 2)"}, near: "cam_{i}"}
+              - {name: "a_{i:02d}", foreach: {i: "range(0, 2)"}, near: "cam_{i}"}
               - {name: "b_{i}", foreach: {i: [1]}, spread: {group: "g_{i}", by: ""}}
             """
         )
     )
     groups = [rule.group for spec in specs for rule in spec.neighbours if rule.group]
-    assert groups == ["{{a}}_{i}", "{{a}}_{i}", "g_1"]
+    assert groups == ["a_{i:02d}", "a_{i:02d}", "g_1"]
     assert [spec.neighbours[0].processes for spec in specs] == [("cam_0",), ("cam_1",), ()]
 
 

@@ -17,7 +17,7 @@ import rosrm
 from rosrm.cli.commands import app
 from rosrm.config.cluster import load_cluster
 from rosrm.config.host import load_host
-from rosrm.config.process import ProcessInFile
+from rosrm.config.process import NeighboursInFile, ProcessInFile
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.config.work import load_work
 from rosrm.extensions import contracts, hookspecs, installed
@@ -109,7 +109,9 @@ def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options)
 def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
-    wanted |= {"host_loss", "isolation", "standby", "health"}
+    wanted |= {"host_loss", "isolation", "standby", "health", "spread"}
+    members = [field.name for field in fields(NeighboursInFile)]
+    wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted
 
 
