@@ -391,7 +391,7 @@ def test_a_process_that_starts_again_prefers_the_host_of_those_near_it() -> None
 
 
 def test_a_standby_is_apart_from_others_and_in_another_place_of_its_spread() -> None:
-    """It need not be near the neighbours of its process."""
+    """A standby need not be near the neighbours of its process."""
     guarded = node(
         "p", migration=MigrationPolicy("handoff"), standby=StandbyPolicy(wanted=True),
         neighbours=near("camera") + apart("planner") + spread("p", "rack"),

@@ -226,6 +226,8 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
 
 def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a neighbour and do not block those behind them."""
+    if not state.neighbours.declared:
+        return frozenset()
     found = []
     for name in state.neighbours.declared:
         if name in state.queue:

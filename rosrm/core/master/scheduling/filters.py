@@ -153,7 +153,7 @@ def _why_no_resources(hosts: Candidates, row: int) -> str:
 
 
 def _keeps_neighbours(hosts: Candidates) -> BoolArray | None:
-    rules = _required_neighbours(hosts)
+    rules = _required_neighbours(hosts) if hosts.demand.neighbours else ()
     if not rules:
         return None
     kept = [proximity.keeping(hosts.table, rule)[hosts.columns] for rule in rules]
