@@ -14,8 +14,7 @@ def neighbour_fault(state: MasterState, submitted: Sequence[ProcessSpec]) -> str
     """Return a sentence on a rule that can never be kept, with both sides; "": none is known."""
     if not state.neighbours.declared and not any(spec.neighbours for spec in submitted):
         return ""
-    live = (one.spec for one in state.processes.values() if not one.phase.is_terminal)
-    specs = {spec.name: spec for spec in (*live, *submitted)}
+    specs = _tied(state, {spec.name: spec for spec in submitted})
     for name, rule in _required(specs.values()):
         if name in rule.processes:
             relation = "near" if rule.relation == "near" else "apart from"
@@ -23,6 +22,35 @@ def neighbour_fault(state: MasterState, submitted: Sequence[ProcessSpec]) -> str
     labels = {rule.by for _, rule in _required(specs.values())}
     faults = (_fault_in_places(specs, by) for by in sorted(labels | {""}))
     return next(filter(None, faults), "")
+
+
+def _tied(state: MasterState, submitted: _Specs) -> _Specs:
+    """Return the submitted processes and those that rules "near" tie to one of them."""
+    specs, open_names = dict(submitted), list(submitted)
+    named: dict[str, list[str]] = {}
+    for spec in submitted.values():
+        for name in _near(spec):
+            named.setdefault(name, []).append(spec.name)
+    seen = set[str]()
+    while open_names:
+        name = open_names.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        known = state.processes.get(name)
+        if name not in specs and known is not None and not known.phase.is_terminal:
+            specs[name] = known.spec
+        open_names += _near(specs[name]) if name in specs else ()
+        open_names += named.get(name, ())
+        about = (state.processes[other].spec for other in state.neighbours.about.get(name, ()))
+        open_names += [spec.name for spec in about if name in _near(spec)]
+    live = {name: spec for name, spec in specs.items() if name not in submitted}
+    return {**live, **submitted}
+
+
+def _near(spec: ProcessSpec) -> list[str]:
+    rules = (rule for rule in spec.neighbours if rule.relation == "near" and not rule.prefer)
+    return [name for rule in rules for name in rule.processes]
 
 
 def _required(specs: Iterable[ProcessSpec]) -> Iterator[tuple[str, NeighbourRule]]:

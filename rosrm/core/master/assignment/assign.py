@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from math import inf
@@ -186,15 +186,27 @@ def place_waiting(state: MasterState, now: float) -> None:
         state.processes[head].reason = state.processes[head].reason or why
         return
     passed_over = _passed_over(state, now)
+    if state.neighbours.declared:
+        _place_with_neighbours(state, passed_over, now)
+    else:
+        _place(state, passed_over, now)
+    if not passed_over:
+        state.placed_at = _versions(state)
+
+
+def _place(state: MasterState, passed_over: frozenset[str], now: float) -> None:
+    if state.settings.backfill:
+        _place_any(state, passed_over, now)
+    else:
+        _place_in_order(state, passed_over, now)
+
+
+def _place_with_neighbours(state: MasterState, passed_over: frozenset[str], now: float) -> None:
+    """Place processes; then those that waited for one of them, until all others still wait."""
     awaiting: frozenset[str] | None = None
     while awaiting != (found := _awaiting_neighbours(state, now)):
         awaiting = found
-        if state.settings.backfill:
-            _place_any(state, passed_over | awaiting, now)
-        else:
-            _place_in_order(state, passed_over | awaiting, now)
-    if not passed_over:
-        state.placed_at = _versions(state)
+        _place(state, passed_over | awaiting, now)
 
 
 def _first_request_awaited(state: MasterState, now: float) -> str:
@@ -226,8 +238,6 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
 
 def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a neighbour and do not block those behind them."""
-    if not state.neighbours.declared:
-        return frozenset()
     found = []
     for name in state.neighbours.declared:
         if name in state.queue:
@@ -276,7 +286,9 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     ranking = ranking_of(state, demand)
     column = ranking.best()
     if column >= 0:
-        decision = _decide_jointly(state, process, ranking, column)
+        tied = waiting_with(state, process) if state.neighbours.declared else ()
+        decision = _decide_jointly(state, process, ranking, tied) if tied else None
+        decision = decision or decide(ranking, chosen=column)
         _assign(state, process, ranking, decision, now)
         return True
     never = why_never(state.hosts, demand)
@@ -287,19 +299,17 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     return False
 
 
-def _decide_jointly(state: MasterState, process: Process, ranking: Ranking, best: int) -> Decision:
-    """Return the decision for the best host; if possible, for one with room for all tied to it."""
-    others = waiting_with(state, process) if state.neighbours.concern(process.name) else ()
-    if others:
-        names = {process.name, *(one.name for one in others)}
-        demands = {process.name: ranking.demand}
-        for one in others:
-            neighbours = neighbours_of(state, one, together=names)
-            demands[one.name] = replace(demand_of(state, one), neighbours=neighbours)
-        joint = ranking_of(state, joint_demand(state, demands))
-        if joint.best() >= 0:
-            return decide(joint)
-    return decide(ranking, chosen=best)
+def _decide_jointly(
+    state: MasterState, process: Process, ranking: Ranking, tied: Sequence[Process]
+) -> Decision | None:
+    """Return the decision for a host with room for all tied processes; None: there is none."""
+    names = {process.name, *(one.name for one in tied)}
+    demands = {process.name: ranking.demand}
+    for one in tied:
+        neighbours = neighbours_of(state, one, together=names)
+        demands[one.name] = replace(demand_of(state, one), neighbours=neighbours)
+    joint = ranking_of(state, joint_demand(state, demands))
+    return decide(joint) if joint.best() >= 0 else None
 
 
 def _assign(

@@ -31,7 +31,7 @@ def neighbours_of(
 
     `together`: processes that move with it to one host; rules "near" them do not count.
     """
-    if not state.neighbours.concern(process.name):
+    if not state.neighbours.declared or not state.neighbours.concern(process.name):
         return ()
     own, of_others = _near(state, process, together), _near_of_others(state, process, together)
     return (*own, *of_others, *_apart(state, process))
