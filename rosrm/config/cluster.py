@@ -7,12 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.config.checking import salvaged
+from rosrm.config.checking import near, salvaged
 from rosrm.config.documents import Node, Problems, parse, read
 from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
+from rosrm.config.work import checked_defaults
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
 from rosrm.keys.roles import principal_of
@@ -50,6 +51,7 @@ def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> 
     plugins = PluginCheck(registry, problems)
     plugins.check_resources(root.get("defaults", "needs"), "defaults.needs")
     config = _with_options(root, config or ClusterConfig(), plugins)
+    config = _with_process(root, path, config, plugins, problems)
     problems.raise_any()
     if config.record.directory != Path():
         directory = settled(config.record.directory, path)
@@ -124,6 +126,22 @@ def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> Cl
         ),
         migration=replace(config.migration, strategies=strategies),
     )
+
+
+def _with_process(
+    root: Node, path: str | Path, config: ClusterConfig, plugins: PluginCheck, problems: Problems
+) -> ClusterConfig:
+    """Return the settings with the checked defaults of what a process leaves out."""
+    given = root.get("defaults", "process")
+    process = checked_defaults(given, path, plugins, problems)
+    if given is None or process is None:
+        return config
+    strategy = process.migration.strategy
+    if strategy is not None and strategy not in config.migration.strategies:
+        selected = list(config.migration.strategies)
+        text = f"migration strategy {strategy!r} is not selected{near(strategy, selected)}"
+        problems.add(given.deepest(("migration", "strategy")).place, f"defaults.process: {text}")
+    return replace(config, defaults=replace(config.defaults, process=process))
 
 
 def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> str | None:

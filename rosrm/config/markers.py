@@ -70,6 +70,17 @@ class RosSection:
 
 
 @dataclass(frozen=True)
+class ProcessSection:
+    """Annotation of a section with the keys of a process, which `rosrm.config.work` checks."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Return the schema that leaves the section to its own check."""
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
+
+        return core_schema.no_info_plain_validator_function(lambda _: None)
+
+
+@dataclass(frozen=True)
 class PlainWord:
     """Annotation of text that needs no quotes, even if YAML reads it as a number or boolean."""
 

@@ -196,6 +196,7 @@ class ProcessInFile:
             standby=_same(StandbyPolicy, self.standby),
             health=Health() if self.health is None else _same(Health, self.health),
             neighbours=tuple(self._neighbour_rules()),
+            given=(),
         )
 
     def _neighbour_rules(self) -> Iterator[NeighbourRule]:

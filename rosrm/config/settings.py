@@ -15,7 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from rosrm.config.markers import NullIsEmpty, OptionsByName, PlainWord, RosSection
+from rosrm.config.markers import (
+    NullIsEmpty,
+    OptionsByName,
+    PlainWord,
+    ProcessSection,
+    RosSection,
+)
 from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings
 from rosrm.errors import ConfigError
 from rosrm.extensions.units import (
@@ -30,7 +36,7 @@ from rosrm.extensions.units import (
 from rosrm.keys.roles import SecurityMode
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.ros_settings import RosSettings
-from rosrm.model.values import EMPTY
+from rosrm.model.values import EMPTY, ProcessSpec
 
 #: Default upper limits: memory as in the paper, CPU and disk with a reserve.
 DEFAULT_LIMITS: Final[Mapping[str, float]] = {"memory": 0.8, "cpu": 0.9, "disk": 0.9}
@@ -162,10 +168,13 @@ class ProcessDefaults:
     Attributes:
         needs: amounts by resource, for a process without declared or learned needs.
         settle: seconds after which an estimate no longer counts as load of its host.
+        process: values of the fields that the submitter of a process leaves out; its name and
+            program are of no meaning. None: there are none.
     """
 
     needs: Mapping[str, Amount] = field(default_factory=lambda: dict(_CORE.default_needs))
     settle: Seconds = _CORE.settle
+    process: Annotated[ProcessSpec | None, ProcessSection()] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,6 +289,7 @@ class ClusterConfig:
             backfill=self.queue.backfill,
             default_needs=self.defaults.needs,
             settle=self.defaults.settle,
+            process_defaults=self.defaults.process,
             suspect=self.liveness.suspect,
             lease=self.liveness.lease,
             delivery_timeout=self.delivery_timeout,

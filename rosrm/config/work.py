@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +15,7 @@ from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, complaints
 from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, settled_on_host
+from rosrm.core.master.process_defaults import IDENTITY
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
@@ -22,6 +23,8 @@ from rosrm.wording import get_close_matches
 _SECTIONS: Final = ("processes", "defaults")
 #: Keys that are allowed in an entry but not in `defaults`.
 _NOT_IN_DEFAULTS: Final = ("name", "foreach")
+#: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
+_NOT_IN_CLUSTER_DEFAULTS: Final = (*_NOT_IN_DEFAULTS, *IDENTITY)
 
 
 def load_work(path: str | Path, registry: Registry | None = None) -> tuple[ProcessSpec, ...]:
@@ -91,14 +94,38 @@ def _entries(root: Node, problems: Problems) -> Sequence[Node]:
 
 def _defaults(root: Node, problems: Problems) -> Node:
     defaults = root.get("defaults") or Node({}, root.place)
+    _refuse_keys(defaults, _NOT_IN_DEFAULTS, "defaults", problems)
+    return written_out(defaults)
+
+
+def _refuse_keys(defaults: Node, refused: Sequence[str], where: str, problems: Problems) -> None:
+    """Note defaults that are no mapping, and the keys of them that only a process may have."""
     if not isinstance(defaults.value, Mapping):
-        problems.add(defaults.place, "defaults: a mapping is required")
-    for name in _NOT_IN_DEFAULTS:
+        problems.add(defaults.place, f"{where}: a mapping is required")
+    for name in refused:
         node = defaults.get(name)
         if node is not None:
-            text = f"defaults: {name} is allowed in a process only"
+            text = f"{where}: {name} is allowed in a process only"
             problems.add(node.key_place or node.place, text)
-    return written_out(defaults)
+
+
+def checked_defaults(
+    node: Node | None, path: str | Path, plugins: PluginCheck, problems: Problems
+) -> ProcessSpec | None:
+    """Return `defaults.process` of cluster.yaml as a spec of a placeholder; None: it gives nothing.
+
+    The placeholder is a ROS node, so that the rules for all keys are checked.
+    """
+    if node is None or not (node.value or isinstance(node.value, (bool, int))):
+        return None
+    _refuse_keys(node, _NOT_IN_CLUSTER_DEFAULTS, "defaults.process", problems)
+    own = {
+        name: item
+        for name, item in written_out(node).items.items()
+        if name not in _NOT_IN_CLUSTER_DEFAULTS
+    }
+    placeholder = {name: Node("default", node.place) for name in ("name", "package", "executable")}
+    return _process(Node({**own, **placeholder}, node.place), path, plugins, problems)
 
 
 def _with_group(entry: Node) -> Node:
@@ -127,6 +154,7 @@ def _process(
     if process is None:
         return None
     spec = process.spec()
+    spec = replace(spec, given=tuple(_given(node, spec)))
     for complaint in complaints(spec, wrong):
         problems.add(node.deepest(complaint.path).place, complaint.text)
     spec = _on_host(spec, path)
@@ -136,6 +164,16 @@ def _process(
     if fault:
         problems.add(node.deepest(("standby",)).place, fault)
     return spec
+
+
+def _given(node: Node, value: Any, before: str = "") -> Iterator[str]:
+    """Yield the paths of the keys in an entry: of each field, and of each field of a policy."""
+    for name, inner in node.items.items():
+        policy = getattr(value, name, None)
+        if inner.items and is_dataclass(policy):
+            yield from _given(inner, policy, f"{before}{name}.")
+        else:
+            yield f"{before}{name}"
 
 
 def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] | None:

@@ -208,6 +208,8 @@ class ProcessSpec:
         avoided_labels: a host with any of these labels is chosen only if no other host fits.
         priority: processes with a higher number are placed first.
         neighbours: rules on its hosts, relative to other processes.
+        given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
+            default applies to the others. Empty: the fields that differ from their defaults here.
     """
 
     name: str
@@ -237,6 +239,7 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
     neighbours: tuple[NeighbourRule, ...] = ()
+    given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         """Set the default of `ros`, which depends on `package`."""

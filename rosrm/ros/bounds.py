@@ -43,6 +43,7 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.required_labels": 256,
     "ProcessSpec.preferred_labels": 256,
     "ProcessSpec.avoided_labels": 256,
+    "ProcessSpec.given": 256,
     "StandbyPolicy.apart_by": 256,
     "ProcessSpec.neighbours": 256,
     "NeighbourRule.processes": 1024,

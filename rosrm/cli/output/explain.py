@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
@@ -46,6 +47,9 @@ def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
         for reason, count in (decision.get("omitted") or {}).items():
             if count:
                 yield Text(f"and {counted(count, 'more host')} {reason}", "dim")
+    if explanation.get("defaults"):
+        yield Text()
+        yield _defaults(explanation["defaults"])
     history = explanation.get("history") or ()
     yield Text()
     if not history or history[0]["kind"] != "submitted":
@@ -99,6 +103,14 @@ def _sentence(name: str, decision: Mapping[str, Any]) -> Text:
 def _needs(need: Mapping[str, float]) -> Text:
     amounts = [f"{name} {amount(value, _UNITS.get(name, ''))}" for name, value in need.items()]
     return Text(f"Needs, declared or estimated: {', '.join(amounts) or 'none'}.")
+
+
+def _defaults(defaults: Mapping[str, Any]) -> Text:
+    """Return the fields whose values are the cluster's, without values that may be secret."""
+    fields = [
+        path if value is None else f"{path} {json.dumps(value)}" for path, value in defaults.items()
+    ]
+    return Text(f"From `defaults.process` of the cluster: {', '.join(fields)}.")
 
 
 def _hosts(hosts: list[Mapping[str, Any]]) -> RenderableType:

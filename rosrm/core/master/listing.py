@@ -10,6 +10,7 @@ from rosrm.core.master.assignment.neighbours import awaited_neighbour
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.process_defaults import defaulted_values
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
@@ -149,6 +150,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "process": name, "state": row.state, "host": row.host, "owner": row.owner,
         "reason": "; ".join(filter(None, reasons)),
         "decision": None if decision is None else {**decision, "elapsed": age},
+        "defaults": defaulted_values(process.spec, process.defaulted),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
         "history": [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from rosrm.core.master import events as happened
@@ -18,6 +18,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
 from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
+from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.state.hosts import Host
@@ -50,24 +51,20 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     taken = _taken(state, event)
     if taken:
         raise RequestRefused(taken, "name_taken")
-    fault = _submission_fault(state, event)
+    filled = [with_defaults(spec, state.settings.process_defaults) for spec in event.specs]
+    specs = [spec for spec, _ in filled]
+    fault = _submission_fault(state, filled)
     if fault:
         raise RequestRefused(fault)
-    check_quota(state, event.specs, event.by)
+    check_quota(state, specs, event.by)
     wall, born, first = state.wall, state.next_instance, state.next_order
     processes = [
         Process(
-            spec,
-            order,
-            ProcessPhase.QUEUED,
-            now,
-            event.by.name,
-            wall=wall,
-            born=born,
-            owned_from=_owned_from(state, spec.name, event.by),
+            spec, order, ProcessPhase.QUEUED, now, event.by.name, wall=wall, born=born,
+            owned_from=_owned_from(state, spec.name, event.by), defaulted=defaulted,
         )
-        for order, spec in enumerate(event.specs, first)
-    ]
+        for order, (spec, defaulted) in enumerate(filled, first)
+    ]  # fmt: skip
     nodes = {process.node for process in processes}
     users = [one for one in state.processes.values() if one.node in nodes]
     live = [one for one in users if not one.phase.is_terminal]
@@ -140,25 +137,44 @@ def _still_stopping(state: MasterState, name: str) -> str:
     return f"an earlier {instance.id} is still being stopped on {instance.host.name}"
 
 
-def _submission_fault(state: MasterState, event: happened.SubmissionReceived) -> str:
+def _submission_fault(
+    state: MasterState, submitted: Sequence[tuple[ProcessSpec, tuple[str, ...]]]
+) -> str:
+    """Return why specs, each with the paths of its defaults, are refused; "": they are not."""
     live, most = len(state.processes) - len(state.terminal), state.settings.max_processes
-    if live + len(event.specs) > most:
+    if live + len(submitted) > most:
         return (
-            f"{live} processes have not ended, and {len(event.specs)} more would exceed "
+            f"{live} processes have not ended, and {len(submitted)} more would exceed "
             f"`queue.max_processes` ({most}). Nothing was queued"
         )
-    for spec in event.specs:
-        strategy = spec.migration.strategy
-        if strategy is not None and strategy not in state.strategies:
-            return f"{spec.name}: {why_not_selected(state, strategy)}. Nothing was queued"
-        fault = _strategy_fault(state, spec)
+    for spec, defaulted in submitted:
+        fault = _spec_fault(state, spec)
         if fault:
-            return f"{spec.name}: migration by {strategy!r}: {fault}. Nothing was queued"
-        if spec.standby.wanted and not state.declared.capabilities_of(spec).shadow:
-            fault = no_standby(strategy, state.declared.capabilities)
-            return f"{spec.name}: {fault}. Nothing was queued"
-    fault = neighbour_fault(state, event.specs)
+            return f"{spec.name}: {fault}{_origin(defaulted)}. Nothing was queued"
+    fault = neighbour_fault(state, [spec for spec, _ in submitted])
     return f"{fault}. Nothing was queued" if fault else ""
+
+
+def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
+    """Return why the migration or the standby of a spec is refused; "": it is not."""
+    strategy = spec.migration.strategy
+    if strategy is not None and strategy not in state.strategies:
+        return why_not_selected(state, strategy)
+    fault = _strategy_fault(state, spec)
+    if fault:
+        return f"migration by {strategy!r}: {fault}"
+    if spec.standby.wanted and not state.declared.capabilities_of(spec).shadow:
+        return no_standby(strategy, state.declared.capabilities)
+    return ""
+
+
+def _origin(defaulted: Sequence[str]) -> str:
+    """Return the part of a refusal that names the fields with defaults of the cluster, if any."""
+    concerned = [path for path in defaulted if path.startswith(("migration.", "standby."))]
+    if not concerned:
+        return ""
+    given = "is" if len(concerned) == 1 else "are"
+    return f" ({listed(concerned)} {given} given by `defaults.process` of the cluster)"
 
 
 def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Final, Literal
 
-from rosrm.model.values import EMPTY
+from rosrm.model.values import EMPTY, ProcessSpec
 
 #: Key of the quota of each user without an entry of its own.
 DEFAULT_QUOTA: Final = "default"
@@ -20,6 +20,7 @@ class CoreSettings:
     Attributes:
         backfill: True: processes may be placed before an earlier one that waits for room.
         default_needs: base units by resource, for a process without declared or learned needs.
+        process_defaults: values of the fields that a submitted process leaves out; None: none.
         settle: seconds after which an estimate (not a declared need) no longer counts.
         suspect: seconds of silence after which a host gets no new work.
         lease: seconds of silence after which a host is lost.
@@ -43,6 +44,7 @@ class CoreSettings:
     default_needs: Mapping[str, float] = field(
         default_factory=lambda: MappingProxyType({"memory": 64 * 2.0**20, "cpu": 0.1})
     )
+    process_defaults: ProcessSpec | None = None
     settle: float = 10.0
     suspect: float = 1.0
     lease: float = 10.0

@@ -230,6 +230,14 @@ def test_explain_shows_the_owner_if_it_is_known():
     assert "Owner" not in "".join(drawn(explain.render({**STORY, "owner": ""})))
 
 
+def test_explain_shows_what_comes_from_the_defaults_of_the_cluster():
+    given = {"restart.when": "always", "environment": None, "needs": {"memory": 2e8}}
+    lines = drawn(explain.render({**STORY, "defaults": given}))
+    said = 'From `defaults.process` of the cluster: restart.when "always", environment, needs'
+    assert said in " ".join(lines)
+    assert "defaults.process" not in "".join(drawn(explain.render({**STORY, "defaults": {}})))
+
+
 def test_explain_prints_the_rounding_error_of_a_score_as_zero():
     host = {"name": "alpha", "verdict": "chosen", "score": 1.3877787807814457e-17}
     made = explain.render({**STORY, "decision": {**STORY["decision"], "hosts": [host]}})

@@ -301,3 +301,58 @@ def test_a_resource_that_no_probe_reads_is_refused(refusal, text, said):
 def test_no_text_is_among_the_allowed_words_where_it_is_one(refusal):
     said = refusal(load_cluster, "ros: {discovery: {range: lokalhost}}")
     assert "did you mean 'localhost'? Allowed: \"\", " in said
+
+
+# --- defaults.process -------------------------------------------------------------------------
+
+
+def test_defaults_of_processes_have_the_keys_and_shorthands_of_a_work_file(file):
+    """The paths of the given keys tell the master which defaults there are."""
+    config = load_cluster(
+        file("""\
+            defaults:
+              process:
+                migration: {strategy: relaunch, overlap: false}
+                restart: always
+                host_loss: elsewhere
+                needs: {memory: 200MB}
+                labels: {avoided: {gpu: "yes"}}
+                environment: {OMP_NUM_THREADS: 1}
+                stop: {interrupt_grace: 2s}
+            """)
+    )
+    process = ClusterConfig.from_json(config.to_json()).core().process_defaults
+    assert (process.migration.strategy, process.migration.overlap) == ("relaunch", False)
+    assert (process.restart.when, process.host_loss.then) == ("always", "elsewhere")
+    assert (process.needs, process.avoided_labels) == ({"memory": 2e8}, {"gpu": "yes"})
+    assert process.environment == {"OMP_NUM_THREADS": "1"}
+    assert {"restart.when", "stop.interrupt_grace", "migration.overlap"} <= set(process.given)
+    assert "stop.terminate_grace" not in process.given
+
+
+@pytest.mark.parametrize("text", ["", "defaults: {process: }", "defaults: {process: {}}"])
+def test_without_defaults_of_processes_there_are_none(file, text):
+    assert load_cluster(file(text)).core().process_defaults is None
+
+
+@pytest.mark.parametrize(
+    ("process", "fault"),
+    [
+        ("{name: p}", "f.yaml:1:22: defaults.process: name is allowed in a process only"),
+        ("{module: m}", "f.yaml:1:22: defaults.process: module is allowed in a process only"),
+        ("{foreach: {i: [1]}}", "defaults.process: foreach is allowed in a process only"),
+        ("{restrat: always}", "f.yaml:1:22: unknown key 'restrat'; did you mean 'restart'?"),
+        ("{restart: {delay: soon}}", "f.yaml:1:39: restart.delay: "),
+        ("{restart: {delay: 9s, max_delay: 2s}}", "restart.max_delay must not be less than"),
+        ("{needs: {memory: 2cores}}", "f.yaml:1:38: needs.memory: "),
+        ("[restart]", "f.yaml:1:21: defaults.process: a mapping is required"),
+        ("always", "f.yaml:1:21: defaults.process: a mapping is required"),
+        ("{standby: true}", "f.yaml:1:31: "),
+        (
+            "{migration: criu}",
+            "f.yaml:1:33: defaults.process: migration strategy 'criu' is not selected",
+        ),
+    ],
+)
+def test_wrong_defaults_of_processes_have_their_place(refusal, process, fault):
+    assert fault in refusal(load_cluster, f"defaults: {{process: {process}}}")

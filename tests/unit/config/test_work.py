@@ -185,6 +185,20 @@ def test_defaults_lie_under_each_process_in_depth(file):
     assert second.migration == MigrationPolicy("other", False, {})
 
 
+def test_a_spec_names_the_given_keys_and_those_of_the_defaults(file):
+    """So the master can tell them from keys that were left out, which the cluster may fill."""
+    spec = one(
+        file("""\
+            defaults: {restart: on-failure}
+            processes:
+              - {name: p, module: m, migration: , health: , stop: {interrupt_grace: 5s}}
+            """)
+    )
+    assert sorted(spec.given) == [
+        "health", "migration.strategy", "module", "name", "restart.when", "stop.interrupt_grace",
+    ]  # fmt: skip
+
+
 def test_foreach_makes_many_alike(file):
     specs = load_work(
         file(

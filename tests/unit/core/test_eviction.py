@@ -326,6 +326,71 @@ def test_eviction_counts_the_measured_usage(resource: str) -> None:
     assert (cluster.where("p"), cluster.where("q")) == (["b"], ["a"])
 
 
+# --- the paper's Fig. 10: equal hosts, and a process that grows beyond the limit of each ----------
+
+
+def equal_hosts(**settings: Any) -> Cluster:
+    """Return three equal hosts, on one of which a process begins with 100 MiB."""
+    cluster = cluster_of(machine("a"), machine("b"), machine("c"), **settings)
+    cluster.submit(movable("p", memory=100))
+    grow(cluster, to=100)
+    return cluster
+
+
+def grow(cluster: Cluster, *, to: float) -> str:
+    """Let the process use so many MiB where it runs; return the name of that host."""
+    (host,) = cluster.where("p")
+    cluster.machines[host].shown["p"] = {"memory": to * MIB}
+    cluster.wait(1.5)
+    return host
+
+
+def test_a_process_that_fills_a_host_leaves_it_for_an_equal_one_by_its_declared_need() -> None:
+    """Relaunched, it begins with its need again; after the cool-down it moves on."""
+    cluster = equal_hosts(need="declared")
+    for moves in (1, 2):
+        source = grow(cluster, to=750)
+        cluster.wait(3.0)
+        (there,) = cluster.where("p")
+        assert there != source
+        assert cluster["p"].migrations == moves
+        cluster.machines[source].shown.clear()
+        cluster.wait(30.0)
+    assert cluster.recorded("nothing_moves") == []
+
+
+def test_a_process_that_fills_a_host_stays_by_its_measured_need() -> None:
+    """An equal host has no room for all that it uses."""
+    cluster = equal_hosts(need="measured")
+    source = grow(cluster, to=750)
+    cluster.wait(10.0)
+    assert cluster.where("p") == [source]
+    assert cluster.recorded("nothing_moves")[0].endswith("no host has room for p")
+
+
+def test_by_its_measured_need_a_process_leaves_before_it_is_too_large() -> None:
+    """Another program fills the host, and the equal hosts have room for what the process uses."""
+    cluster = equal_hosts(need="measured")
+    source = grow(cluster, to=600)
+    cluster.machines[source].busy["memory"] = 0.3
+    cluster.wait(3.0)
+    assert cluster.where("p") != [source]
+
+
+@pytest.mark.parametrize(("seconds", "moves"), [(1.0, 0), (4.0, 1)])
+def test_a_peak_within_the_hysteresis_moves_nothing_also_by_the_declared_need(
+    seconds: float, moves: int
+) -> None:
+    """The hysteresis, not the judgement at the destination, decides whether a peak counts."""
+    cluster = equal_hosts(need="declared", hysteresis=3.0)
+    (source,) = cluster.where("p")
+    cluster.machines[source].shown["p"] = {"memory": 750 * MIB}
+    cluster.wait(seconds)
+    cluster.machines[source].shown["p"] = {"memory": 100 * MIB}
+    cluster.wait(5.0)
+    assert cluster["p"].migrations == moves
+
+
 def test_a_resource_without_a_probe_prevents_no_move() -> None:
     """Slaves report CPU usage per process even where no probe measures the host's CPU."""
     memory = (ResourceDescription("memory", "B", 16 * GIB),)

@@ -230,6 +230,12 @@ NONSENSE_IN_SPECS = {
 }
 
 
+def test_the_paths_of_given_fields_are_sent() -> None:
+    """They do not count in a comparison of two specs, because they are not part of the process."""
+    spec = values.ProcessSpec("p", command=("true",), given=("name", "restart.when"))
+    assert convert.spec_from_msg(convert.spec_to_msg(spec)).given == spec.given
+
+
 @pytest.mark.parametrize("what", NONSENSE_IN_SPECS)
 def test_spec_that_makes_no_process_is_refused(what) -> None:
     """Any client may send an invalid spec: the refusal has a reason, and nothing else is raised."""

@@ -151,7 +151,7 @@ class Image:
 #: Fields of a process that are journaled unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
-    "principal", "owned_from",
+    "principal", "owned_from", "defaulted",
 )  # fmt: skip
 
 
@@ -185,6 +185,7 @@ class Process:
         standby_at: time before which no standby is started.
         standby_tries: number of standbys that were lost in a row.
         standby_reason: condition of its standby, for listings.
+        defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
     """
@@ -216,6 +217,7 @@ class Process:
     standby_tries: int = 0
     standby_reason: str = ""
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
+    defaulted: tuple[str, ...] = ()
     demand: tuple[int, Demand] | None = None
     plain: Plain = field(init=False)
     node: str = field(init=False)
