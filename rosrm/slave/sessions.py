@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,9 @@ from rosrm.slave.launch.launchers import Launchers
 from rosrm.supervisor.procfs import inner_pid
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
-_PAGE: Final = os.sysconf("SC_PAGE_SIZE")
+#: KiB of a process that the kernel cannot reclaim. Pages of files are shared and reclaimable, and a
+#: host's reading counts them at most once, so they would release too much of a reservation.
+_USED: Final = re.compile(rb"^Rss(?:Anon|Shmem):\s*(\d+)", re.MULTILINE)
 #: Errors after which a process may be there although its file cannot be opened now.
 _NOT_NOW: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
 
@@ -31,7 +34,7 @@ class SessionUsage:
 
     Attributes:
         cpu: cores, mean since the previous walk.
-        memory: resident bytes, summed over the processes (shared pages count in each).
+        memory: anonymous bytes and bytes of shared memory, summed over the processes.
         others: slot of another resource to the amount in its base unit, as probes measure it.
     """
 
@@ -165,27 +168,39 @@ class SessionTable:
         self._pids = tuple(pid for pids in self._members.values() for pid in pids)
 
     def _read(self, members: tuple[int, ...]) -> tuple[float, int]:
-        """Return the CPU seconds (with those of reaped children) and resident bytes of pids.
+        """Return the CPU seconds (with those of reaped children) and used bytes of pids.
 
         Raises:
             OSError: no file can be opened now.
         """
-        ticks = pages = 0
+        ticks = used = 0
         for pid in members:
-            try:
-                descriptor = os.open(f"{self._proc}/{pid}/stat", os.O_RDONLY)
-            except OSError as error:
-                if error.errno in _NOT_NOW:
-                    raise
-                continue  # it has ended
-            try:
-                line = os.read(descriptor, 1024)
-            except OSError:
+            stat = _content(f"{self._proc}/{pid}/stat", 1024)
+            status = _content(f"{self._proc}/{pid}/status", 4096)
+            if not stat:
                 continue
-            finally:
-                os.close(descriptor)
             # The name, in parentheses, may itself hold spaces and parentheses.
-            fields = line[line.rindex(b")") + 2 :].split()
+            fields = stat[stat.rindex(b")") + 2 :].split()
             ticks += int(fields[11]) + int(fields[12]) + int(fields[13]) + int(fields[14])
-            pages += int(fields[21])
-        return ticks / _TICKS, pages * _PAGE
+            used += sum(map(int, _USED.findall(status))) * 1024
+        return ticks / _TICKS, used
+
+
+def _content(path: str, most: int) -> bytes:
+    """Return the first bytes of a file of a process; b"": the process has ended.
+
+    Raises:
+        OSError: no file can be opened now.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        if error.errno in _NOT_NOW:
+            raise
+        return b""
+    try:
+        return os.read(descriptor, most)
+    except OSError:
+        return b""
+    finally:
+        os.close(descriptor)

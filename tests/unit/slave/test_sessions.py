@@ -20,7 +20,10 @@ class Tree:
         self.session = {}
 
     def put(self, pid, session, *, own=0.0, children=0.0, pages=0, name="sleep"):
-        """Add a process: its CPU seconds, those of its reaped children, its resident pages."""
+        """Add a process: its CPU seconds, those of its reaped children, its pages.
+
+        Half of these pages are shared memory. It also has many pages of files.
+        """
         self.session[pid] = session
         fields = [
             "S", 1, pid, session, 0, -1, 0, 0, 0, 0, 0,
@@ -29,6 +32,12 @@ class Tree:
         folder = self.path / str(pid)
         folder.mkdir(exist_ok=True)
         (folder / "stat").write_text(f"{pid} ({name}) {' '.join(map(str, fields))}\n")
+        kib, shared = PAGE // 1024, pages // 2
+        (folder / "status").write_text(
+            f"Name:\t{name}\nVmRSS:\t{(pages + 999) * kib} kB\n"
+            f"RssAnon:\t{(pages - shared) * kib} kB\n"
+            f"RssFile:\t{999 * kib} kB\nRssShmem:\t       {shared * kib} kB\nVmData:\t0 kB\n"
+        )
 
     def end(self, pid):
         """Remove a process that was reaped."""
@@ -66,7 +75,10 @@ def test_leader_counts_at_once_members_at_the_walk(tree, table):
 
 
 def test_usage_is_a_mean_between_walks(tree, table):
-    """Cores are CPU time over time passed; memory is the sum over all processes."""
+    """Cores are CPU time over time passed; memory is the sum over all processes.
+
+    Pages of files do not count, because processes share them and the kernel can reclaim them.
+    """
     tree.put(10, 10, own=5.0, pages=100)
     tree.put(11, 10, own=1.0, pages=50)
     table.add(10)
