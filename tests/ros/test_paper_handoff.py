@@ -41,6 +41,32 @@ try:
 except BaseException:
     pass
 """
+#: The same, but a shadow subscribes to the state only in the function that `state_config` calls.
+CONFIGURED = COUNTER.replace(
+    'node.create_subscription(Int64, "/counter/state", initialise, 1)',
+    """
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosrm.node.handoff.links import NodeLinks
+from rosrm.node.identity import identity_from
+from rosrm_msgs.msg import Sealed, StateConfig
+identity = identity_from(os.environ)
+configs = NodeLinks(identity).configs
+
+def configure(data):
+    config = configs.read(data)
+    if config is None or (config.phase, config.destination) != (
+        StateConfig.SHADOW, identity.instance
+    ):
+        return
+    print("configured with", config.source_node, flush=True)
+    node.create_subscription(Int64, "/counter/state", initialise, 1)
+
+node.create_subscription(
+    Sealed, identity.state_config, configure,
+    QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL), raw=True,
+)
+""",
+)
 PAPER = {"protocol": "paper", "state": "/counter/state", "type": "std_msgs/msg/Int64"}
 
 
@@ -53,9 +79,9 @@ def cluster(make_shared):
     )  # fmt: skip
 
 
-def counter(name: str = "counter", **options: object) -> ProcessSpec:
+def counter(name: str = "counter", program: str = COUNTER, **options: object) -> ProcessSpec:
     return ProcessSpec(
-        name, command=(sys.executable, "-c", COUNTER), ros=True, stop=QUICK,
+        name, command=(sys.executable, "-c", program), ros=True, stop=QUICK,
         readiness=Readiness(timeout=PATIENCE), restart=RestartPolicy("on-failure"),
         migration=MigrationPolicy("handoff", options={**PAPER, **options}),
     )  # fmt: skip
@@ -71,6 +97,20 @@ def test_the_count_continues_there_and_back(cluster):
         cluster.wait("counter", "running", migrations=times, host=target)
         log = cluster.wait_for_log("counter", "began with")
         assert int(log.split("began with")[1].split()[0]) > 10
+    cluster.cancel("counter")
+
+
+def test_a_node_is_initialised_in_the_function_that_state_config_calls(cluster):
+    """Constraint (ii) of the paper, by the letter: the master's topic begins the initialisation."""
+    cluster.submit(counter(program=CONFIGURED))
+    here = cluster.wait("counter", "running").host
+    cluster.client.migrate("counter", None)
+    cluster.wait_for_event("migrated", process="counter")
+    assert cluster.wait("counter", "running", migrations=1).host != here
+    log = cluster.wait_for_log("counter", "began with")
+    configured, began = (log.index(one) for one in ("configured with /counter", "began with"))
+    assert configured < began
+    assert int(log.split("began with")[1].split()[0]) > 0
     cluster.cancel("counter")
 
 
