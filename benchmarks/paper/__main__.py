@@ -17,13 +17,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from benchmarks.machine import say
 from benchmarks.paper.labs import Failed
 from benchmarks.paper.page import checked_page, update_page
-from benchmarks.paper.report import FIGURES, Options, plain_report, write_report
+from benchmarks.paper.repeated import combined
+from benchmarks.paper.report import (
+    FIGURES,
+    REPEATED,
+    Options,
+    Result,
+    plain_report,
+    write_report,
+)
 from benchmarks.stopping import Stopped, own_keys, raise_signals
 from rosrm.errors import RosrmError
 from rosrm_examples.errors import ExampleError
@@ -70,7 +80,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("figure", choices=(*FIGURES, "all"))
     parser.add_argument("--out", required=True, type=Path, help="folder for FIGURE.json and .png")
     parser.add_argument(
-        "--runs", type=int, default=3, help="of each case of Table III, interleaved (default: 3)"
+        "--runs",
+        type=int,
+        default=3,
+        help="number of runs of each figure, and of each case of Table III (default: 3)",
     )
     parser.add_argument(
         "--drive", action="append", default=[], metavar="DRIVE",
@@ -123,7 +136,7 @@ def _report(name: str, options: argparse.Namespace, folder: Path, load: float) -
     """Measure one figure, and write its numbers and its picture; return the numbers."""
     module, began = importlib.import_module(f"benchmarks.paper.{name}"), time.monotonic()
     wanted = Options(folder, options.runs, tuple(options.drive), options.small, options.lab)
-    result = module.measure(wanted)
+    result = _result(name, module, wanted)
     report = plain_report(
         name, module.CLAIM, result, small=options.small, seconds=time.monotonic() - began,
         load_before=load,
@@ -131,6 +144,23 @@ def _report(name: str, options: argparse.Namespace, folder: Path, load: float) -
     result.draw(options.out / f"{name}.png")
     write_report(options.out, name, report)
     return report
+
+
+def _result(name: str, module: ModuleType, options: Options) -> Result:
+    """Measure a figure as often as the options say; a small one, and Table III, only once.
+
+    Table III repeats its cases itself, interleaved.
+    """
+    if name not in REPEATED or options.small:
+        result: Result = module.measure(options)
+        return result
+    results = []
+    for number in range(1, options.runs + 1):
+        say(f"{name}: run {number} of {options.runs}")
+        folder = options.folder / f"run{number}"
+        folder.mkdir()
+        results.append(module.measure(replace(options, folder=folder)))
+    return combined(results, module.SPREAD)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from benchmarks.paper.simulated import agreement
 from benchmarks.paper.trace import Trace, per_host
 from rosrm_lab import GIB, MIB, HostPlan, uniform
 
+#: Numbers of one run of which the median and the range over several runs are reported.
+SPREAD: Final = ("processes", "widest_gap_points")
 CLAIM: Final = (
     "Processes go to the slave with the largest margin: the three stay balanced all the way, and "
     "processes are allocated until each has reached its limit of 80 %"

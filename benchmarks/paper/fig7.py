@@ -16,6 +16,8 @@ from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, holder
 from benchmarks.paper.trace import Trace, per_host
 from rosrm_lab import GIB, MIB, uniform
 
+#: Numbers of one run of which the median and the range over several runs are reported.
+SPREAD: Final = ("gap_at_the_end_points",)
 CLAIM: Final = (
     "Slaves that join at 25 s and 75 s are given the processes, as they have the largest margin, "
     "until all are equally full"

@@ -8,16 +8,18 @@ from typing import Any, Final
 
 from benchmarks.machine import say
 from benchmarks.paper import pictures
-from benchmarks.paper.judging import NOISE, Line, line, over, proportion
+from benchmarks.paper.judging import Line, line, over, peak, proportion
 from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, holder
 from benchmarks.paper.trace import Look, Trace, per_host
 from rosrm_lab import MIB, uniform
 
+#: Numbers of one run of which the median and the range over several runs are reported.
+SPREAD: Final = ("slope", "r2", "highest_percent")
 CLAIM: Final = (
     "The number of processes that are allocated is proportional to that of slaves; none ends above "
-    "its limit of 80 % by more than one process"
+    "its limit of 80 % by more than the noise of a reading"
 )
 _MB: Final = 40
 _NEED: Final = (_MB + HOLDER_MB) * 1e6
@@ -84,12 +86,7 @@ def judge(trace: Trace, held: list[int], fit: Line) -> tuple[list[str], dict[str
             f"less than {_LEAST_R2}"
         )
     beyond = over(trace, MEMORY_LIMIT)
-    hosts = trace.looks[-1].hosts
-    wrong += [
-        f"{name} reached {100 * top:.1f} %, more than one process ({100 * one:.1f}) above the limit"
-        for name, top in beyond.items()
-        if top > MEMORY_LIMIT + (one := _NEED / hosts[name].capacity) + NOISE
-    ]
+    wrong += [f"{name} reached {100 * top:.1f} %" for name, top in beyond.items()]
     return wrong, {
         "r2": round(fit.r2, 6),
         "r2_through_origin": round(through_origin.r2, 6),
@@ -97,6 +94,7 @@ def judge(trace: Trace, held: list[int], fit: Line) -> tuple[list[str], dict[str
         "intercept": round(fit.intercept, 4),
         "slaves": list(range(1, len(held) + 1)),
         "processes": held,
+        "highest_percent": round(100 * peak(trace), 1),
         "over_limit_percent": {name: round(100 * top, 1) for name, top in beyond.items()},
         "per_host": per_host(trace.placed()),
         **trace.curves(),

@@ -25,6 +25,8 @@ from benchmarks.paper.labs import ROOT, Failed
 from benchmarks.paper.report import Options, Result
 from benchmarks.paper.settings import FIG9_INTERCEPT_MS, FIG9_SLOPE_MS, RATE_HZ
 
+#: Numbers of one run of which the median and the range over several runs are reported.
+SPREAD: Final = ("slope_us", "intercept_us")
 CLAIM: Final = (
     "The master's time for one cycle grows at most linearly with the slaves, by less for each than "
     "in the paper, and stays below the 100 ms of a cycle with 1,000 slaves"

@@ -128,15 +128,22 @@ def over(trace: Trace, limit: float) -> dict[str, float]:
     return peaks
 
 
-def wrong_move(look: Look, move: Move, limit: float, headroom: float) -> str:
+def peak(trace: Trace) -> float:
+    """Return the highest usage of any host, fraction."""
+    looks = (host.usage for look in trace.looks for host in look.hosts.values())
+    return max((usage for usage in looks if usage is not None), default=0.0)
+
+
+def wrong_move(look: Look, move: Move, need: float, limit: float, headroom: float) -> str:
     """Return the error of a migration, by the last look before it; "": none.
 
-    The source must have reached the limit. Of the hosts with room for the usage of the process,
-    the destination must have the largest margin.
+    The source must have reached the limit. Of the hosts with room for the process, the destination
+    must have the largest margin.
 
     Args:
         look: at the cluster, right before.
         move: the migration.
+        need: bytes for which the destination must have room.
         limit: of each host, fraction.
         headroom: by which a destination stays under the limit, fraction.
     """
@@ -147,7 +154,7 @@ def wrong_move(look: Look, move: Move, limit: float, headroom: float) -> str:
     fits = {
         name: load
         for name, load in loads.items()
-        if load + move.size / look.hosts[name].capacity <= limit - headroom + 2 * NOISE
+        if load + need / look.hosts[name].capacity <= limit - headroom + 2 * NOISE
     }
     if move.destination not in fits:
         return f"{move.process} went to {move.destination}, which had no room for it"

@@ -136,11 +136,6 @@ class LabCluster:
             if count != 1:
                 raise Failed(f"{host} has {count} supervisors: its jobs may be beside its limits")
 
-    def start_holder(self, host: str, mb: float) -> None:
-        """Start a program on a host that holds memory, and is not known to rosrm."""
-        command = [sys.executable, "-m", "rosrm_examples.holder", "--mb", f"{mb:g}"]
-        self._start(f"the holder on {host}", host, command)
-
     def wait_for_slaves(self, hosts: Sequence[str]) -> None:
         """Wait until the slaves of some hosts are registered and request work."""
 

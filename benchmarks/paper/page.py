@@ -67,7 +67,8 @@ def section(name: str, report: _Report, picture: str) -> str:
         report: content of its JSON file.
         picture: path of its picture, from the page.
     """
-    rows = "".join(f"| {what} | {paper} | {ours} |\n" for what, paper, ours in _ROWS[name](report))
+    lines = [*_ROWS[name](report), *_spread(report)]
+    rows = "".join(f"| {what} | {paper} | {ours} |\n" for what, paper, ours in lines)
     verdict = "The claim holds." if report["claim_holds"] else "**The claim does not hold:** "
     reasons = "; ".join(report["against_it"])
     return (
@@ -80,6 +81,8 @@ def section(name: str, report: _Report, picture: str) -> str:
 def _measured_on(report: _Report) -> str:
     machine, runs = report["machine"], report["runs"]
     often = "one run" if runs == 1 else f"median of {runs} runs"
+    if "spread" in report:
+        often = f"the median one of {runs} runs"
     return (
         f"({often}, {report['seconds']:.0f} s in all, load average {report['load_average_before']} "
         f"before; {machine['cores']} cores of {machine['processor']})"
@@ -87,6 +90,29 @@ def _measured_on(report: _Report) -> str:
 
 
 _Rows = list[tuple[str, str, str]]
+
+
+def _spread(report: _Report) -> _Rows:
+    """Return a row for each number of which several runs show the range."""
+    return [
+        (f"{_SPREAD[name]}: median and range of all runs", "",
+         f"{one['median']:g}, {one['least']:g} to {one['most']:g}")
+        for name, one in report.get("spread", {}).items()
+    ]  # fmt: skip
+
+
+_SPREAD: Final = {
+    "processes": "processes placed",
+    "widest_gap_points": "slaves apart, at most, points",
+    "gap_at_the_end_points": "slaves apart at the end, points",
+    "slope": "processes a slave",
+    "r2": "R² of the line",
+    "highest_percent": "highest utilization of a slave, %",
+    "slope_us": "µs a slave",
+    "intercept_us": "µs beside",
+    "moves": "migrations",
+    "longest_move_s": "longest migration, s",
+}
 
 
 def _fig6(report: _Report) -> _Rows:

@@ -12,6 +12,8 @@ from benchmarks.machine import machine, versions
 
 #: In the order of the paper.
 FIGURES: Final = ("fig6", "fig7", "fig8", "fig9", "fig10", "table3")
+#: Figures that are measured several times.
+REPEATED: Final = ("fig6", "fig7", "fig8", "fig9", "fig10")
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Options:
 
     Attributes:
         folder: for settings, logs and records, removed afterwards.
-        runs: of each case of Table III.
+        runs: of each figure, and of each case of Table III.
         drives: to be mapped for Table III; empty: those available.
         small: measure so little that it only shows that the measurement works.
         lab: prefix of the names of labs.

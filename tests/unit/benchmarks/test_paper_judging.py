@@ -160,7 +160,7 @@ MOVE = Move("p", "host1", "host2", 1.0, 1.5, size=0.3 * CAPACITY)
 )
 def test_a_move_is_judged_by_what_was_seen_right_before(usages, word):
     """The source is at its limit, and the destination is the emptiest host with room."""
-    wrong = wrong_move(look_at(0.9, usages), MOVE, limit=0.8, headroom=0.05)
+    wrong = wrong_move(look_at(0.9, usages), MOVE, MOVE.size, limit=0.8, headroom=0.05)
     assert wrong == "" if not word else word in wrong
 
 
@@ -169,7 +169,7 @@ def test_an_emptier_host_without_room_is_no_reproach():
     look = look_at(0.9, {"host1": 0.81, "host2": 0.4})
     small = HostLook(0.1, 0.0, 0.2 * CAPACITY, accepting=True)
     look = Look(look.elapsed, {**look.hosts, "host3": small}, {})
-    assert wrong_move(look, MOVE, limit=0.8, headroom=0.05) == ""
+    assert wrong_move(look, MOVE, MOVE.size, limit=0.8, headroom=0.05) == ""
 
 
 def test_moves_are_read_from_the_record():
