@@ -39,8 +39,8 @@ from rosrm.errors import RosrmError
 from rosrm_examples.errors import ExampleError
 from rosrm_lab import needs
 
-#: Needs no hosts: the slaves are simulated.
-_WITHOUT_LAB = ("fig9",)
+#: These need no hosts: the slaves are simulated, or share the machine with budgets.
+_WITHOUT_LAB = ("fig9", "fig11")
 #: Exit status where nothing was measured.
 _FAILED = 2
 
@@ -89,7 +89,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--drive", action="append", default=[], metavar="DRIVE",
         help="for Table III: name or path of a LiDAR drive, several times for several; else the "
         "KITTI drives 0001, 0002 and 0027 in the folder that ROSRM_KITTI names (without it: in "
-        "../shared/data/kitti beside the repository), or a simulated street",
+        "../shared/data/kitti beside the repository), or a simulated street. Fig. 11 plays the "
+        "first one",
     )  # fmt: skip
     parser.add_argument(
         "--page", type=Path, help="write what was measured into this page (docs/evaluation.md)"

@@ -204,6 +204,19 @@ def _table3(report: _Report) -> _Rows:
     ]  # fmt: skip
 
 
+def _fig11(report: _Report) -> _Rows:
+    hosts = ", ".join(f"{part['scans']} on {part['host']}" for part in report["parts"])
+    return [
+        ("scans mapped", "", f"{report['scans_processed']} of {report['scans_sent']}: {hosts}"),
+        ("scans lost, mapped twice", "", f"{report['scans_lost']}, {report['scans_repeated']}"),
+        ("pause beyond the period of the scans, ms", "", f"{report['gap_ms']}"),
+        ("poses apart from a drive without a move, at most, m", "",
+         f"{report['max_deviation_m']}"),
+        ("drive", "", report["drive"]),
+    ]  # fmt: skip
+
+
 _ROWS: Final[Mapping[str, Callable[[_Report], _Rows]]] = {
     "fig6": _fig6, "fig7": _fig7, "fig8": _fig8, "fig9": _fig9, "fig10": _fig10, "table3": _table3,
+    "fig11": _fig11,
 }  # fmt: skip

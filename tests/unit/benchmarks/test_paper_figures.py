@@ -16,12 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.paper import __main__ as paper
-from benchmarks.paper import fig6, fig8, fig9, fig10, page, pictures, table3
+from benchmarks.paper import fig6, fig8, fig9, fig10, fig11, page, pictures, table3
 from benchmarks.paper.judging import Line
 from benchmarks.paper.labs import Failed, LabClient, Part
 from benchmarks.paper.page import section, update_page
 from benchmarks.paper.repeated import combined
-from benchmarks.paper.report import FIGURES, REPEATED, Result
+from benchmarks.paper.report import FIGURES, REPEATED, Options, Result
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, host_settings
 from benchmarks.paper.slam import Piece, pieces_of, shared_out
 from benchmarks.paper.trace import Happening, HostLook, Look, Trace
@@ -228,6 +228,31 @@ def test_several_runs_are_one_result_with_median_and_range():
 def test_each_number_with_a_range_has_its_row_on_the_page(name):
     figure = importlib.import_module(f"benchmarks.paper.{name}")
     assert set(figure.SPREAD) <= set(page._SPREAD)
+
+
+def test_fig11_is_judged_by_the_summary_of_the_demo(tmp_path, monkeypatch):
+    """The picture is that of the demo; a demo without results is a failed measurement."""
+    summary = {
+        "drive": "street", "scans_sent": 9, "scans_processed": 9, "scans_lost": 0,
+        "scans_repeated": 1, "migrations": 1, "gap_ms": 1.0, "max_deviation_m": 0.0,
+        "parts": [{"host": "a", "scans": 9, "points": 1}],
+    }  # fmt: skip
+
+    def demo(command, **_):
+        out = Path(command[command.index("--out") + 1])
+        out.mkdir()
+        (out / "summary.json").write_text(json.dumps(summary))
+        (out / "map.png").write_bytes(b"map")
+        return subprocess.CompletedProcess(command, 1)
+
+    monkeypatch.setattr(subprocess, "run", demo)
+    result = fig11.measure(Options(tmp_path, small=True))
+    assert result.wrong == ["scans_repeated is 1, not 0"]
+    result.draw(tmp_path / "fig11.png")
+    assert (tmp_path / "fig11.png").read_bytes() == b"map"
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 2))
+    with pytest.raises(Failed, match="the demo ended with exit code 2"):
+        fig11.measure(Options(tmp_path))
 
 
 # --- failures -------------------------------------------------------------------------------------
