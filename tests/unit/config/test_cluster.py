@@ -341,6 +341,7 @@ def test_without_defaults_of_processes_there_are_none(file, text):
         ("{name: p}", "f.yaml:1:22: defaults.process: name is allowed in a process only"),
         ("{module: m}", "f.yaml:1:22: defaults.process: module is allowed in a process only"),
         ("{foreach: {i: [1]}}", "defaults.process: foreach is allowed in a process only"),
+        ("{spread: rack}", "defaults.process: spread is allowed in a process only"),
         ("{restrat: always}", "f.yaml:1:22: unknown key 'restrat'; did you mean 'restart'?"),
         ("{restart: {delay: soon}}", "f.yaml:1:39: restart.delay: "),
         ("{restart: {delay: 9s, max_delay: 2s}}", "restart.max_delay must not be less than"),
