@@ -165,8 +165,8 @@ __all__ = [
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
     "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
-    "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging", "Plan",
-    "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
+    "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
+    "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
     "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
     "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError",
@@ -203,7 +203,8 @@ _NAMES: Final = {
     "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind MigrationPolicy "
-        "NeighbourRule ProcessSpec Readiness Reading ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
+        "NeighbourRule ProcessSpec Readiness Reading ResourceDescription RestartPolicy "
+        "StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {
