@@ -19,8 +19,8 @@ STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
     "required_labels", "preferred_labels", "avoided_labels",
 )  # fmt: skip
-#: All fields of a spec, which an offer may declare.
-SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec))
+#: All fields of a spec, which an offer may declare; `given` is of use at the submission only.
+SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec) if f.name != "given")
 
 
 class UndeclaredField(LookupError):

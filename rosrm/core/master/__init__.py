@@ -4,7 +4,8 @@ reducer.py     the transition table: the handler of each event
 events.py, commands.py, outcomes.py, settings.py
 master_state.py, state/   data and the rules that keep it consistent
 tick.py        periodic work
-requests.py    requests of clients; rights.py, quotas.py, pruning.py, graph_names.py
+requests.py    requests of clients; rights.py, quotas.py, contradictions.py, process_defaults.py,
+               pruning.py, graph_names.py
 answers.py     answers of slaves to orders
 lifecycle.py   an instance from start to end
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py

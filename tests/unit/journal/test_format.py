@@ -145,7 +145,9 @@ def test_every_process_is_written_back_as_it_was_read(state: MasterState, name: 
     process = state.processes[name]
     state.save(process)
     again = written(state)["process", name]
-    before = {"principal": "", "owned_from": 0, **INTENTS["process", name]}  # as in older journals
+    # Fields that are absent in older journals.
+    before = {"principal": "", "owned_from": 0, "defaulted": [], **INTENTS["process", name]}
+    before["spec"] = {"neighbours": [], "given": [], **before["spec"]}
     changed = {field: (before[field], value) for field, value in again.items()
                if before[field] != value}  # fmt: skip
     if process.phase not in WAITING:
