@@ -27,7 +27,7 @@ Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, Migrati
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
-                ResourceDescription, Reading
+                ResourceDescription, Accounting, Reading
   scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
@@ -138,6 +138,7 @@ if TYPE_CHECKING:
         ResourceRow,
     )
     from rosrm.model.values import (
+        Accounting,
         Health,
         HostDescription,
         HostLossPolicy,
@@ -157,7 +158,7 @@ if TYPE_CHECKING:
 
 # Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
-    "PROTOCOL_VERSION", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
+    "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "EventRow", "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher",
@@ -202,9 +203,9 @@ _NAMES: Final = {
     "model.ros_settings": "RosSettings",
     "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
-        "Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind MigrationPolicy "
-        "NeighbourRule ProcessSpec Readiness Reading ResourceDescription RestartPolicy "
-        "StandbyPolicy StopPolicy"
+        "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
+        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ResourceDescription "
+        "RestartPolicy StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {

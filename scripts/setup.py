@@ -355,7 +355,7 @@ def ended_with_us(process: subprocess.Popen[str]) -> Iterator[None]:
     """End a command, with its compilers, where this run is interrupted."""
     try:
         yield
-    except BaseException:
+    except BaseException:  # an interrupt above all
         for how, grace in ((signal.SIGINT, 5.0), (signal.SIGKILL, None)):
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, how)

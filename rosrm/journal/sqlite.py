@@ -162,7 +162,7 @@ class SqliteJournal:
                 [at for at, value in intents.items() if value is None],
             )
             database.execute("COMMIT")
-        except BaseException:
+        except BaseException:  # also an interrupt must leave no open transaction
             if database.in_transaction:
                 database.execute("ROLLBACK")
             raise

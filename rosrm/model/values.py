@@ -171,6 +171,11 @@ class NeighbourRule:
     by: str = ""
     prefer: bool = False
 
+    @property
+    def requires_near(self) -> bool:
+        """True if the process must run near the others."""
+        return self.relation == "near" and not self.prefer
+
 
 @dataclass(frozen=True, slots=True)
 class Health:

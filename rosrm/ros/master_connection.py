@@ -215,7 +215,7 @@ class MasterClient:
         try:
             endpoints = SealedEndpoints(participant, user_security(security, timeout))
             hello = _greet(endpoints, name, timeout, begun)
-        except BaseException:
+        except BaseException:  # also an interrupt must leave no open participant
             participant.close()
             raise
         return cls(endpoints, hello, name, max(timeout, _REQUEST))

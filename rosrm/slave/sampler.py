@@ -385,9 +385,9 @@ class _Watched:
         by_process: UsageByProcess = EMPTY
         reason = ""
         try:
-            read = read_values(self._probe, self.names)
-            by_process = read_processes(self._probe, self._resources)
-            values = read
+            values, by_process = (
+                read_values(self._probe, self.names), read_processes(self._probe, self._resources)
+            )  # fmt: skip
         except PluginError as nonsense:
             reason = str(nonsense)
         except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even

@@ -176,9 +176,9 @@ class SessionTable:
         ticks = used = 0
         for pid in members:
             stat = _content(f"{self._proc}/{pid}/stat", 1024)
-            status = _content(f"{self._proc}/{pid}/status", 4096)
             if not stat:
                 continue
+            status = _content(f"{self._proc}/{pid}/status", 4096)
             # The name, in parentheses, may itself hold spaces and parentheses.
             fields = stat[stat.rindex(b")") + 2 :].split()
             ticks += int(fields[11]) + int(fields[12]) + int(fields[13]) + int(fields[14])

@@ -232,7 +232,7 @@ class LocalCluster:
                 self.start_slave(host)
             if self.hosts:
                 self.wait_for_hosts()
-        except BaseException:
+        except BaseException:  # also an interrupt must leave no process
             self.close()
             raise
         return self

@@ -71,7 +71,7 @@ print(json.dumps({
 }), flush=True)
 try:
     rclpy.spin(node)
-except BaseException:
+except BaseException:  # however the context ends, the node ends with success
     pass
 """
 

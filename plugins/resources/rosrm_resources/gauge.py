@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, Literal, Protocol
 
-from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription
+from rosrm import Accounting, ConfigError, ProbeContext, Reading, ResourceDescription
 
 #: Scope of a measurement: the whole machine; the control group of the slave (for containers); or
 #: the slave's own process tree against a budget.
 Scope = Literal["machine", "cgroup", "slice"]
-
-Accounting = Literal["attributed", "shared", "countable"]
 
 #: Largest reported usage. A small budget can be exceeded a hundredfold, and a larger number would
 #: add no information.

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Ge
 
-from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription, SkipPlugin
-from rosrm_resources.gauge import Accounting
+from rosrm import Accounting, ConfigError, ProbeContext, Reading, ResourceDescription, SkipPlugin
 
 _LIBRARY: Final = "libnvidia-ml.so.1"
 #: Inode of the first pid namespace (`PROC_PID_INIT_INO` of the kernel).

@@ -49,7 +49,7 @@ def _tied(state: MasterState, submitted: _Specs) -> _Specs:
 
 
 def _near(spec: ProcessSpec) -> list[str]:
-    rules = (rule for rule in spec.neighbours if rule.relation == "near" and not rule.prefer)
+    rules = (rule for rule in spec.neighbours if rule.requires_near)
     return [name for rule in rules for name in rule.processes]
 
 

@@ -177,11 +177,11 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
     position = row.queue_position
     if process.name in state.neighbours.separated:
         return state.neighbours.separated[process.name][0]
-    if position and awaited_neighbour(state, process):
-        return awaited_neighbour(state, process)
+    if position and (awaited := awaited_neighbour(state, process)):
+        return awaited
     if process.phase is not ProcessPhase.QUEUED or position <= 1:
-        awaited = _awaited_node(process, state.instances.get(process.owner))
-        return reason_of(state, process) or awaited
+        owner = state.instances.get(process.owner)
+        return reason_of(state, process) or _awaited_node(process, owner)
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"
 

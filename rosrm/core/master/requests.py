@@ -50,12 +50,12 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     check_rights(named, event.by)
     taken = _taken(state, event)
     if taken:
-        raise RequestRefused(taken, "name_taken")
+        raise RequestRefused(f"{taken}. Nothing was queued", "name_taken")
     filled = [with_defaults(spec, state.settings.process_defaults) for spec in event.specs]
     specs = [spec for spec, _ in filled]
-    fault = _submission_fault(state, filled)
+    fault = _submission_fault(state, filled) or neighbour_fault(state, specs)
     if fault:
-        raise RequestRefused(fault)
+        raise RequestRefused(f"{fault}. Nothing was queued")
     check_quota(state, specs, event.by)
     wall, born, first = state.wall, state.next_instance, state.next_order
     processes = [
@@ -92,18 +92,18 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
     """Return why the submitted names cannot be used; "" if they can."""
     twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
     if twice:
-        return f"submitted twice at once: {listed(twice)}; names are unique. Nothing was queued"
+        return f"submitted twice at once: {listed(twice)}; names are unique"
     taken = [
         spec.name for spec in event.specs
         if spec.name in state.processes and not state.processes[spec.name].phase.is_terminal
     ]  # fmt: skip
     if taken:
-        return f"{'; '.join(_in_use(state, taken))}. Nothing was queued"
+        return "; ".join(_in_use(state, taken))
     for spec in event.specs:
         if spec.name in state.processes or spec.name in state.unowned_instances:
             left = _still_stopping(state, spec.name)
             if left:
-                return f"{left}. Nothing was queued"
+                return left
     return ""
 
 
@@ -145,14 +145,13 @@ def _submission_fault(
     if live + len(submitted) > most:
         return (
             f"{live} processes have not ended, and {len(submitted)} more would exceed "
-            f"`queue.max_processes` ({most}). Nothing was queued"
+            f"`queue.max_processes` ({most})"
         )
     for spec, defaulted in submitted:
         fault = _spec_fault(state, spec)
         if fault:
-            return f"{spec.name}: {fault}{_origin(defaulted)}. Nothing was queued"
-    fault = neighbour_fault(state, [spec for spec, _ in submitted])
-    return f"{fault}. Nothing was queued" if fault else ""
+            return f"{spec.name}: {fault}{_origin(defaulted)}"
+    return ""
 
 
 def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:

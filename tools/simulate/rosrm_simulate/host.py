@@ -14,6 +14,7 @@ from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from rosrm.core.master.commands import OrderId, SendOrder
 from rosrm.core.master.events import OrderAnswered, StatusesReceived, UsagesReceived
@@ -175,7 +176,7 @@ class Host(ABC, Generic[ProgramT]):
 
     def usage(self, now: float) -> dict[str, float]:
         """Return the fraction of each resource that is used."""
-        used = [self.used_by(program, now) for program in self.programs.values()]
+        used = self._amounts(now).values()
         return {
             one.name: self.busy.get(one.name, 0.0)
             + sum(amounts.get(one.name, 0.0) for amounts in used) / one.capacity
@@ -195,26 +196,30 @@ class Host(ABC, Generic[ProgramT]):
 
     def used(self, now: float) -> tuple[tuple[int, float, float], ...]:
         """Return number, cores and bytes of each instance."""
-        usages = []
-        for instance, program in self.programs.items():
-            amounts = self.used_by(program, now)
-            usages.append((instance.number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0)))
-        return tuple(usages)
+        return tuple(
+            (instance.number, amounts.get("cpu", 0.0), amounts.get("memory", 0.0))
+            for instance, amounts in self._amounts(now).items()
+        )
+
+    def _amounts(self, now: float) -> dict[InstanceId, Mapping[str, float]]:
+        return {one: self.used_by(program, now) for one, program in self.programs.items()}
 
     def usages(self, now: float) -> UsagesReceived:
         """Return the event with the usage of each instance."""
-        used = self.used(now)
-        numbers, cpu, memory = zip(*used, strict=True) if used else ((), (), ())
-        amounts = [self.used_by(program, now) for program in self.programs.values()]
+        used = self._amounts(now)
+
+        def column(resource: str) -> npt.NDArray[np.float64]:
+            return np.array([amounts.get(resource, 0.0) for amounts in used.values()], np.float64)
+
         measured = self.measured | self.description().accounted("attributed") - MOST_USED.keys()
         others = {
-            slot: np.array([one.get(resource.name, 0.0) for one in amounts])
+            slot: column(resource.name)
             for slot, resource in enumerate(self.resources)
             if resource.name in measured
         }
         return UsagesReceived(
-            self.host_id, self.incarnation, np.array(numbers, np.uint64),
-            np.array(cpu, np.float64), np.array(memory, np.float64), others,
+            self.host_id, self.incarnation, np.array([one.number for one in used], np.uint64),
+            column("cpu"), column("memory"), others,
         )  # fmt: skip
 
     # --- the slave -------------------------------------------------------------------------

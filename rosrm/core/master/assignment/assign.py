@@ -120,11 +120,11 @@ def joint_demand(state: MasterState, demands: Mapping[str, Demand]) -> Demand:
 
     `demands`: the demand of each process by its name.
     """
-    demand, *others = demands.values()
+    (_, demand), *others = demands.items()
     if not others:
         return demand
     table, excluded = state.hosts, dict(demand.excluded)
-    for name, other in list(demands.items())[1:]:
+    for name, other in others:
         ranking = ranking_of(state, other)
         for host in table.listed():
             if not ranking.fits(host.column):

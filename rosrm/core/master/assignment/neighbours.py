@@ -96,7 +96,7 @@ def host_of(state: MasterState, name: str) -> tuple[Host | None, str]:
 def awaited_neighbour(state: MasterState, process: Process) -> str:
     """Return why a waiting process waits for another one, near which it must run; "": none."""
     for rule in process.spec.neighbours:
-        for name in rule.processes if _is_required(rule) else ():
+        for name in rule.processes if rule.requires_near else ():
             host, why = host_of(state, name)
             if host is None and not _goes_first(state, process, name):
                 return _awaited(name, why)
@@ -110,9 +110,9 @@ def _awaited(name: str, why: str) -> str:
 def _goes_first(state: MasterState, process: Process, name: str) -> bool:
     """Return True if a process waits in turn for this one, which is the first of them in line."""
     waiting = _awaited_by(state, name)
-    in_circle = [one for one in waiting if process.name in _awaited_by(state, one)]
     if process.name not in waiting:
         return False
+    in_circle = [one for one in waiting if process.name in _awaited_by(state, one)]
     first = min((state.processes[one] for one in in_circle), key=_place_in_line)
     return first is process
 
@@ -131,7 +131,7 @@ def _awaited_by(state: MasterState, name: str) -> dict[str, None]:
             continue
         found[one] = None
         for rule in state.neighbours.declared.get(one, ()):
-            if _is_required(rule):
+            if rule.requires_near:
                 open_names += rule.processes
     return found
 
@@ -154,16 +154,12 @@ def running_with(state: MasterState, process: Process) -> list[Process]:
 
 def moving_neighbour(state: MasterState, process: Process) -> str:
     """Return a process that moves now, and that a required rule "near" concerns; "": none."""
-    own = (rule for rule in process.spec.neighbours if _is_required(rule))
+    own = (rule for rule in process.spec.neighbours if rule.requires_near)
     names = [name for rule in own for name in rule.processes]
     for other in state.neighbours.about.get(process.name, ()):
         rules = _rules_about(state, other, process.name, "near")
-        names += [other for rule in rules if _is_required(rule)]
+        names += [other for rule in rules if rule.requires_near]
     return next((name for name in names if name in state.migrations), "")
-
-
-def _is_required(rule: NeighbourRule) -> bool:
-    return rule.relation == "near" and not rule.prefer
 
 
 def _tied(state: MasterState, process: Process, here: Host | None = None) -> list[Process]:
@@ -195,7 +191,7 @@ def _tied_to(state: MasterState, process: Process) -> Iterator[str]:
 
 
 def _ties(rule: NeighbourRule) -> bool:
-    return _is_required(rule) and not rule.by
+    return rule.requires_near and not rule.by
 
 
 # --- apart ------------------------------------------------------------------------------------

@@ -200,12 +200,13 @@ def try_move(
         migrations = _planned_moves(state, moving, destination, cause, now)
         if isinstance(migrations, Rejected):
             return migrations
-        unfit = next((one for one in migrations if why_no_executor(state, one)), None)
-        if unfit is None:
+        unfit = [(one, why) for one in migrations if (why := why_no_executor(state, one))]
+        if not unfit:
             break
-        hosts, shared = without_executor(state, unfit)
+        migration, why = unfit[0]
+        hosts, shared = without_executor(state, migration)
         if host is not None or not hosts:
-            return Rejected(why_no_executor(state, unfit))
+            return Rejected(why)
         lacking.update(dict.fromkeys(hosts, shared))
     for one, migration in zip(moving, migrations, strict=True):
         judged = ranking if one is process else rankings[one.name]

@@ -43,7 +43,7 @@ def _why_separated(state: MasterState, process: Process) -> str:
     if here is None:
         return ""
     for rule in process.spec.neighbours:
-        for name in rule.processes if rule.relation == "near" and not rule.prefer else ():
+        for name in rule.processes if rule.requires_near else ():
             there, _ = host_of(state, name)
             if there is not None and not same_place(here, there, rule.by):
                 return f"it runs on {here.name}, and not near {name}, which runs on {there.name}"
