@@ -11,6 +11,10 @@ master's runtime, without the transport and the journal:
   commands, with the queue, the record and the intent of each. `assignments_per_s` is for equal
   processes, `mixed_assignments_per_s` for ten different demands by turns (such as the pieces of a
   map), where each assignment makes the scores of the other demands stale.
+- `constrained`: 1,000 processes submitted at once to 1,000 hosts. `plain`: ten different demands by
+  turns; `applications`: the same demands with labels and neighbours, in applications of ten
+  processes that belong together; `spread`: the same demands, in groups of 150 processes that keep
+  apart. Assignments a second, and how many times as long as `plain` each takes.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import gc
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from statistics import median
 
 import numpy as np
@@ -30,14 +35,27 @@ from rosrm.core.master.commands import Assign
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
-from rosrm.model.values import RESOURCE_SLOTS, HostDescription, ProcessSpec, ResourceDescription
+from rosrm.model.values import (
+    RESOURCE_SLOTS,
+    HostDescription,
+    NeighbourRule,
+    ProcessSpec,
+    ResourceDescription,
+)
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 
 _HOSTS = (10, 100, 1_000, 10_000)
 _RESOURCES = ("memory", "cpu", "disk")
 _LIMIT = 0.8
 _AT_ONCE = 5_000
+_CONSTRAINED = 1_000
+_RACKS = 50
+_APPLICATION = 10
+_GROUP = 150
 _DEMANDS = 10
+
+#: Returns the spec of a process by its number.
+SpecOf = Callable[[int], ProcessSpec]
 
 
 class Bench:
@@ -49,7 +67,6 @@ class Bench:
 
     def __init__(self, hosts: int) -> None:
         self.now = 0.0
-        self._names = 0
         self._sequence = 0
         self._hosts = hosts
         self._random = np.random.default_rng(hosts)
@@ -62,7 +79,10 @@ class Bench:
             )
         )  # fmt: skip
         for number in range(hosts):
-            description = HostDescription(f"h{number}", number + 1, resources=described)
+            labels = {"rack": f"r{number % _RACKS}", "arch": "arm64" if number % 4 else "x86_64"}
+            description = HostDescription(
+                f"h{number}", number + 1, labels=labels, resources=described
+            )
             self.step(happened.HostRegistered(number, description))
         self.read()
         for number in range(hosts):
@@ -93,13 +113,8 @@ class Bench:
         took, _ = self.step(readings)
         return took
 
-    def submit(self, demands: Sequence[dict[str, float]]) -> tuple[float, int]:
-        """Submit one process for each demand; return as `step`."""
-        specs = []
-        for needs in demands:
-            self._names += 1
-            name = f"p{self._names}"
-            specs.append(ProcessSpec(name, package="maps", executable="map_piece", needs=needs))
+    def submit(self, specs: Sequence[ProcessSpec]) -> tuple[float, int]:
+        """Submit processes at once; return as `step`."""
         return self.step(happened.SubmissionReceived(1, tuple(specs)))
 
 
@@ -107,35 +122,77 @@ def decision(hosts: int, runs: int) -> tuple[float, float]:
     """Return the median microseconds by host of one decision, and of the readings before it."""
     bench = Bench(hosts)
     decisions, readings = [], []
-    for _ in range(runs):
+    for number in range(runs):
         readings.append(bench.read())
-        took, assigned = bench.submit([{"memory": 2.0**26, "cpu": 0.1}])
+        took, assigned = bench.submit([equal(number)])
         assert assigned == 1
         decisions.append(took)
     per_host = 1e6 / hosts
     return median(decisions) * per_host, median(readings) * per_host
 
 
-def rate(hosts: int, runs: int, needs_of: Callable[[int], dict[str, float]]) -> float:
+def rate(hosts: int, runs: int, spec_of: SpecOf, count: int = _AT_ONCE) -> float:
     """Return the median assignments a second of many processes submitted at once."""
-    rates = []
+    return median(rate_once(hosts, spec_of, count) for _ in range(runs))
+
+
+def rate_once(hosts: int, spec_of: SpecOf, count: int) -> float:
+    bench = Bench(hosts)
+    bench.submit([ProcessSpec("first", needs={"memory": 2.0**26})])
+    gc.collect()
+    took, assigned = bench.submit([spec_of(number) for number in range(count)])
+    assert assigned == count
+    return assigned / took
+
+
+def constrained(runs: int) -> dict[str, dict[str, float]]:
+    """Return the rates with labels and neighbours, measured by turns with the plain one."""
+    rates: dict[str, list[float]] = {"plain": [], "applications": [], "spread": []}
     for _ in range(runs):
-        bench = Bench(hosts)
-        bench.submit([{"memory": 2.0**26}])
-        gc.collect()
-        took, assigned = bench.submit([needs_of(number) for number in range(_AT_ONCE)])
-        assert assigned == _AT_ONCE
-        rates.append(assigned / took)
-    return median(rates)
+        for name, spec_of in zip(rates, (mixed, of_application, spread), strict=True):
+            rates[name].append(rate_once(_CONSTRAINED, spec_of, _CONSTRAINED))
+    plain = median(rates["plain"])
+    return {
+        name: {"assignments_per_s": round(median(found)), "times": round(plain / median(found), 2)}
+        for name, found in rates.items()
+    }
 
 
-def equal(_number: int) -> dict[str, float]:
-    return {"memory": 2.0**26, "cpu": 0.1}
+def equal(number: int) -> ProcessSpec:
+    return _spec(number, {"memory": 2.0**26, "cpu": 0.1})
 
 
-def mixed(number: int) -> dict[str, float]:
+def mixed(number: int) -> ProcessSpec:
     kind = number % _DEMANDS
-    return {"memory": (8 + 8 * kind) * 2.0**20, "cpu": 0.05 * (1 + kind)}
+    return _spec(number, {"memory": (8 + 8 * kind) * 2.0**20, "cpu": 0.05 * (1 + kind)})
+
+
+def of_application(number: int) -> ProcessSpec:
+    """Return a member of an application.
+
+    A driver needs a processor of a kind; four members run in its rack, two apart from each other,
+    and three workers in racks of their own.
+    """
+    spec, first = mixed(number), number - number % _APPLICATION
+    member = number - first
+    if member == 0:
+        return replace(spec, required_labels={"arch": "x86_64"})
+    if member <= 4:
+        rule = NeighbourRule("near", (f"p{first}",), by="rack")
+    elif member <= 6:
+        rule = NeighbourRule("apart", (f"p{first + 11 - member}",))
+    else:
+        rule = NeighbourRule("apart", group=f"workers {first}", by="rack")
+    return replace(spec, neighbours=(rule,))
+
+
+def spread(number: int) -> ProcessSpec:
+    rule = NeighbourRule("apart", group=f"group {number // _GROUP}")
+    return replace(mixed(number), neighbours=(rule,))
+
+
+def _spec(number: int, needs: dict[str, float]) -> ProcessSpec:
+    return ProcessSpec(f"p{number}", package="maps", executable="map_piece", needs=needs)
 
 
 def main() -> None:
@@ -151,9 +208,13 @@ def main() -> None:
         rates[str(hosts)] = round(rate(hosts, runs, equal))
         mixed_rates[str(hosts)] = round(rate(hosts, runs, mixed))
         say(f"{hosts:6} hosts: {rates[str(hosts)]} equal, {mixed_rates[str(hosts)]} mixed a second")
+    with_rules = constrained(runs)
+    for name, figure in with_rules.items():
+        say(f"{name:12}: {figure['assignments_per_s']} a second, {figure['times']} times as long")
     figures = {
         "us_per_host": per_host, "assignments_per_s": rates,
         "mixed_assignments_per_s": mixed_rates, "readings_us_per_host": read,
+        "constrained": with_rules,
     }  # fmt: skip
     print_report("decide", figures, runs=runs)
 

@@ -8,7 +8,7 @@ first of them in the queue does not wait.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Final
 
@@ -21,7 +21,11 @@ from rosrm.model.values import NeighbourRule
 from rosrm.wording import standing
 
 _NONE: Final = frozenset[str]()
-_Places = dict[tuple[str, bool], set[tuple[str, str]]]
+#: Pairs of host and process, in order.
+_At = dict[tuple[str, str], None]
+#: Label and strictness of rules to the instances that they concern.
+_Places = dict[tuple[str, bool], _At]
+_NO_MEMBERS: Final[Mapping[tuple[str, bool], Iterable[str]]] = {}
 
 
 def neighbours_of(
@@ -203,8 +207,7 @@ def _apart(state: MasterState, process: Process) -> tuple[Neighbour, ...]:
     if known is None or known[0] != state.neighbours.version:
         places = _places_apart(state, process)
         found = (
-            Neighbour("apart", by, prefer, tuple(sorted(at)))
-            for (by, prefer), at in sorted(places.items())
+            Neighbour("apart", by, prefer, tuple(at)) for (by, prefer), at in sorted(places.items())
         )
         known = state.neighbours.version, tuple(one for one in found if one.at or one.by)
         state.neighbours.apart_of[process.name] = known
@@ -213,37 +216,31 @@ def _apart(state: MasterState, process: Process) -> tuple[Neighbour, ...]:
 
 def _places_apart(state: MasterState, process: Process) -> _Places:
     """Return label and strictness of each rule "apart" to the instances that it concerns."""
-    found: _Places = defaultdict(set)
-    for rule, other in _rules_apart(state, process):
-        at = found[rule.by, rule.prefer]  # a label is required even without others
-        if other != process.name:
-            at.update(_instances_at(state, other))
-    return found
-
-
-def _rules_apart(state: MasterState, process: Process) -> Iterator[tuple[NeighbourRule, str]]:
-    """Yield each rule "apart" of a process or about it, with the name of each other process."""
+    found: _Places = defaultdict(dict)
     for rule in process.spec.neighbours:
         if rule.relation != "apart":
             continue
-        for other in rule.processes:
-            yield rule, other
-        for other in state.neighbours.groups.get(rule.group, ()):  # none for the group ""
-            yield rule, other
-            for theirs in state.neighbours.declared[other]:
-                if theirs.group == rule.group and theirs != rule:
-                    yield theirs, other
+        own = found[rule.by, rule.prefer]  # a label is required even without others
+        own.update(_instances_at(state, process, rule.processes))
+        for theirs, members in state.neighbours.groups.get(rule.group, _NO_MEMBERS).items():
+            at = _instances_at(state, process, members)
+            own.update(at)
+            found[theirs].update(at)
     for other in state.neighbours.about.get(process.name, ()):
         for rule in _rules_about(state, other, process.name, "apart"):
-            yield rule, other
+            found[rule.by, rule.prefer].update(_instances_at(state, process, (other,)))
+    return found
 
 
-def _instances_at(state: MasterState, name: str) -> Iterator[tuple[str, str]]:
-    """Return host and name for each instance of a process that runs or may run."""
-    process = state.processes.get(name)
-    if process is None:
-        return
-    for number in process.instances:
-        yield state.instances[number].host.name, name
-    if process.left_behind is not None:
-        yield process.left_behind.host, name
+def _instances_at(state: MasterState, process: Process, names: Iterable[str]) -> _At:
+    """Return host and name of each instance of other processes that runs or may run."""
+    found: _At = {}
+    for name in names:
+        other = state.processes.get(name)
+        if other is None or other is process:
+            continue
+        for number in sorted(other.instances):
+            found[state.instances[number].host.name, name] = None
+        if other.left_behind is not None:
+            found[other.left_behind.host, name] = None
+    return found

@@ -72,13 +72,15 @@ def unmet(hosts: Candidates, row: int) -> str:
 
 def _neighbours_beside(table: HostTable, neighbour: Neighbour) -> FloatArray:
     """Return the number of instances, (H,), on each host or in its place by the label."""
+    by, hosts = neighbour.by, table.by_name
+    there = [hosts[name] for name, _ in neighbour.at if name in hosts]
+    if not by:
+        columns = np.fromiter((host.column for host in there), np.int64, len(there))
+        return np.bincount(columns, minlength=len(table)).astype(np.float64)
     found = np.zeros(len(table))
-    places = Counter(_value(table, name, neighbour.by) for name, _ in neighbour.at)
-    for place, count in places.items():
-        if place is not None and neighbour.by:
-            found += count * table.labelled(neighbour.by, place)
-        elif place is not None:
-            found[table.by_name[place].column] += count
+    for place, count in Counter(host.description.labels.get(by) for host in there).items():
+        if place is not None:
+            found += count * table.labelled(by, place)
     return found
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
+from typing import TypeVar
 
 from rosrm.core.master.state.demand import Neighbour
 from rosrm.model.values import NeighbourRule, ProcessSpec
 
+_K = TypeVar("_K", bound=Hashable)
 _Names = dict[str, dict[str, None]]
 
 
@@ -16,7 +18,7 @@ class NeighbourRules:
     Attributes:
         declared: name of each process with rules to its rules, in order of submission.
         about: name of a process to the processes with rules that name it.
-        groups: group to its processes.
+        groups: group to label and strictness of its rules, to the processes with such a rule.
         version: counter of changes of the rules and of the hosts of the processes concerned.
         apart_of: process to the version and its resolved rules of the relation "apart".
         separated: process that runs apart from one near which it must run, to the reason and the
@@ -26,7 +28,7 @@ class NeighbourRules:
     def __init__(self) -> None:
         self.declared: dict[str, tuple[NeighbourRule, ...]] = {}
         self.about: _Names = {}
-        self.groups: _Names = {}
+        self.groups: dict[str, dict[tuple[str, bool], dict[str, None]]] = {}
         self.version = 0
         self.apart_of: dict[str, tuple[int, tuple[Neighbour, ...]]] = {}
         self.separated: dict[str, tuple[str, float]] = {}
@@ -39,8 +41,8 @@ class NeighbourRules:
         self.declared[spec.name] = spec.neighbours
         for name in _named(spec.neighbours):
             self.about.setdefault(name, {})[spec.name] = None
-        for group in _groups(spec.neighbours):
-            self.groups.setdefault(group, {})[spec.name] = None
+        for group, strictness in _groups(spec.neighbours):
+            self.groups.setdefault(group, {}).setdefault(strictness, {})[spec.name] = None
         self.version += 1
 
     def remove(self, name: str) -> None:
@@ -51,8 +53,10 @@ class NeighbourRules:
         rules = self.declared.pop(name, ())
         for other in _named(rules):
             _discard(self.about, other, name)
-        for group in _groups(rules):
-            _discard(self.groups, group, name)
+        for group, strictness in _groups(rules):
+            _discard(self.groups[group], strictness, name)
+            if not self.groups[group]:
+                del self.groups[group]
 
     def note_change(self, name: str) -> None:
         """Note that an instance of a process was added or has ended."""
@@ -68,11 +72,11 @@ def _named(rules: Iterable[NeighbourRule]) -> set[str]:
     return {name for rule in rules for name in rule.processes}
 
 
-def _groups(rules: Iterable[NeighbourRule]) -> set[str]:
-    return {rule.group for rule in rules if rule.group}
+def _groups(rules: Iterable[NeighbourRule]) -> Iterable[tuple[str, tuple[str, bool]]]:
+    return dict.fromkeys((rule.group, (rule.by, rule.prefer)) for rule in rules if rule.group)
 
 
-def _discard(table: _Names, key: str, name: str) -> None:
+def _discard(table: dict[_K, dict[str, None]], key: _K, name: str) -> None:
     del table[key][name]
     if not table[key]:
         del table[key]
