@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from math import inf
@@ -159,11 +159,15 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
         state.demands.clear()
         state.rankings_version = state.hosts.version
     ranking = state.rankings.get(demand.key)
-    if ranking is None:
+    if ranking is not None:
+        ranking.refresh()
+    elif demand.neighbours:
+        alone = state.rankings.get((demand.key[0], ()))
+        alone = ranking_of(state, alone.demand if alone else replace(demand, neighbours=()))
+        ranking = state.rankings[demand.key] = alone.beside(demand)
+    else:
         ranking = Ranking(state.hosts, state.policies, demand, state.plugins)
         state.rankings[demand.key] = ranking
-    else:
-        ranking.refresh()
     return ranking
 
 
@@ -249,15 +253,17 @@ def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
 
 
 def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
-    while (name := _next_in_line(state, passed_over)) is not None:
+    for name in _in_line(state, passed_over):
         if not _place_or_set_aside(state, state.processes[name], now):
             return
 
 
-def _next_in_line(state: MasterState, passed_over: frozenset[str]) -> str | None:
-    if not passed_over:
-        return state.queue.head()  # faster, because thousands may wait
-    return next((name for name in state.queue if name not in passed_over), None)
+def _in_line(state: MasterState, passed_over: frozenset[str]) -> Iterator[str]:
+    """Yield the waiting processes in order, while each one leaves the queue."""
+    if passed_over:
+        yield from (name for name in state.queue if name not in passed_over)
+    while not passed_over and (name := state.queue.head()) is not None:
+        yield name  # faster, because thousands may wait
 
 
 def _versions(state: MasterState) -> tuple[int, ...]:

@@ -171,8 +171,10 @@ def _tied(state: MasterState, process: Process, here: Host | None = None) -> lis
 
     `here`: only those on this host. Others on the way are followed only through such processes.
     """
-    found: dict[str, Process] = {}
-    open_names = [process.name] if state.neighbours.concern(process.name) else []
+    open_names = list(_tied_to(state, process))
+    if not open_names:
+        return []  # by far the most frequent case
+    found = {process.name: process}
     while open_names:
         name = open_names.pop()
         one = state.processes.get(name)

@@ -15,7 +15,6 @@ import numpy as np
 
 from rosrm.core.master.scheduling import proximity
 from rosrm.core.master.scheduling.candidates import Candidates
-from rosrm.core.master.state.demand import Neighbour
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.wording import amount, counted
@@ -153,25 +152,17 @@ def _why_no_resources(hosts: Candidates, row: int) -> str:
 
 
 def _keeps_neighbours(hosts: Candidates) -> BoolArray | None:
-    rules = _required_neighbours(hosts) if hosts.demand.neighbours else ()
-    if not rules:
-        return None
-    kept = [proximity.keeping(hosts.table, rule)[hosts.columns] for rule in rules]
-    allowed: BoolArray = np.logical_and.reduce(kept)
-    return allowed
+    kept = proximity.keeping_all(hosts.table, hosts.demand)
+    return None if kept is None else kept[hosts.columns]
 
 
 def _why_not_kept(hosts: Candidates, row: int) -> str:
     column = hosts.host(row).column
     return next(
         proximity.why_not_kept(hosts, row, rule)
-        for rule in _required_neighbours(hosts)
-        if not proximity.keeping(hosts.table, rule)[column]
+        for rule in hosts.demand.neighbours
+        if not rule.prefer and not proximity.keeping(hosts.table, rule)[column]
     )
-
-
-def _required_neighbours(hosts: Candidates) -> list[Neighbour]:
-    return [rule for rule in hosts.demand.neighbours if not rule.prefer]
 
 
 # --- presence of the host ---------------------------------------------------------------------

@@ -19,9 +19,18 @@ from rosrm.wording import listed
 TERM: Final = 1.0
 
 
+def keeping_all(table: HostTable, demand: Demand) -> BoolArray | None:
+    """Return the mask, (H,), of the hosts that keep each required rule; None: there are none."""
+    kept = [keeping(table, rule) for rule in demand.neighbours if not rule.prefer]
+    if not kept:
+        return None
+    allowed: BoolArray = np.logical_and.reduce(kept)
+    return allowed
+
+
 def keeping(table: HostTable, neighbour: Neighbour) -> BoolArray:
     """Return the mask, (H,), of the hosts that keep a rule."""
-    beside = _neighbours_beside(table, neighbour) > 0.0
+    beside = _beside_any(table, neighbour)
     if neighbour.relation == "near":
         return beside
     return ~(beside | table.labelled(neighbour.by, None)) if neighbour.by else ~beside
@@ -32,9 +41,10 @@ def preference(table: HostTable, demand: Demand) -> FloatArray | None:
     term = None
     for neighbour in demand.neighbours:
         if neighbour.prefer and neighbour.at:
-            beside = _neighbours_beside(table, neighbour)
-            unmet = beside == 0.0 if neighbour.relation == "near" else beside
-            term = TERM * unmet if term is None else term + TERM * unmet
+            is_near = neighbour.relation == "near"
+            unmet = ~_beside_any(table, neighbour) if is_near else _count(table, neighbour)
+            added: FloatArray = TERM * unmet
+            term = added if term is None else term + added
     return term
 
 
@@ -70,18 +80,35 @@ def unmet(hosts: Candidates, row: int) -> str:
     return "; ".join(phrases)
 
 
-def _neighbours_beside(table: HostTable, neighbour: Neighbour) -> FloatArray:
-    """Return the number of instances, (H,), on each host or in its place by the label."""
-    by, hosts = neighbour.by, table.by_name
-    there = [hosts[name] for name, _ in neighbour.at if name in hosts]
-    if not by:
-        columns = np.fromiter((host.column for host in there), np.int64, len(there))
-        return np.bincount(columns, minlength=len(table)).astype(np.float64)
-    found = np.zeros(len(table))
-    for place, count in Counter(host.description.labels.get(by) for host in there).items():
-        if place is not None:
-            found += count * table.labelled(by, place)
+def _beside_any(table: HostTable, neighbour: Neighbour) -> BoolArray:
+    """Return the mask, (H,), of the hosts of the instances, or of their places by the label."""
+    found = np.zeros(len(table), np.bool_)
+    if not neighbour.by:
+        found[_columns(table, neighbour)] = True
+    for place in _places(table, neighbour) if neighbour.by else ():
+        found |= table.labelled(neighbour.by, place)
     return found
+
+
+def _count(table: HostTable, neighbour: Neighbour) -> FloatArray:
+    """Return the number of instances, (H,), on each host or in its place by the label."""
+    found = np.zeros(len(table))
+    if not neighbour.by:
+        np.add.at(found, _columns(table, neighbour), 1.0)
+    for place, many in _places(table, neighbour).items() if neighbour.by else ():
+        found += many * table.labelled(neighbour.by, place)
+    return found
+
+
+def _columns(table: HostTable, neighbour: Neighbour) -> list[int]:
+    hosts = table.by_name
+    return [hosts[name].column for name, _ in neighbour.at if name in hosts]
+
+
+def _places(table: HostTable, neighbour: Neighbour) -> Counter[str]:
+    """Return the number of instances by the value of the label of their hosts."""
+    values = (_value(table, name, neighbour.by) for name, _ in neighbour.at)
+    return Counter(value for value in values if value is not None)
 
 
 def _beside(table: HostTable, host: Host, neighbour: Neighbour) -> list[tuple[str, str]]:

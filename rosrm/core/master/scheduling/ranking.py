@@ -12,6 +12,7 @@ readings (one pass over all hosts); each assignment costs one refresh and one ar
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Final
 
 import numpy as np
@@ -25,7 +26,7 @@ from rosrm.core.master.scheduling.filters import (
     refusals,
 )
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
-from rosrm.core.master.scheduling.proximity import preference
+from rosrm.core.master.scheduling.proximity import keeping_all, preference
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
@@ -73,7 +74,8 @@ class Ranking:
         self._standing = passing(STANDING, candidates(table, demand, self.need, every))
         self._refusals: dict[int, Refusal | None] = {}
         self._tier = _tiers(table, demand)
-        self._preference = preference(table, demand)
+        self._preference: FloatArray | None = None
+        self._alone: Ranking | None = None
         self._lowest: list[int] | None = None
         self._own = -1
         self._ahead: dict[int, list[float]] = {}
@@ -93,9 +95,31 @@ class Ranking:
             return name
         return f"{name} ({self.failure})" if name else self.failure
 
+    def beside(self, demand: Demand) -> Ranking:
+        """Return this ranking for a demand that differs by its neighbours alone.
+
+        Neighbours change with each assignment, so that few demands share a ranking with them. The
+        scores of the policy do not depend on them.
+        """
+        found = copy(self)
+        found._set_neighbours(demand, self)  # noqa: SLF001 - it is of this class
+        return found
+
+    def _set_neighbours(self, demand: Demand, alone: Ranking) -> None:
+        self.demand, self._alone, self._lowest = demand, alone, None
+        self._left, self._refusals, self._ahead = list(self._left), {}, {}
+        self._preference = preference(self.table, demand)
+        self.value = self.value + (0.0 if self._preference is None else self._preference)
+        kept = keeping_all(self.table, demand)
+        if kept is not None:
+            self._standing = self._standing & kept
+            self.value[~kept] = np.inf
+
     def note_assignment(self) -> None:
         """Note that the newest change of the table was an assignment of this demand."""
         self._own = len(self.table.touched)
+        if self._alone is not None:
+            self._alone.note_assignment()
 
     def refresh(self) -> None:
         """Update the columns that assignments have changed since the last refresh."""

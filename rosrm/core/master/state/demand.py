@@ -34,6 +34,10 @@ class Neighbour:
     absent: str = ""
 
 
+#: Values that decide about a ranking: those of the process alone, and its neighbours.
+RankingKey = tuple[tuple[Any, ...], tuple[Neighbour, ...]]
+
+
 @dataclass(frozen=True, slots=True)
 class Demand:
     """Inputs of the placement of one process; equal demands share a ranking.
@@ -46,7 +50,8 @@ class Demand:
         near: hosts with a replica of its snapshot; each counts as one more preferred label.
         neighbours: rules on its hosts, relative to other processes.
         reads: fields of the spec that scoring policies read beyond the standard ones.
-        key: equal for demands with equal rankings.
+        key: equal for demands with equal rankings; its first part, for demands that differ by
+            their neighbours alone.
     """
 
     spec: ProcessSpec
@@ -57,17 +62,16 @@ class Demand:
     near: tuple[str, ...] = ()
     neighbours: tuple[Neighbour, ...] = ()
     reads: tuple[str, ...] = ()
-    key: tuple[Any, ...] = field(init=False, compare=False)
+    key: RankingKey = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        key = (
+        without_neighbours = (
             *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
-            self.neighbours,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
             *(repr(getattr(self.spec, name)) for name in self.reads),
         )  # fmt: skip
-        object.__setattr__(self, "key", key)
+        object.__setattr__(self, "key", (without_neighbours, self.neighbours))
 
     @property
     def declared(self) -> frozenset[str]:
