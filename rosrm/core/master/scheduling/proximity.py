@@ -38,14 +38,22 @@ def keeping(table: HostTable, neighbour: Neighbour) -> BoolArray:
 
 def preference(table: HostTable, demand: Demand) -> FloatArray | None:
     """Return the term, (H,), of the preferred rules in the score; None: there are none."""
-    term = None
+    term: FloatArray | None = None
     for neighbour in demand.neighbours:
         if neighbour.prefer and neighbour.at:
-            is_near = neighbour.relation == "near"
-            unmet = ~_beside_any(table, neighbour) if is_near else _count(table, neighbour)
-            added: FloatArray = TERM * unmet
-            term = added if term is None else term + added
+            unmet = _unmet(table, neighbour)
+            term = TERM * unmet if term is None else term + TERM * unmet
     return term
+
+
+def _unmet(table: HostTable, neighbour: Neighbour) -> FloatArray:
+    """Return the number of instances, (H,), near or apart from which a host should be, and is not.
+
+    Of a rule "near", which has one instance: 0 or 1.
+    """
+    if neighbour.relation == "apart":
+        return _count(table, neighbour)
+    return np.where(_beside_any(table, neighbour), 0.0, 1.0)
 
 
 def why_not_kept(hosts: Candidates, row: int, neighbour: Neighbour) -> str:
