@@ -28,7 +28,8 @@ Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, Migrati
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
                 ResourceDescription, Accounting, Reading
-  scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
+  scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, LinkView, FlowView,
+                FloatArray, BoolArray
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
   launchers     LauncherOffer, Launcher, LauncherContext, Launch, ProcessTreeLauncher,
@@ -103,6 +104,7 @@ if TYPE_CHECKING:
         SpecChecking,
     )
     from rosrm.extensions.hookspecs import hookimpl
+    from rosrm.extensions.link_views import FlowView, LinkView
     from rosrm.extensions.options import options_of
     from rosrm.extensions.units import (
         Amount,
@@ -161,10 +163,10 @@ __all__ = [
     "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
-    "EventRow", "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher",
+    "EventRow", "Execute", "FloatArray", "FlowView", "Fraction", "GraphDepartureLauncher",
     "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
-    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
+    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "LinkView", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
     "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
     "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
@@ -192,6 +194,7 @@ _NAMES: Final = {
         "ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
+    "extensions.link_views": "FlowView LinkView",
     "extensions.options": "options_of",
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
-from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.values import (
     EMPTY,
@@ -171,6 +171,9 @@ class ProcessInFile:
     near: tuple[NeighboursInFile, ...] = ()
     apart: tuple[NeighboursInFile, ...] = ()
     spread: SpreadInFile | None = None
+    talks_to: Annotated[Mapping[str, ByteRate], NullIsEmpty()] = field(
+        default_factory=lambda: EMPTY
+    )
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -289,6 +292,15 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
                 yield Complaint((key,), f"{key}: {fault}")
 
 
+def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name in spec.talks_to:
+        fault = name_fault(name, "process")
+        if name == spec.name:
+            fault = f"{name} names itself; only other processes are allowed"
+        if fault:
+            yield Complaint(("talks_to", name), f"talks_to: {fault}")
+
+
 def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
     health = spec.health
     if bool(health.topic) != bool(health.rate):
@@ -381,4 +393,5 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
+    (_about_flows, ("name", "talks_to")),
 )

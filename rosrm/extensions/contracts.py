@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.extensions.link_views import NO_FLOWS, NO_LINKS, FlowView, LinkView
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
     EMPTY,
@@ -142,6 +143,7 @@ class HostView:
         capacity: (N, R) base units at usage 1.0; NaN as in `usage`.
         processes: (N,) number of processes on the host or reserved for it.
         labels: (N,) mappings, the labels of each host.
+        links: links between the hosts and all hosts of the cluster.
     """
 
     names: Sequence[str]
@@ -151,6 +153,7 @@ class HostView:
     capacity: FloatArray
     processes: npt.NDArray[np.int64]
     labels: Sequence[Mapping[str, str]] = ()
+    links: LinkView = NO_LINKS
 
     def column(self, resource: str, missing: float = 0.0) -> FloatArray:
         """Return the usage of one resource, (N,), as a new array without NaN.
@@ -177,10 +180,13 @@ class ProcessView:
             `priority`, `needs` and labels) and those that its offer declares in `reads`; any other
             field raises `UndeclaredField`.
         need: (N, R) demand of the process on each host, fractions of that host's capacity.
+        flows: flows between the process and others, declared and learned ones; empty unless the
+            offer declares `talks_to` in `reads`.
     """
 
     spec: ProcessSpec
     need: FloatArray
+    flows: FlowView = NO_FLOWS
 
 
 @dataclass(frozen=True)

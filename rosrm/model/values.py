@@ -22,6 +22,8 @@ MOST_USED: Final[Mapping[str, float]] = MappingProxyType({"cpu": 65_536.0, "memo
 MOST_USED_OF_OTHERS: Final = 2.0**53
 #: Instance numbers and journal records grow one by one, and so never get as large as this.
 LARGEST_NUMBER: Final = 2**53
+#: Greatest rate of a flow or a link, in B/s.
+LARGEST_RATE: Final = 1e15
 
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 
@@ -213,6 +215,7 @@ class ProcessSpec:
         avoided_labels: a host with any of these labels is chosen only if no other host fits.
         priority: processes with a higher number are placed first.
         neighbours: rules on its hosts, relative to other processes.
+        talks_to: name of another process to the bytes a second that flow between both.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -244,6 +247,7 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
     neighbours: tuple[NeighbourRule, ...] = ()
+    talks_to: Mapping[str, float] = field(default_factory=lambda: EMPTY)
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from rosrm.core.master.assignment.assign import decide_now
+from rosrm.core.master.assignment.flows import described_flows
 from rosrm.core.master.assignment.neighbours import awaited_neighbour
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
@@ -151,6 +152,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "reason": "; ".join(filter(None, reasons)),
         "decision": None if decision is None else {**decision, "elapsed": age},
         "defaults": defaulted_values(process.spec, process.defaulted),
+        "flows": described_flows(state, process),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
         "history": [

@@ -17,6 +17,7 @@ from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.flows import Flows
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
@@ -122,6 +123,7 @@ class MasterState:
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
+        self.flows = Flows()
         self.set_aside: set[str] = set()
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
@@ -287,10 +289,12 @@ class MasterState:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
                 self.neighbours.add(process.spec)
+            self.flows.declare(process.name, process.spec.talks_to)
         else:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
             self.neighbours.remove(process.name)
+            self.flows.remove(process.name)
 
     def collect_garbage(self) -> None:
         """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
@@ -329,6 +333,7 @@ class MasterState:
         """Queue a process at its place, given by its priority and order of submission."""
         process.owner, process.ended_on = 0, ""
         process.wanted = DesiredState.RUN
+        self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.queue.add(process.name, process.spec.priority, process.order)
 
@@ -401,12 +406,17 @@ class MasterState:
         host.instances.add(instance.number)
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
-        self.neighbours.note_change(instance.process)
+        self.note_change(instance.process)
         return added
 
     def reserve(self, instance: InstanceId, host: Host, now: float, ranking: Ranking) -> None:
         """Add an instance on the host that a ranking has chosen."""
         self.add_instance(instance, host, now, ranking.demand, ranking.need[:, host.column])
+
+    def note_change(self, name: str) -> None:
+        """Note that the instances of a process, or the one that owns its name, have changed."""
+        self.neighbours.note_change(name)
+        self.flows.note_change(name)
 
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""
@@ -417,7 +427,7 @@ class MasterState:
         if not self.unowned_instances.get(name, True):
             del self.unowned_instances[name]
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
-        self.neighbours.note_change(name)
+        self.note_change(name)
 
     def assignment(
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,

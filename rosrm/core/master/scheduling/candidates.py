@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rosrm.core.master.scheduling.traffic import flow_view
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.extensions.link_views import FlowView
 
 Columns = slice | IntArray
 
@@ -27,6 +29,7 @@ class Candidates:
         busy: (R, n) reading plus reservations.
         processes: (n,) number of processes on the host or reserved for it.
         bound: (n,) highest number of processes.
+        flows: flows of the process on each host; None: it has none, or no policy reads them.
         empty: True if the arrays are those of hosts without processes.
     """
 
@@ -39,6 +42,7 @@ class Candidates:
     busy: FloatArray
     processes: IntArray
     bound: IntArray
+    flows: FlowView | None = None
     empty: bool = False
 
     def __len__(self) -> int:
@@ -69,7 +73,15 @@ def candidates(
     return Candidates(
         table=table, demand=demand, columns=columns, resources=table.resources, need=need,
         cells=cells, busy=busy, processes=processes, bound=table.bound[columns],
+        flows=_flows(table, demand, columns),
     )  # fmt: skip
+
+
+def _flows(table: HostTable, demand: Demand, columns: Columns) -> FlowView | None:
+    if not demand.traffic.flows or not demand.scores_flows:
+        return None
+    at = np.arange(len(table))[columns] if isinstance(columns, slice) else columns
+    return flow_view(table.links, demand.traffic, at)
 
 
 def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:

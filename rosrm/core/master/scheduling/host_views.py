@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -10,11 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.scheduling.candidates import Candidates
-from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray
+from rosrm.core.master.scheduling.traffic import rates, round_trips
+from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.links import LinkTable
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.declared_fields import declared_spec
+from rosrm.extensions.link_views import NO_FLOWS
 from rosrm.extensions.plugin_calls import given, required
 
 T = TypeVar("T")
@@ -25,14 +28,14 @@ def host_view(hosts: Candidates) -> HostView:
     return HostView(
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
-        _read_only(hosts.processes[:]), _Labels(hosts),
+        _read_only(hosts.processes[:]), _Labels(hosts), _Links(hosts),
     )  # fmt: skip
 
 
 def process_view(hosts: Candidates) -> ProcessView:
     """Return the view of a process for a policy, with its needs on each host."""
     spec = declared_spec(hosts.demand.spec, hosts.demand.reads)
-    return ProcessView(spec, _read_only(hosts.need.T))
+    return ProcessView(spec, _read_only(hosts.need.T), hosts.flows or NO_FLOWS)
 
 
 def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -72,6 +75,34 @@ class _Labels(_PerHost[Mapping[str, str]]):
 
     def _of(self, host: Host) -> Mapping[str, str]:
         return MappingProxyType(dict(host.description.labels))
+
+
+class _Links:
+    """`LinkView` of some hosts; computed when it is read, because few policies read it."""
+
+    def __init__(self, hosts: Candidates) -> None:
+        self._hosts = hosts
+
+    @property
+    def hosts(self) -> Sequence[str]:
+        return [host.name for host in self._hosts.table.hosts]
+
+    @property
+    def round_trip(self) -> FloatArray:
+        return self._read(round_trips, 0.0)
+
+    @property
+    def rate(self) -> FloatArray:
+        return self._read(rates, np.inf)
+
+    def _read(
+        self, values: Callable[[LinkTable, IntArray, IntArray], FloatArray], own: float
+    ) -> FloatArray:
+        every, at = np.arange(len(self._hosts.table)), self._hosts.columns
+        columns = every[at] if isinstance(at, slice) else at
+        found = values(self._hosts.table.links, columns, every)
+        found[columns[:, None] == every] = own
+        return _read_only(found)
 
 
 def checked_scores(
