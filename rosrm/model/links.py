@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from rosrm.model.description_checks import name_fault
 from rosrm.model.values import LARGEST_RATE
 
 #: Most interfaces of one host that are told apart.
@@ -16,8 +17,13 @@ INTERFACES: Final = 8
 MOST_ADDRESSES: Final = 8
 MOST_PEERS: Final = 16
 MOST_FLOWS: Final = 512
+#: Largest number of a host in a packet, and most bytes of a key.
+MOST_NUMBER: Final = 2**32 - 1
+MOST_KEY_BYTES: Final = 32
 #: Longest round trip, in seconds; a longer one counts as no answer.
 LONGEST_ROUND_TRIP: Final = 10.0
+#: Seconds for which a slave waits for answers of other hosts.
+MEASURE_SECONDS: Final = 3.0
 _PART: Final = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 _ADDRESS: Final = re.compile(rf"({_PART}\.){{3}}{_PART}")
 
@@ -108,13 +114,47 @@ def report_from_json(plain: Mapping[str, Any]) -> LinkReport:
         }
         addresses = tuple(_some(plain["addresses"], MOST_ADDRESSES, "addresses"))
         port, limit = plain["port"], _number(plain["limit"], "the limit", 1.0)
-        is_port = type(port) is int and 0 <= port < 1 << 16
-        is_complete = is_port and all(map(_ADDRESS.fullmatch, addresses))
+        is_complete = _is_place(addresses, port)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"it is malformed ({type(error).__name__})") from None
     if not is_complete:
         raise ValueError(f"it has an impossible address or port: {addresses!r:.200}, {port!r:.50}")
     return LinkReport(addresses, port, limit, interfaces, peers, flows)
+
+
+def peer_to_json(peer: LinkPeer) -> dict[str, Any]:
+    """Return a peer with its key as a JSON object."""
+    return {
+        "host_id": peer.host_id, "host": peer.host, "addresses": list(peer.addresses),
+        "port": peer.port, "key": peer.key.hex(),
+    }  # fmt: skip
+
+
+def peers_from_json(plain: Any) -> tuple[LinkPeer, ...]:
+    """Return the peers of a JSON list; raise `ValueError` for an impossible value."""
+    try:
+        return tuple(map(_peer, _some(plain, MOST_PEERS, "peers")))
+    except (LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"it is malformed ({type(error).__name__})") from None
+
+
+def _peer(plain: Any) -> LinkPeer:
+    peer = LinkPeer(
+        int(plain["host_id"]), str(plain["host"]),
+        tuple(_some(plain["addresses"], MOST_ADDRESSES, "addresses")), plain["port"],
+        bytes.fromhex(plain["key"]),
+    )  # fmt: skip
+    fault = name_fault(peer.host, "host")
+    if not 0 < peer.host_id <= MOST_NUMBER or len(peer.key) > MOST_KEY_BYTES:
+        fault = fault or f"host {peer.host_id} cannot be, or its key"
+    if fault or not _is_place(peer.addresses, peer.port):
+        raise ValueError(fault or f"{peer.host} has an impossible address or port")
+    return peer
+
+
+def _is_place(addresses: tuple[Any, ...], port: Any) -> bool:
+    is_port = type(port) is int and 0 <= port < 1 << 16
+    return is_port and all(map(_ADDRESS.fullmatch, addresses))
 
 
 def _some(given: Any, most: int, what: str) -> list[Any]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rosrm.model.links import MEASURE_SECONDS, LinkPeer
 from rosrm.model.values import EMPTY, Assignment, InstanceId, RestartPolicy
 
 
@@ -89,6 +90,19 @@ class DropReplica:
     instance: InstanceId
 
 
+@dataclass(frozen=True, slots=True)
+class MeasureLinks:
+    """Measure the links to other hosts; the answer has a `LinkReport`.
+
+    Attributes:
+        peers: the other hosts; (): report addresses, interfaces and flows only.
+        learn: measure the flows to the instances of this host from now on.
+    """
+
+    peers: tuple[LinkPeer, ...] = ()
+    learn: bool = False
+
+
 #: Orders to the slave's core.
 InstanceOrder = (
     StartInstance
@@ -98,9 +112,11 @@ InstanceOrder = (
     | SetRestartPolicy
     | ReportInstances
 )
-Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica
+Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica | MeasureLinks
 
 
 def seconds_of(order: Order) -> float:
     """Return the seconds for which a slave may execute an order before it answers."""
+    if isinstance(order, MeasureLinks):
+        return MEASURE_SECONDS
     return order.timeout if isinstance(order, RunExecutor) else 0.0

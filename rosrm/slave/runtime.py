@@ -50,8 +50,10 @@ from rosrm.runtime.state_lock import only_one
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
+from rosrm.slave.interfaces import own_address
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
+from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sampler import ProbeReport, Sampler
@@ -130,6 +132,11 @@ class SlaveRuntime:
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._note_probes(first)
             self._note_broken(offered.broken)
+            self._links = LinkProber(
+                config.links, key_of=security.link_key, own_id=lambda: self._endpoint.host_id,
+                only=own_address(config.ros),
+            )  # fmt: skip
+            opened.callback(self._links.close)
             self._serve_master(max_age)
             self._starter = Starter(
                 config, self._snapshots, self._state, self._supervisor, self._endpoint,
@@ -199,7 +206,7 @@ class SlaveRuntime:
         )  # fmt: skip
         duties = Duties(
             self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
-            self._execute, self._read_log,
+            self._execute, self._read_log, self._links.measure,
         )  # fmt: skip
         SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
@@ -299,6 +306,7 @@ class SlaveRuntime:
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
                 guard.call(self._starter.look_at_graph, awaited)
+            guard.call(self._links.turn, now)
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
                 guard.call(self._look_at_health, now)

@@ -82,6 +82,10 @@ def _flows(flows: list[Mapping[str, Any]]) -> Text:
             f"{amount(one['rate'], 'B/s')} {'from' if one['incoming'] else 'to'} "
             f"{one['process']}{where} ({'measured' if one['learned'] else 'declared'})"
         )
+        if one.get("round_trip") is not None:
+            text += f", round trip {one['round_trip'] * 1e3:.3g} ms"
+        if one.get("link_rate") is not None:
+            text += f", link {amount(one['link_rate'], 'B/s')}"
         if not one["host"]:
             text += f" does not count yet: {one['process']} {one['reason']}"
         lines.append(text)

@@ -22,6 +22,7 @@ from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
+from rosrm.core.master.state.link_queries import LinkQueries
 from rosrm.core.master.state.migration import Migration, migration_to_dict
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
@@ -124,6 +125,7 @@ class MasterState:
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
         self.flows = Flows()
+        self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}

@@ -32,6 +32,8 @@ class CoreSettings:
             need and its measured usage; "declared": its need as at its first placement.
         max_migrations: highest number of migrations in flight.
         automatic: True: the core evicts processes from hosts that are over a limit.
+        link_period: seconds between two measurements of the links of a host; 0: no measurements.
+        learn_flows: True: slaves measure the flows between processes.
         order_retry: seconds after which an unanswered order is repeated.
         keep_ended: number of the newest terminal processes that are not garbage-collected.
         max_hosts: most hosts, also of those that left or are lost.
@@ -55,6 +57,8 @@ class CoreSettings:
     need: Literal["measured", "declared"] = "measured"
     max_migrations: int = 2
     automatic: bool = True
+    link_period: float = 10.0
+    learn_flows: bool = True
     order_retry: float = 2.0
     keep_ended: int = 10_000
     max_hosts: int = 2_000

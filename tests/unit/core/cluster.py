@@ -205,7 +205,7 @@ class Cluster(World[Machine]):
         self, *machines: Machine | str, policy: Any = None, strategies: Mapping[str, Any] = EMPTY,
         fallback: Any = None, declared: Declared | None = None, **settings: Any,
     ) -> None:  # fmt: skip
-        self.settings = CoreSettings(**{"settle": 1e9, **settings})
+        self.settings = CoreSettings(**{"settle": 1e9, "link_period": 0.0, **settings})
         self.policy = policy or Eq1()
         self.fallback = fallback
         self.strategies = {"relaunch": StartFirstOrStopFirst(), "handoff": HandOver(), **strategies}

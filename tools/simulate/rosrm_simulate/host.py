@@ -22,7 +22,13 @@ from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.slave import commands, events, reducer
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
-from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
+from rosrm.model.orders import (
+    DropReplica,
+    MeasureLinks,
+    ReplicateSnapshot,
+    RunExecutor,
+    SetRestartPolicy,
+)
 from rosrm.model.values import (
     EMPTY,
     MOST_USED,
@@ -145,6 +151,10 @@ class Host(ABC, Generic[ProgramT]):
         message = f"the simulation cannot carry out {order.executor!r}"
         return OrderAnswered(order_id, False, "failed", message)
 
+    def measure(self, order_id: OrderId, _order: MeasureLinks) -> OrderAnswered:
+        """Measure links, and answer; a simulated host does not."""
+        return OrderAnswered(order_id, False, "refused", "the simulation does not measure links")
+
     def replicate(self, order: ReplicateSnapshot | DropReplica) -> None:
         """Carry out an order about snapshots; here nodes publish none."""
 
@@ -263,6 +273,8 @@ class Host(ABC, Generic[ProgramT]):
         match order:
             case RunExecutor():
                 return self.execute(sent.order_id, order)
+            case MeasureLinks():
+                return self.measure(sent.order_id, order)
             case ReplicateSnapshot() | DropReplica():
                 self.replicate(order)
             case SetRestartPolicy():

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from collections.abc import Set as AbstractSet
+from math import isnan
 from typing import Any, Final
+
+import numpy as np
 
 from rosrm.core.master.assignment.neighbours import host_of
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.scheduling.traffic import rates, round_trips
 from rosrm.core.master.state.demand import NO_TRAFFIC, Flow, Traffic
 from rosrm.core.master.state.flows import pair_of
 from rosrm.core.master.state.hosts import Host
@@ -80,15 +84,30 @@ def _host(state: MasterState, name: str) -> Host | None:
     return owner.host if owner is not None else None
 
 
+def _link(
+    state: MasterState, here: Host | None, there: Host | None
+) -> tuple[float | None, float | None]:
+    """Return round trip and rate of the link between two hosts; None: there is none, or unknown."""
+    if here is None or there is None or here is there:
+        return None, None
+    links, ends = state.hosts.links, (np.array([here.column]), np.array([there.column]))
+    found = (float(values(links, *ends)[0, 0]) for values in (round_trips, rates))
+    trip, rate = (None if isnan(value) else value for value in found)
+    return trip, rate
+
+
 def described_flows(state: MasterState, process: Process) -> list[Mapping[str, Any]]:
     """Return the flows of a process for `explain`, also those that do not count yet."""
     rows: list[Mapping[str, Any]] = []
+    here = _host(state, process.name)
     for other in state.flows.partners.get(process.name, ()):
         flow, host = state.flows.between(process.name, other), _host(state, other)
+        trip, rate = _link(state, here, host)
         rows.append(
             {
                 "process": other, "rate": flow.rate, "incoming": flow.incoming,
                 "host": "" if host is None else host.name, "learned": flow.learned,
+                "round_trip": trip, "link_rate": rate,
                 "reason": host_of(state, other)[1] if host is None else "",
             }
         )  # fmt: skip
