@@ -27,7 +27,8 @@ from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
-from rosrm.model.orders import RunExecutor, SetRestartPolicy
+from rosrm.model.links import LinkReport
+from rosrm.model.orders import MeasureLinks, RunExecutor, SetRestartPolicy
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -41,6 +42,7 @@ from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
+from rosrm.ros.slave.flows import FlowSampler
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.replication import ReplicationEndpoint
@@ -99,6 +101,7 @@ class SlaveRuntime:
         self._incarnation = _random_number()
         self._stopping = ""
         self._accepting = False
+        self._learns = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
         self._state = SlaveState(
             max_processes=config.max_processes, max_starting=config.max_starting, max_age=max_age
@@ -132,9 +135,11 @@ class SlaveRuntime:
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._note_probes(first)
             self._note_broken(offered.broken)
+            name = f"{self._participant.node.get_name()}_flows"
+            self._flows = FlowSampler(lambda: self._participant.unwatched_node(name))
             self._links = LinkProber(
                 config.links, key_of=security.link_key, own_id=lambda: self._endpoint.host_id,
-                only=own_address(config.ros),
+                only=own_address(config.ros), flows=self._flows.rates,
             )  # fmt: skip
             opened.callback(self._links.close)
             self._serve_master(max_age)
@@ -206,7 +211,7 @@ class SlaveRuntime:
         )  # fmt: skip
         duties = Duties(
             self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
-            self._execute, self._read_log, self._links.measure,
+            self._execute, self._read_log, self._measure_links,
         )  # fmt: skip
         SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
@@ -336,6 +341,7 @@ class SlaveRuntime:
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
+        self._look_at_flows()
         sample = self._sampler.latest(now)
         if sample.reports:
             self._note_probes(sample.reports)
@@ -380,6 +386,15 @@ class SlaveRuntime:
                 [one.memory for one in used],
                 {slot: [one.others[slot] for one in used] for slot in used[0].others},
             )
+
+    def _measure_links(self, order: MeasureLinks, done: Callable[[LinkReport], None]) -> None:
+        """Measure links, and learn flows from now on or no more."""
+        self._learns = order.learn
+        self._links.measure(order, done)
+
+    def _look_at_flows(self) -> None:
+        nodes = self._state.nodes() if self._learns else {}
+        self._participant.guard.call(self._flows.look, nodes)
 
     # --- core and supervisor -------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from rosrm.config.settings import LinkSettings, NetworkSettings, ScoringChoice
 from rosrm.testing.local_cluster import LocalCluster
-from tests.ros.clusters import MIB, STEADY, host, service
+from tests.ros.clusters import MIB, STEADY, host, node, service
 from tests.waiting import wait_until
 
 MB = 1e6
@@ -47,3 +47,53 @@ def test_links_are_measured_and_their_limits_hold(make_cluster) -> None:
     assert decision["policy"] == "network"
     (why,) = (one["reason"] for one in decision["hosts"] if one["name"] == "base")
     assert why.startswith("20 MB/s from camera on robot-1 would cross a 5 MB/s link")
+
+
+#: Publishes 20 messages of 50 kB a second.
+CAMERA = """
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+rclpy.init()
+node = Node("camera")
+out = node.create_publisher(String, "image", 5)
+image = String(data="x" * 50_000)
+node.create_timer(0.05, lambda: out.publish(image))
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+VIEWER = """
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+rclpy.init()
+node = Node("viewer")
+node.create_subscription(String, "image", lambda _: None, 5)
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+
+
+def test_the_rate_of_a_topic_is_learned_as_a_flow_between_its_processes(make_cluster) -> None:
+    """The slave of the subscriber samples it, and the master knows both processes."""
+    cluster = make_cluster(
+        host("a", labels={"at": "a"}), host("b", labels={"at": "b"}), liveness=STEADY,
+        network=NetworkSettings(period=0.5),
+    )  # fmt: skip
+    cluster.submit(
+        node("camera", CAMERA, required_labels={"at": "a"}),
+        node("viewer", VIEWER, required_labels={"at": "b"}),
+    )
+    cluster.wait("viewer", "running")
+
+    def learned() -> Mapping[str, Any] | None:
+        found = [one for one in cluster.client.explain("viewer")["flows"] if one["rate"]]
+        return found[0] if found else None
+
+    flow = wait_until(learned, "a learned flow", pause=cluster.client.spin)
+    assert (flow["process"], flow["host"], flow["learned"]) == ("camera", "a", True)
+    assert 0.3 * MB < flow["rate"] < 3 * MB
