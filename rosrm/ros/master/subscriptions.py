@@ -18,7 +18,7 @@ from rosrm.ros.master.slave_links import HostLinks
 from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
 from rosrm.ros.sealed import SealedEndpoints
-from rosrm.ros.sealed_readings import is_of_unknown_host, open_reading
+from rosrm.ros.sealed_readings import may_be_of_former_run, open_reading
 from rosrm.wording import sanitized
 from rosrm_msgs import msg
 
@@ -74,8 +74,7 @@ class SlaveSubscriptions:
     def _opened(self, sealed: bytes) -> bytes | None:
         run, slave_of = self._endpoints.security.run, self._links.slave_of
         plain = open_reading(sealed, run, slave_of)
-        # After a restart of the master, slaves send readings until they notice the restart.
-        if plain is None and not is_of_unknown_host(sealed, slave_of):
+        if plain is None and not may_be_of_former_run(sealed, slave_of, time.monotonic()):
             self._endpoints.refused(self._topic)
         return plain
 
