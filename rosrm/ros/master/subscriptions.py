@@ -15,6 +15,7 @@ from rosrm.ros import convert, names, qos
 from rosrm.ros.control import version_refusal
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLinks
+from rosrm.ros.master.strangers import Strangers
 from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
 from rosrm.ros.sealed import SealedEndpoints
@@ -32,13 +33,15 @@ class SlaveSubscriptions:
     Args:
         links: receives the ids of hosts whose readings arrived.
         refuse: receives refused peers, and reasons.
+        strangers: counts the messages without a valid key, also those that slaves report.
     """
 
     def __init__(
         self, endpoints: SealedEndpoints[Authority], links: HostLinks,
-        handle: Callable[[happened.Event], None], refuse: Refuse,
+        handle: Callable[[happened.Event], None], refuse: Refuse, strangers: Strangers,
     ) -> None:  # fmt: skip
         self._endpoints = endpoints
+        self._strangers = strangers
         self._links = links
         self._handle = handle
         self._refuse = refuse
@@ -97,6 +100,10 @@ class SlaveSubscriptions:
         if fault:
             self._refuse("process_status", who, fault)
             return
+        slave = self._links.slave_of(message.host_id)
+        if message.strangers and slave is not None:
+            topics = f"the topics of {slave.peer.grant.principal}"
+            self._strangers.note(topics, message.strangers)
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
         except Refused as refusal:
