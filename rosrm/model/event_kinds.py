@@ -55,6 +55,7 @@ class EventKind(str, Enum):
     FAILED = "failed", "the process ended and is not started again"
     CANCEL_REQUESTED = "cancel_requested", "a client cancels the process"
     CANCELLED = "cancelled", "the process ended because it was cancelled"
+    OVERDUE = "overdue", "the time limit of the job has passed: it is stopped, and has failed"
     RESTART_REQUESTED = "restart_requested", "a client restarts the process"
     INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
     UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
@@ -62,6 +63,7 @@ class EventKind(str, Enum):
     GIVEN_UP = "given_up", "the host of the instance is lost, and the instance is given up"
     READOPTED = "readopted", "the lost host rejoined, and its instance owns the name again"
     SEPARATED = "separated", "the process no longer runs near another one, with the reason"
+    PREEMPTED = "preempted", "the process makes room for one of a higher priority; facts: for, host"
 
     # --- hosts ---------------------------------------------------------------------------
 
@@ -81,6 +83,7 @@ class EventKind(str, Enum):
     OVER_LIMIT = "over_limit", "the host reached a limit; facts: the resource"
     UNDER_LIMIT = "under_limit", "the host is under all its limits again"
     NOTHING_MOVES = "nothing_moves", "no process can leave the host, with the reasons"
+    REBALANCING = "rebalancing", "processes move to even out the load of the hosts; facts: moves"
 
     # --- migration -----------------------------------------------------------------------
 

@@ -228,6 +228,19 @@ class HostStateRequested:
 
 
 @dataclass(frozen=True, slots=True)
+class RebalanceRequested:
+    """An operator evens out the load of the hosts.
+
+    Attributes:
+        plan_only: True: the reply has the moves, and none begins.
+    """
+
+    request: int
+    plan_only: bool = False
+    by: Requester = OPERATOR
+
+
+@dataclass(frozen=True, slots=True)
 class PruneRequested:
     """A client removes ended processes and departed hosts from the listings.
 
@@ -341,6 +354,7 @@ ClientRequest = (
     | CheckpointRequested
     | RestoreRequested
     | HostStateRequested
+    | RebalanceRequested
     | PruneRequested
 )
 #: Events that are answered by a `Reply`.

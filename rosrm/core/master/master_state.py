@@ -22,6 +22,7 @@ from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.migration import Migration, migration_to_dict
+from rosrm.core.master.state.moving import Rebalancing, RoomMade
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
@@ -80,6 +81,8 @@ class MasterState:
 
     Attributes:
         declared: declarations in the offers of the selected plugins.
+        room_made: name of a queued process to the room that others make for it.
+        delayed: names of the queued processes that wait for the end of their `queue_delay`.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
@@ -123,6 +126,10 @@ class MasterState:
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
         self.set_aside: set[str] = set()
+        self.delayed: set[str] = set()
+        self.room_made: dict[str, RoomMade] = {}
+        self.rebalancing = Rebalancing()
+        self.preemption_reviewed = -inf
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
@@ -328,14 +335,22 @@ class MasterState:
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place, given by its priority and order of submission."""
         process.owner, process.ended_on = 0, ""
-        process.wanted = DesiredState.RUN
+        process.wanted, process.overdue = DesiredState.RUN, False
+        process.started_at, process.began = inf, 0.0
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
+        self.put_in_queue(process)
+
+    def put_in_queue(self, process: Process) -> None:
+        """Add a process whose phase is QUEUED to the queue."""
         self.queue.add(process.name, process.spec.priority, process.order)
+        if process.queue_delay:
+            self.delayed.add(process.name)
 
     def unqueue(self, process: Process) -> None:
         """Remove the process from the queue and from the set-aside list."""
         if process.name in self.queue:
             self.queue.remove(process.name)
+        self.delayed.discard(process.name)
         self.set_aside.discard(process.name)
 
     def instances_of(self, owner: Process | Host) -> list[Instance]:

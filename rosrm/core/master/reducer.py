@@ -18,6 +18,7 @@ MigrationRequested      begins a migration
 CheckpointRequested     begins to dump a process into an image
 RestoreRequested        begins to restore a process from its image
 HostStateRequested      cordons, uncordons, drains
+RebalanceRequested      evens out the load of the hosts, or replies with the moves that would
 PruneRequested          removes ended processes and departed hosts from the listings
 OrderAnswered           notes whether the slave accepted the order, and the result of an executor
 HandoffReported         notes the reported phase of a handoff's source or destination
@@ -67,6 +68,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.CheckpointRequested: requests.checkpoint_requested,
         happened.RestoreRequested: requests.restore_requested,
         happened.HostStateRequested: requests.host_state_requested,
+        happened.RebalanceRequested: requests.rebalance_requested,
         happened.PruneRequested: pruning.prune_requested,
         happened.OrderAnswered: answers.order_answered,
         happened.HandoffReported: handoff.handoff_reported,

@@ -18,6 +18,7 @@ REFUSED = {
     happened.HostRegistered, happened.SubmissionReceived, happened.CancelRequested,
     happened.RestartRequested, happened.MigrationRequested, happened.HostStateRequested,
     happened.CheckpointRequested, happened.RestoreRequested, happened.PruneRequested,
+    happened.RebalanceRequested,
 }  # fmt: skip
 KEPT = {
     happened.HostLeft, happened.StatusesReceived, happened.OrderAnswered,

@@ -53,6 +53,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     host = state.hosts.register(description, now)
     host.failing.clear()  # the slave reports the plugins that fail in this run
     state.ahead_since.pop(host.column, None)
+    state.rebalancing.joined_at = now
     if is_new:
         save_host(state, host)
     state.record(

@@ -113,6 +113,7 @@ class HostTable(HostColumns):
 
     Attributes:
         version: counter of changes that concern many hosts.
+        claims: column of a host on which room is made for a process -> priority of the process.
         touched: columns that assignments and ends have changed since `version` grew.
     """
 
@@ -122,6 +123,7 @@ class HostTable(HostColumns):
         self.hosts: list[Host] = []
         self.version = 0
         self.touched: list[int] = []
+        self.claims: dict[int, int] = {}
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}
         self._listed: list[Host] | None = None
 
@@ -218,6 +220,12 @@ class HostTable(HostColumns):
         """Note that many hosts have changed, which makes earlier rankings void."""
         self.version += 1
         self.touched.clear()
+
+    def set_claims(self, claims: dict[int, int]) -> None:
+        """Set for which priorities hosts are reserved while room is made there."""
+        if claims != self.claims:
+            self.claims = claims
+            self.changed()
 
     def ask(self, host: Host) -> None:
         """Note a request for work; placement also waits for the host's first reading."""
