@@ -37,6 +37,8 @@ class EventKind(str, Enum):
     JOURNAL_BEHIND = "journal_behind", "the newest records of the journal are missing"
     PEER_REFUSED = "peer_refused", "a message was refused: another protocol version, or malformed"
     PRUNED = "pruned", "ended processes were removed from the listings"
+    SETTINGS_RELOADED = "settings_reloaded", "the settings of a file apply without a restart"
+    RELOAD_REFUSED = "reload_refused", "a file with settings is not valid, and changes nothing"
 
     # --- processes -----------------------------------------------------------------------
 
@@ -68,6 +70,7 @@ class EventKind(str, Enum):
     # --- hosts ---------------------------------------------------------------------------
 
     HOST_REGISTERED = "host_registered", "a host registered; facts: labels and resources"
+    HOST_CHANGED = "host_changed", "the slave reports other labels of the host; facts: labels"
     HOST_REFUSED = "host_refused", "a host was not registered, with the reason"
     HOST_SUSPECT = "host_suspect", "the host is silent and gets no new work"
     HOST_BACK = "host_back", "a silent host reports again"

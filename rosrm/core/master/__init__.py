@@ -6,7 +6,7 @@ master_state.py, state/   data and the rules that keep it consistent
 tick.py        periodic work
 requests.py    requests of clients; rights.py, quotas.py, contradictions.py, process_defaults.py,
                pruning.py, graph_names.py
-answers.py     answers of slaves to orders
+answers.py     answers of slaves to orders; reloading.py
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
 scheduling/    choice of a host for a process: filter, score, pick

@@ -179,7 +179,7 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         return state.neighbours.separated[process.name][0]
     if position and (awaited := awaited_neighbour(state, process)):
         return awaited
-    room = state.room_made.get(process.name)
+    room = state.preemption.room_made.get(process.name)
     if process.phase is not ProcessPhase.QUEUED or position <= 1 or room is not None:
         owner = state.instances.get(process.owner)
         reason = reason_of(state, process) or _awaited_node(process, owner)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass
 from math import inf
 from operator import attrgetter
@@ -22,12 +22,13 @@ from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.migration import Migration, migration_to_dict
-from rosrm.core.master.state.moving import Rebalancing, RoomMade
+from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
+from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
@@ -81,7 +82,6 @@ class MasterState:
 
     Attributes:
         declared: declarations in the offers of the selected plugins.
-        room_made: name of a queued process to the room that others make for it.
         delayed: names of the queued processes that wait for the end of their `queue_delay`.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
@@ -92,6 +92,8 @@ class MasterState:
         unowned_instances: name of a removed process to its instances that may still run.
         capability_answers: answers of hosts, by strategy and host, for each strategy that must
             check its hosts.
+        scoring_of: returns the scoring policy with other options; None: the policy stays.
+        reloads: requests to reload, and the answers to them.
         plugins: guards every call of a plugin.
     """
 
@@ -127,9 +129,10 @@ class MasterState:
         self.neighbours = NeighbourRules()
         self.set_aside: set[str] = set()
         self.delayed: set[str] = set()
-        self.room_made: dict[str, RoomMade] = {}
+        self.preemption = Preemption()
         self.rebalancing = Rebalancing()
-        self.preemption_reviewed = -inf
+        self.reloads = Reloads()
+        self.scoring_of: Callable[[Mapping[str, Any]], ScoringPolicy] | None = None
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0

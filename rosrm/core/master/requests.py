@@ -21,7 +21,7 @@ from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
-from rosrm.core.master.rights import check_rights, require_operator
+from rosrm.core.master.rights import check_rights
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -411,7 +411,6 @@ def host_state_requested(
 
 def rebalance_requested(state: MasterState, event: happened.RebalanceRequested, now: float) -> None:
     """Begin one round of moves that even out the load of the hosts, or reply with its plan."""
-    require_operator(event.by, "rebalance")
     if state.rebalancing.pending:
         names = listed([name for name, _ in state.rebalancing.pending])
         raise RequestRefused(f"a round is under way: {names} will move yet")

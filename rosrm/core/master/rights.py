@@ -27,10 +27,3 @@ def check_rights(processes: Iterable[Process], by: Requester) -> None:
             f"processes: ask the owner or an operator. Nothing was changed",
             "denied",
         )
-
-
-def require_operator(by: Requester, command: str) -> None:
-    """Refuse a request of a user who is no operator."""
-    if not by.is_operator:
-        who = by.name or "an unknown user"
-        raise RequestRefused(f"`rosrm {command}` is for operators, and {who} is none", "denied")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from rosrm.core.master import events as happened
-from rosrm.model.requester import Requester
 from rosrm.model.values import NeighbourRule, ProcessSpec
 from tests.unit.core.cluster import MIB, Cluster, Machine, movable, process
 
@@ -144,11 +143,3 @@ def test_processes_on_one_host_by_rule_move_together() -> None:
     assert "move p and q from a" in rebalance(cluster)
     cluster.wait(3.0)
     assert (cluster.where("p"), cluster.where("q")) == (["b"], ["b"])
-
-
-def test_only_an_operator_rebalances() -> None:
-    """The moves concern the processes of all users."""
-    cluster = on_a(*four())
-    reply = cluster.ask(happened.RebalanceRequested, True, Requester("user:ada"))
-    assert (reply.accepted, reply.code) == (False, "denied")
-    assert reply.message == "`rosrm rebalance` is for operators, and user:ada is none"

@@ -412,7 +412,7 @@ def _record_waiting(state: MasterState, process: Process, demand: Demand, now: f
     if not state.hosts.listed():
         _record_wait_reason(state, process, "no host has registered yet", now)
         return
-    room = state.room_made.get(process.name)
+    room = state.preemption.room_made.get(process.name)
     made = room.reason if room is not None and room.host is not None else ""
     reason = why_all_away(state.hosts, demand) or made or "no host can take it now"
     if process.reason != reason:

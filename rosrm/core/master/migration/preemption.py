@@ -85,15 +85,15 @@ class _Search:
 
 def preempt(state: MasterState, now: float) -> None:
     """Make room for the first waiting processes that fit nowhere, or continue to make it."""
-    if not state.settings.preemption or now - state.preemption_reviewed < _EVERY:
+    if not state.settings.preemption or now - state.preemption.reviewed < _EVERY:
         return
-    state.preemption_reviewed = now
+    state.preemption.reviewed = now
     lowest = min((one.spec.priority for one in _placed(state)), default=None)
     waiting = [] if lowest is None else list(_waiting(state, lowest, now))
     made = {one.name: _review(state, one, now) for one in waiting}
-    state.room_made = {name: room for name, room in made.items() if room is not None}
+    state.preemption.room_made = {name: room for name, room in made.items() if room is not None}
     claims: dict[int, int] = {}
-    for name, room in state.room_made.items():
+    for name, room in state.preemption.room_made.items():
         if room.host is not None:
             priority, column = state.processes[name].spec.priority, room.host.column
             claims[column] = max(priority, claims.get(column, priority))
@@ -116,7 +116,7 @@ def _waiting(state: MasterState, lowest: int, now: float) -> Iterator[Process]:
             return
         if name in state.delayed or awaited_neighbour(state, process):
             continue
-        if name in state.room_made or now - process.since >= state.settings.hysteresis:
+        if name in state.preemption.room_made or now - process.since >= state.settings.hysteresis:
             yield process
         found += 1
         if not state.settings.backfill:
@@ -128,7 +128,7 @@ def _review(state: MasterState, process: Process, now: float) -> RoomMade | None
     ranking = ranking_of(state, demand_of(state, process))
     if ranking.best() >= 0:
         return None
-    before = state.room_made.get(process.name)
+    before = state.preemption.room_made.get(process.name)
     if before is not None and now < before.until and before.host is None:
         return before
     search = _Search(process, ranking)

@@ -7,7 +7,7 @@ values of single hosts (description, labels) are in `Host`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Final, Literal
 
@@ -31,6 +31,9 @@ from rosrm.model.values import HostDescription
 _MOST_GUESSED: Final = 0.5
 #: Greatest step from one sequence of a host to the next; a greater one is an error or a forgery.
 MOST_AHEAD: Final = 1000
+
+#: Fields of a description that may change while the slave runs.
+CHANGEABLE: Final = ("labels",)
 
 
 class HostCondition(IntEnum):
@@ -173,6 +176,18 @@ class HostTable(HostColumns):
         self._labelled.clear()
         self.changed()
         return host
+
+    def redescribe(self, host: Host, description: HostDescription) -> tuple[str, ...]:
+        """Take over what a slave may change while it runs; return the names of what has changed."""
+        new = {name: getattr(description, name) for name in CHANGEABLE}
+        changed = tuple(
+            name for name, value in new.items() if value != getattr(host.description, name)
+        )
+        if changed:
+            host.description = replace(host.description, **new)
+            self._labelled.clear()
+            self.changed()
+        return changed
 
     def prune(self, host: Host) -> None:
         """Remove a host from every listing; its slave may register it later as a new host."""

@@ -27,6 +27,19 @@ class RoomMade:
 
 
 @dataclass(slots=True)
+class Preemption:
+    """State of the preemption.
+
+    Attributes:
+        room_made: name of a queued process to the room that others make for it.
+        reviewed: time of the last review.
+    """
+
+    room_made: dict[str, RoomMade] = field(default_factory=dict)
+    reviewed: float = -inf
+
+
+@dataclass(slots=True)
 class Rebalancing:
     """State of the rebalancing.
 
