@@ -16,6 +16,8 @@ OF_CLUSTER: Final = (
 )  # fmt: skip
 #: The same of a slave.
 OF_HOST: Final = ("labels", "limits")
+#: Sections with other keys in a file than as a value.
+_AS_A_WHOLE: Final = ("ros",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,7 @@ class _Difference:
         if path in self.reloadable:
             self.changed.append(path)
             return new
-        if not is_dataclass(old) or type(old) is not type(new):
+        if path in _AS_A_WHOLE or not is_dataclass(old) or type(old) is not type(new):
             self.kept.append(path)
             return old
         merged = {

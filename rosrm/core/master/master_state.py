@@ -82,7 +82,7 @@ class MasterState:
 
     Attributes:
         declared: declarations in the offers of the selected plugins.
-        delayed: names of the queued processes that wait for the end of their `queue_delay`.
+        time_limited: names of the processes with a time limit that are not terminal.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
@@ -128,7 +128,7 @@ class MasterState:
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
         self.set_aside: set[str] = set()
-        self.delayed: set[str] = set()
+        self.time_limited: dict[str, None] = {}
         self.preemption = Preemption()
         self.rebalancing = Rebalancing()
         self.reloads = Reloads()
@@ -293,6 +293,8 @@ class MasterState:
         """Update `terminal`, which stays in the order in which processes ended."""
         if not process.phase.is_terminal:
             self.terminal.pop(process.name, None)
+            if process.spec.time_limit:
+                self.time_limited.setdefault(process.name)
             if process.spec.standby.wanted:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
@@ -300,6 +302,7 @@ class MasterState:
         else:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
+            self.time_limited.pop(process.name, None)
             self.neighbours.remove(process.name)
 
     def collect_garbage(self) -> None:
@@ -347,13 +350,12 @@ class MasterState:
         """Add a process whose phase is QUEUED to the queue."""
         self.queue.add(process.name, process.spec.priority, process.order)
         if process.queue_delay:
-            self.delayed.add(process.name)
+            self.queue.delayed.add(process.name)
 
     def unqueue(self, process: Process) -> None:
         """Remove the process from the queue and from the set-aside list."""
         if process.name in self.queue:
             self.queue.remove(process.name)
-        self.delayed.discard(process.name)
         self.set_aside.discard(process.name)
 
     def instances_of(self, owner: Process | Host) -> list[Instance]:

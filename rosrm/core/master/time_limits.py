@@ -11,22 +11,22 @@ from rosrm.model.plan import Aim
 
 def review_time_limits(state: MasterState, now: float) -> None:
     """Stop each job that runs longer than its time limit."""
-    for instance in list(state.instances.values()):
-        process = state.owned_by(instance)
-        if process is not None and _is_overdue(process, now) and _may_stop(state, process):
+    for name in list(state.time_limited):
+        process = state.processes[name]
+        if _is_overdue(process, now) and _may_stop(state, process):
             _stop(state, process, now)
 
 
 def _is_overdue(process: Process, now: float) -> bool:
-    limit = process.spec.time_limit
-    return limit > 0.0 and now - process.started_at >= limit
+    return now - process.started_at >= process.spec.time_limit
 
 
 def _may_stop(state: MasterState, process: Process) -> bool:
     """Return True unless the job is being stopped, checkpointed or restored."""
     migration = state.migrations.get(process.name)
-    moves = migration is None or migration.aim is Aim.MOVE
-    return moves and process.wanted is DesiredState.RUN
+    if migration is not None:
+        return migration.aim is Aim.MOVE and process.wanted is DesiredState.RUN
+    return process.owner in state.instances and process.wanted is DesiredState.RUN
 
 
 def _stop(state: MasterState, process: Process, now: float) -> None:

@@ -243,14 +243,14 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
 
 def _delayed(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for the end of their delay."""
-    for name in list(state.delayed):
+    for name in list(state.queue.delayed):
         process = state.processes[name]
         if now >= process.placed_from:
-            state.delayed.remove(name)
+            state.queue.delayed.remove(name)
             continue
         why = f"it is placed on another host after {process.queue_delay:g} s"
         _record_wait_reason(state, process, why, now)
-    return frozenset(state.delayed)
+    return frozenset(state.queue.delayed)
 
 
 def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, islice
+from math import inf
 from typing import Final
 
 import numpy as np
@@ -25,6 +26,7 @@ from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan
 from rosrm.core.master.migration.room import is_leaving, share_of, trial
 from rosrm.core.master.migration.start import moves_under_way, why_immovable
 from rosrm.core.master.outcomes import Rejected
+from rosrm.core.master.recovery.journal_gap import why_no_work
 from rosrm.core.master.scheduling.candidates import candidates
 from rosrm.core.master.scheduling.filters import FILTERS, OF_ROOM, passing
 from rosrm.core.master.scheduling.ranking import Ranking
@@ -88,8 +90,8 @@ def preempt(state: MasterState, now: float) -> None:
     if not state.settings.preemption or now - state.preemption.reviewed < _EVERY:
         return
     state.preemption.reviewed = now
-    lowest = min((one.spec.priority for one in _placed(state)), default=None)
-    waiting = [] if lowest is None else list(_waiting(state, lowest, now))
+    waits = bool(len(state.queue)) and not why_no_work(state, now)
+    waiting = list(_waiting(state, now)) if waits else []
     made = {one.name: _review(state, one, now) for one in waiting}
     state.preemption.room_made = {name: room for name, room in made.items() if room is not None}
     claims: dict[int, int] = {}
@@ -100,21 +102,16 @@ def preempt(state: MasterState, now: float) -> None:
     state.hosts.set_claims(claims)
 
 
-def _placed(state: MasterState) -> Iterator[Process]:
-    for instance in state.instances.values():
-        process = state.owned_by(instance)
-        if process is not None:
-            yield process
-
-
-def _waiting(state: MasterState, lowest: int, now: float) -> Iterator[Process]:
+def _waiting(state: MasterState, now: float) -> Iterator[Process]:
     """Yield the processes that are placed next, and for which others may make room."""
+    owners = (state.owned_by(one) for one in state.instances.values())
+    lowest = min((one.spec.priority for one in owners if one is not None), default=inf)
     found = 0
     for name in state.queue:
         process = state.processes[name]
         if process.spec.priority <= lowest or found == _MOST_WAITING:
             return
-        if name in state.delayed or awaited_neighbour(state, process):
+        if name in state.queue.delayed or awaited_neighbour(state, process):
             continue
         if name in state.preemption.room_made or now - process.since >= state.settings.hysteresis:
             yield process
