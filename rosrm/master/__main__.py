@@ -16,6 +16,7 @@ from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
 from rosrm.extensions.registry import Registry
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
+from rosrm.master.settings_reload import SettingsReload
 from rosrm.runtime.bootstrap import Handover, run
 
 
@@ -30,8 +31,11 @@ def serve(handover: Handover) -> int:
     rows = registry.rows("scoring", "migration", "checkpoint")
     fallback = fallback_of(registry, name)
     declared = registry.declared(name, config.migration.strategies)
+    reload = SettingsReload(
+        config, handover.source, lambda options: registry.scoring(name, options)
+    )
     return MasterRuntime(
-        config, policy, strategies, rows, fallback, checkpoint, declared=declared
+        config, policy, strategies, rows, fallback, checkpoint, declared=declared, reload=reload
     ).run()
 
 

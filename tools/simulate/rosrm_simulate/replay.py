@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Final
+from typing import Any, Final
 
 from rosrm.core.master.commands import Command
 from rosrm.core.master.master_state import MasterState
@@ -14,7 +14,7 @@ from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.reducer import step
 from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.core.master.settings import CoreSettings
-from rosrm.extensions.contracts import MigrationStrategy
+from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.recording.encoding import Happened, decisions
 from rosrm.recording.reader import Recording
@@ -65,6 +65,7 @@ def replay(
     recording: Recording, settings: CoreSettings, policy: NamedPolicy,
     strategies: Mapping[str, MigrationStrategy], watcher: Watcher | None = None,
     until: float = inf, *, declared: Declared | None = None,
+    scoring_of: Callable[[Mapping[str, Any]], ScoringPolicy] | None = None,
 ) -> Replay:  # fmt: skip
     """Replay all events of a record in a core, at the same times.
 
@@ -80,9 +81,11 @@ def replay(
         until: seconds from the beginning of the record: the run is measured up to here. All of it
             is replayed nonetheless.
         declared: declarations of the offers of policy and strategies.
+        scoring_of: returns the policy with other options, after a reload; None: it stays.
     """
     header = recording.header
     state = MasterState(settings, policy[0], policy[1], strategies, header.epoch, declared=declared)
+    state.scoring_of = scoring_of
     restore(state, lambda table: header.intents.get(table, {}), header.started)
     tail = header.intents.get("cluster", {}).get("tail")
     if tail is not None:

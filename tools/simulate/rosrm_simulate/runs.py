@@ -205,7 +205,14 @@ def replay_record(
     extraction = Extraction(recording)
     policy, strategies, declared = _plugins(config, registry)
     replayed = replay(
-        recording, config.core(), policy, strategies, extraction.watch, until, declared=declared
+        recording,
+        config.core(),
+        policy,
+        strategies,
+        extraction.watch,
+        until,
+        declared=declared,
+        scoring_of=lambda options: registry.scoring(policy[0], options),
     )
     return replayed, extraction.workload()
 
