@@ -186,3 +186,8 @@ def duration(seconds: float) -> str:
         return f"{minutes} min"
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d"
+
+
+def weighted(name: str, weight: float) -> str:
+    """Return a term of a weighted sum: `0.5 x network`; without a weight of 1."""
+    return name if weight == 1.0 else f"{weight:g} x {name}"

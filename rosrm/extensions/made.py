@@ -24,6 +24,7 @@ from rosrm.wording import get_close_matches
 _METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
     "probe": ("resources", "read", "close"),
     "scoring": ("score",),
+    "filter": ("mask", "reason"),
     "migration": ("propose",),
     "checkpoint": ("choose",),
     "launcher": ("prepare",),

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from rosrm.core.master.scheduling.host_views import checked_scores
 from rosrm.extensions.contracts import (
     BoolArray,
-    FloatArray,
     HostView,
     ProcessView,
     Scores,
@@ -34,6 +33,7 @@ def host_view(
     capacity: float = 1.0,
     processes: Sequence[int] = (),
     labels: Sequence[Mapping[str, str]] = (),
+    tenants: Sequence[Sequence[str]] = (),
 ) -> HostView:
     """Return hosts h0, h1, ... for a scoring policy.
 
@@ -43,6 +43,7 @@ def host_view(
         capacity: of every resource on every host, base units.
         processes: number of processes by host; (): 0 on every host.
         labels: by host; (): no labels.
+        tenants: names of the processes by host; (): none.
     """
     # The core stores one row for each resource, and a policy gets the transpose, as here.
     table = np.array(list(usage.values()), np.float64).reshape(len(usage), -1)
@@ -56,6 +57,7 @@ def host_view(
         capacity=np.where(missing, np.nan, capacity).T,
         processes=np.array(processes or [0] * hosts, np.int64),
         labels=labels or [EMPTY] * hosts,
+        tenants=[{name: ProcessSpec(name) for name in names} for names in tenants or [()] * hosts],
     )
 
 
@@ -79,7 +81,8 @@ def process_view(
     for name, amount in needs.items():
         if name in hosts.resources:
             row = hosts.resources.index(name)
-            need[row] = amount / hosts.capacity[:, row]
+            part = amount / hosts.capacity[:, row]
+            need[row] = np.where(np.isnan(part), np.inf if amount > 0 else 0.0, part)
     return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T)
 
 
@@ -212,17 +215,8 @@ def vetoes(scores: Scores, count: int) -> BoolArray:
 def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, ProcessView]:
     """Return the arguments of `score` for one host alone."""
     one = slice(row, row + 1)
-
-    def part(array: FloatArray) -> FloatArray:
-        return array[one]
-
-    alone = HostView(
-        hosts.names[one],
-        hosts.resources,
-        part(hosts.usage),
-        part(hosts.limit),
-        part(hosts.capacity),
-        hosts.processes[one],
-        hosts.labels[one],
-    )
-    return alone, replace(process, need=part(process.need))
+    parts = {
+        name: getattr(hosts, name)[one]
+        for name in ("names", "usage", "limit", "capacity", "processes", "labels", "tenants")
+    }
+    return replace(hosts, **parts), replace(process, need=process.need[one])

@@ -202,7 +202,7 @@ def test_a_host_over_its_limit_takes_nothing(two) -> None:
 def test_another_policy_places_and_explains(make_cluster) -> None:
     """Under the policy that the cluster names, too, the explanation has every host."""
     cluster = make_cluster(
-        host("x"), host("y", memory=256 * MIB), scoring=ScoringChoice("threshold")
+        host("x"), host("y", memory=256 * MIB), scoring=(ScoringChoice("threshold"),)
     )
     cluster.submit(service("placed", needs={"memory": 100.0 * MIB, "cpu": 0.1}))
     assert cluster.wait("placed", "running").host in ("x", "y")

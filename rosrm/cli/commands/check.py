@@ -74,9 +74,11 @@ def check(
 
 def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
     """Create the plugins that a master would create; raises `ConfigError` with all failures."""
+    from rosrm.config.placement import placement_of
+
     wrong = []
     for section, make in (
-        ("scoring", lambda: registry.scoring(cluster.scoring.policy, cluster.scoring.options)),
+        ("placement", lambda: placement_of(cluster, registry)),
         ("migration", lambda: registry.migrations(cluster.migration.strategies)),
         (
             "checkpoint",
@@ -128,8 +130,9 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             cluster = checked_cluster(root, file, registry)
             _make(file, cluster, registry)
             strategies = ", ".join(cluster.migration.strategies) or "none"
+            filters = "".join(f"filter {name}, " for name in cluster.filters)
             return (
-                f"a cluster: scoring {cluster.scoring.policy}, migration {strategies}, "
+                f"a cluster: scoring {cluster.chain}, {filters}migration {strategies}, "
                 f"checkpoint {cluster.checkpoint.policy or 'none'}"
             )
         case "host":

@@ -13,7 +13,7 @@ import numpy as np
 from rosrm.core.master.commands import Command, OrderId, SendOrder
 from rosrm.core.master.hosts.fencing import fence_of
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
-from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
+from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand
@@ -28,9 +28,9 @@ from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.replicas import ReplicationState
-from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
+from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
-from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.extensions.placement import PlacementPlugins
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
@@ -79,6 +79,7 @@ class MasterState:
     """The state of the master's core, with the changes that all handlers share.
 
     Attributes:
+        placement: the policies and filters that judge hosts.
         declared: declarations in the offers of the selected plugins.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
@@ -95,20 +96,15 @@ class MasterState:
     def __init__(
         self,
         settings: CoreSettings,
-        policy_name: str,
-        policy: ScoringPolicy,
+        placement: PlacementPlugins,
         strategies: Mapping[str, MigrationStrategy],
         epoch: int,
-        fallback: tuple[str, ScoringPolicy] | None = None,
         *,
         declared: Declared | None = None,
     ) -> None:
         self.settings = settings
         self.declared = declared or Declared()
-        self.policy_name = policy_name
-        self.policies: tuple[NamedPolicy, ...] = ((policy_name, policy),)
-        if fallback is not None:
-            self.policies += (fallback,)
+        self.placement = placement
         self.strategies = dict(strategies)
         self.epoch = epoch
         self.hosts = HostTable()
@@ -127,7 +123,7 @@ class MasterState:
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
-        self.plugins = PluginCalls()
+        self.plugins = placement.calls
         self.replication = ReplicationState()
         self.capability_answers: dict[tuple[str, str], Answer] = {}
         self.images = Images()
@@ -398,7 +394,9 @@ class MasterState:
         reserved = np.where(fractions < np.inf, fractions, 0.0)
         added = Instance(instance, host, now, needs.amounts, needs.estimated, reserved)
         self.instances[instance.number] = added
-        host.instances.add(instance.number)
+        process = self.processes.get(instance.process)
+        spec = process.spec if process is not None else ProcessSpec(instance.process)
+        host.instances[instance.number] = spec
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
         self.neighbours.note_change(instance.process)
@@ -411,7 +409,7 @@ class MasterState:
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""
         del self.instances[instance.id.number]
-        instance.host.instances.discard(instance.id.number)
+        instance.host.instances.pop(instance.id.number, None)
         name = instance.id.process
         self._numbers_of(name).discard(instance.id.number)
         if not self.unowned_instances.get(name, True):

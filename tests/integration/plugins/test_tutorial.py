@@ -88,7 +88,7 @@ def test_the_tutorial_does_what_it_says(environment):
         "registry = Registry.discover()\n"
         "config = load_cluster('rosrm-fewest/cluster.yaml', registry)\n"
         "config = ClusterConfig.from_json(config.to_json())\n"
-        "policy = registry.scoring(config.scoring.policy, config.scoring.options)\n"
+        "policy = registry.scoring(config.scoring[0].policy, config.scoring[0].options)\n"
         "print(type(policy).__module__, policy._most)\n"
     )
     assert environment.python(code).split() == ["rosrm_fewest", "20"]

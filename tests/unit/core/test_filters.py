@@ -16,7 +16,6 @@ from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.declared_fields import declared_spec
-from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.model.values import HostDescription, ProcessSpec, ResourceDescription
 
 RESOURCES = ("memory", "cpu", "gpu")
@@ -80,7 +79,7 @@ def demands(draw: st.DrawFn) -> Demand:
 
 
 def ranked(table: HostTable, demand: Demand) -> Ranking:
-    return Ranking(table, (), demand, PluginCalls())
+    return Ranking(table, demand)
 
 
 def test_no_two_filters_have_one_name() -> None:

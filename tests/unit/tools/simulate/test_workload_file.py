@@ -87,13 +87,17 @@ def test_variants_say_their_own_word_over_the_settings(load):
     )  # fmt: skip
     base, calm, threshold, five = made.variants
     assert (base.name, calm.name) == ("as given", "calm")
-    assert base.cluster.scoring.options == {"weights": {"cpu": 1.0}, "missing": "worst"}
+    assert base.cluster.scoring[0].options == {"weights": {"cpu": 1.0}, "missing": "worst"}
     assert (calm.cluster.migration.automatic, calm.cluster.migration.cooldown) == (False, 7.0)
     assert calm.cluster.scoring == base.cluster.scoring
-    assert (threshold.name, threshold.cluster.scoring.policy) == (
+    assert (threshold.name, threshold.cluster.scoring[0].policy) == (
         "scoring.policy threshold", "threshold",
     )  # fmt: skip
-    assert threshold.cluster.scoring.options["weights"] == {"memory": 1.0, "cpu": 0.5, "disk": 0.0}
+    assert threshold.cluster.scoring[0].options["weights"] == {
+        "memory": 1.0,
+        "cpu": 0.5,
+        "disk": 0.0,
+    }
     assert (five.name, five.hosts) == ("hosts 5", 5)
 
 
