@@ -17,6 +17,7 @@ from rosrm.extensions.contracts import (
     CheckpointPolicy,
     FilterOffer,
     HostChecking,
+    HostLabelling,
     LauncherContext,
     LauncherOffer,
     MigrationOffer,
@@ -50,6 +51,7 @@ from rosrm.extensions.made import (
     Probes,
     close_quietly,
     failed_probe,
+    fault_of_labels,
     fault_of_resources,
     missing_method,
     unmeasured,
@@ -373,14 +375,20 @@ class Registry:
         probe = self._make("probe", name, options, context)
         try:
             resources = tuple(probe.resources)
-            fault = fault_of_resources(resources, offer, before) or unmeasured(probe, resources)
+            labels = probe.labels if implements(probe, HostLabelling) else EMPTY
+            fault = (
+                fault_of_resources(resources, offer, before)
+                or unmeasured(probe, resources)
+                or fault_of_labels(labels, before)
+            )
             fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
         except FAULTS as raised:
-            resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
+            resources, labels = (), EMPTY
+            fault = f"its `resources` or `labels` raised {describe_plugin_fault(raised)}"
         if fault:
             close_quietly(probe)
             raise self._fault("probe", name, fault)
-        return MadeProbe(name, probe, resources, offer.period, offer.deadline)
+        return MadeProbe(name, probe, resources, offer.period, offer.deadline, dict(labels))
 
     def _required(self, kind: PluginKind, name: str, options: Mapping[str, Any]) -> Any:
         """Create an object that the master needs, so that its absence here is an error."""

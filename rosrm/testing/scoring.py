@@ -1,4 +1,4 @@
-"""Hosts and processes for tests of scoring policies, and their contract with the master."""
+"""Hosts and processes for tests of policies and filters; the contract of scoring policies."""
 
 from __future__ import annotations
 
@@ -100,6 +100,30 @@ _SPECS: Final[Sequence[Mapping[str, Any]]] = (
 )  # fmt: skip
 
 
+def placements(reads: Sequence[str]) -> Sequence[tuple[HostView, ProcessView]]:
+    """Return hosts and processes of many kinds, the same in every run.
+
+    `reads`: fields of the spec that the offer declares; the specs have no others.
+    """
+    chance = np.random.default_rng(7)
+    cases = []
+    for count in (1, 2, 7, 100, 1000):
+        usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
+        usage["gpu"][chance.random(count) < 0.5] = np.nan
+        hosts = host_view(
+            {name: list(column) for name, column in usage.items()},
+            limit=0.9,
+            processes=[n % 3 for n in range(count)],
+            labels=[{"rack": str(n % 3)} if n % 4 else {} for n in range(count)],
+            tenants=[[f"q{n}_{k}" for k in range(n % 3)] for n in range(count)],
+        )
+        cases += [(hosts, process_view(hosts, reads=tuple(reads), **spec)) for spec in _SPECS]
+    for resource in ("memory", "something"):
+        bare = host_view({resource: [0.2, 0.4]})
+        cases.append((bare, process_view(bare, reads=tuple(reads))))
+    return cases
+
+
 class ScoringContract:
     """Contract of a scoring policy with the master.
 
@@ -127,25 +151,8 @@ class ScoringContract:
         return call("score", CALL_LIMIT, ask)
 
     def cases(self) -> Sequence[tuple[HostView, ProcessView]]:
-        """Return hosts and processes of many kinds, the same in every run."""
-        chance = np.random.default_rng(7)
-        cases = []
-        for count in (1, 2, 7, 100, 1000):
-            usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
-            usage["gpu"][chance.random(count) < 0.5] = np.nan
-            hosts = host_view({name: list(column) for name, column in usage.items()}, limit=0.9)
-            labels = [{"rack": str(n % 3)} if n % 4 else {} for n in range(count)]
-            hosts = replace(hosts, labels=labels)
-            cases += [(hosts, self._process(hosts, **spec)) for spec in _SPECS]
-        lean = host_view({"memory": [0.2, 0.4]})
-        cases.append((lean, self._process(lean)))
-        bare = host_view({"something": [0.2, 0.4]})
-        cases.append((bare, self._process(bare)))
-        return cases
-
-    def _process(self, hosts: HostView, **spec: Any) -> ProcessView:
-        """Return a process whose spec has only the declared fields, as passed by the master."""
-        return process_view(hosts, reads=tuple(self.offer.reads), **spec)
+        """Return hosts and processes of many kinds, as passed by the master."""
+        return placements(self.offer.reads)
 
     def test_scores_every_host(self) -> None:
         """The policy returns one number for each host, finite without a veto and never NaN."""
@@ -200,7 +207,8 @@ class ScoringContract:
     def test_no_hosts(self) -> None:
         """The policy accepts an empty list of hosts."""
         hosts = host_view({"memory": [], "cpu": []})
-        self._scores(self.make(), hosts, self._process(hosts))
+        process = process_view(hosts, reads=tuple(self.offer.reads))
+        self._scores(self.make(), hosts, process)
 
 
 def _same(array: npt.ArrayLike, other: npt.ArrayLike) -> bool:

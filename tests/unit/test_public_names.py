@@ -26,7 +26,7 @@ MORE = {
 }
 PROGRAMS = [
     path
-    for folder in ("plugins", "examples", "tests/integration/plugins/packages")
+    for folder in ("plugins", "examples", "rosrm/cli/templates")
     for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 #: rosrm-criu also uses modules of the parts that it works in: slave, supervisor, node and command.

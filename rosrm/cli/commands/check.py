@@ -74,11 +74,10 @@ def check(
 
 def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
     """Create the plugins that a master would create; raises `ConfigError` with all failures."""
-    from rosrm.config.placement import placement_of
-
     wrong = []
     for section, make in (
-        ("placement", lambda: placement_of(cluster, registry)),
+        ("scoring", lambda: [registry.link(one.policy, one.options) for one in cluster.scoring]),
+        ("filters", lambda: registry.filters(cluster.filters)),
         ("migration", lambda: registry.migrations(cluster.migration.strategies)),
         (
             "checkpoint",
