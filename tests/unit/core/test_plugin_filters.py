@@ -7,7 +7,7 @@ import pytest
 
 from rosrm.extensions.placement import SelectedFilter
 from rosrm.model.values import MigrationPolicy
-from tests.unit.core.cluster import Cluster, process
+from tests.unit.core.cluster import Cluster, Machine, process
 
 
 class Named:
@@ -123,3 +123,22 @@ def test_a_filter_reads_the_fields_that_it_declares():
     cluster = filtered(SelectedFilter("by_name", ByName()), reads=("name",))
     cluster.submit(process("b1"))
     assert "add reads=('name',) to the offer" in verdicts(cluster, "b1")["b"][1]
+
+
+def test_masks_of_labels_are_those_of_the_registration():
+    """`labelled` is a new array each time, for all hosts and for some."""
+    seen = []
+
+    class Red(Named):
+        def mask(self, hosts, process):
+            mask = hosts.labelled("color", "red")
+            assert mask.tolist() == [one.get("color") == "red" for one in hosts.labels]
+            seen.append(mask.copy())
+            mask[:] = ~mask
+            return ~mask
+
+    machines = [Machine("a"), Machine("b", labels={"color": "red"}), Machine("c", labels={})]
+    cluster = Cluster(*machines, filters=[SelectedFilter("red", Red())])
+    cluster.submit(process("p"), process("q"))
+    assert (cluster.where("p"), cluster.where("q")) == (["b"], ["b"])
+    assert {len(mask) for mask in seen} > {3}

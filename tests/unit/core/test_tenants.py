@@ -53,6 +53,24 @@ def test_tenants_are_the_processes_with_an_instance_on_each_host():
     assert there == {"a": {"q"}, "b": set()}
 
 
+class Even:
+    """Prefers the host with the fewest processes."""
+
+    calls = 0
+
+    def score(self, hosts, process):
+        self.calls += 1
+        return Scores(hosts.processes.astype(float))
+
+
+def test_only_a_policy_that_reads_tenants_is_called_after_each_assignment():
+    """Without a reader one call scores a host for several equal processes ahead."""
+    even, crowd = Even(), Crowd()
+    for policy in (even, crowd):
+        Cluster("a", policy=policy).submit(*(process(f"p{n}") for n in range(24)))
+    assert even.calls < 24 <= len(crowd.seen)
+
+
 def test_tenants_are_read_only():
     """A policy cannot change the master's state through a view."""
     policy = Crowd()

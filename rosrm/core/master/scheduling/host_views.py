@@ -22,11 +22,20 @@ T = TypeVar("T")
 
 def host_view(hosts: Candidates) -> HostView:
     """Return the view of some hosts for a plugin."""
-    return HostView(
+    return _View(
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
         _read_only(hosts.processes[:]), _Labels(hosts), _Tenants(hosts),
     )  # fmt: skip
+
+
+class _View(HostView):
+    """A view whose masks of labels come from the cache of the table."""
+
+    def labelled(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (N,), of the hosts with a label of this value, as a new array."""
+        assert isinstance(self.labels, _Labels)
+        return self.labels.mask(key, value)
 
 
 def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
@@ -73,6 +82,10 @@ class _Labels(_PerHost[Mapping[str, str]]):
 
     def _of(self, row: int) -> Mapping[str, str]:
         return MappingProxyType(dict(self._hosts.host(row).description.labels))
+
+    def mask(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (n,), of the hosts with a label of this value, as a new array."""
+        return np.array(self._hosts.table.labelled(key, value)[self._hosts.columns])
 
 
 class _Tenants(_PerHost[Mapping[str, ProcessSpec]]):
