@@ -208,10 +208,9 @@ def test_a_chain_of_policies_decides_and_explains_each_part(make_cluster) -> Non
     cluster.wait("placed", "running")
     decision = cluster.client.explain("placed")["decision"]
     assert decision["policy"] == "weighted + 0.5 x threshold"
+    parts = r"weighted \d\.\d{3} \(.*\) \+ 0\.5 x threshold \d\.\d{3} \("
     for row in decision["hosts"]:
-        assert re.match(
-            r"weighted \d\.\d{3} \(.*\) \+ 0\.5 x threshold \d\.\d{3} \(", row["reason"]
-        )
+        assert re.match(parts, row["reason"])
 
 
 def test_another_policy_places_and_explains(make_cluster) -> None:
