@@ -169,7 +169,8 @@ def _check_chain(section: Node | None, problems: Problems) -> None:
     for at, link in enumerate(section.value):
         if names[at] in names[:at]:
             place = (link.get("policy") or link).place
-            problems.add(place, f"scoring: {names[at]!r} is twice in the chain; add its weights up")
+            text = f"scoring: {names[at]!r} is in the chain already; give it once, with one weight"
+            problems.add(place, text)
 
 
 def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> str | None:

@@ -186,15 +186,16 @@ def fault_of_labels(labels: object, before: Sequence[MadeProbe]) -> str:
     if not isinstance(labels, Mapping):
         return f'has the labels {labels!r:.100}; a mapping is required, as {{"key": "value"}}'
     for key, value in labels.items():
-        if (
-            not all(isinstance(word, str) and word.isprintable() for word in (key, value))
-            or not key
-        ):
+        if not (key and _is_text(key) and _is_text(value)):
             return f"has the label {key!r:.100}: {value!r:.100}; printable text is required"
         others = [one.name for one in before if one.labels.get(key, value) != value]
         if others:
             return f"gives the label {key!r} another value than {others[0]!r}"
     return ""
+
+
+def _is_text(word: object) -> bool:
+    return isinstance(word, str) and word.isprintable()
 
 
 def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:

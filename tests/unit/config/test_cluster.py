@@ -296,7 +296,7 @@ def test_a_chain_has_weights_and_options_for_each_policy(file, registry):
     [
         ("scoring: []", "1:10: scoring: at least one policy is required; or omit the key"),
         ("scoring: [{policy: curved}, {policy: weighted}, {policy: curved}]",
-         "1:58: scoring: 'curved' is twice in the chain; add its weights up"),
+         "1:58: scoring: 'curved' is in the chain already; give it once, with one weight"),
         ("scoring: [{policy: curved}, {policy: curvd}]",
          "1:30: unknown scoring policy 'curvd'; did you mean 'curved'?"),
         ("scoring: [{policy: curved, weight: -1}]", "1:36: scoring[0].weight: -1 is not within"),

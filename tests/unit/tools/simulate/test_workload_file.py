@@ -101,6 +101,18 @@ def test_variants_say_their_own_word_over_the_settings(load):
     assert (five.name, five.hosts) == ("hosts 5", 5)
 
 
+def test_a_variant_may_chain_policies(load, registry):
+    """A chain replaces a single policy and its options, and runs."""
+    comparison = load(
+        HOST + PROCESS + "cluster: {scoring: {policy: weighted, options: {missing: ignore}}}\n",
+        "scoring: [{policy: weighted}, {policy: threshold, weight: 0.5}]",
+    )
+    _, chained = comparison.variants
+    assert chained.cluster.chain == "weighted + 0.5 x threshold"
+    assert chained.cluster.scoring[0].options["missing"] == "worst"
+    assert run(comparison.workload, chained, registry).outcome.running == 1
+
+
 @pytest.mark.parametrize(
     ("text", "place", "said"),
     [
