@@ -15,6 +15,7 @@ from rosrm.model.orders import (
     FenceInstance,
     MeasureLinks,
     Order,
+    ReloadSettings,
     ReplicateSnapshot,
     ReportInstances,
     RestartInstance,
@@ -39,6 +40,7 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
     ReplicateSnapshot: _Request.REPLICATE,
     DropReplica: _Request.DROP_REPLICA,
     MeasureLinks: _Request.MEASURE_LINKS,
+    ReloadSettings: _Request.RELOAD,
 }
 #: Orders by an instance alone.
 _OF_INSTANCE: Final[Mapping[int, Callable[[InstanceId], Order]]] = {
@@ -54,7 +56,7 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
             request.executor, request.timeout = executor, float(timeout)
             request.arguments = json.dumps(dict(arguments))
             return request
-        case ReportInstances():
+        case ReportInstances() | ReloadSettings():
             return request
         case MeasureLinks(peers, learn):
             plain = [peer_to_json(peer) for peer in peers]
@@ -86,6 +88,8 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
             return _measure_links(request.arguments)
         case _Request.REPORT:
             return ReportInstances()
+        case _Request.RELOAD:
+            return ReloadSettings()
         case _Request.SET_RESTART:
             return SetRestartPolicy(instance, convert.restart_from_msg(request.restart))
         case _Request.REPLICATE:

@@ -23,7 +23,7 @@ def test_links_are_measured_and_their_limits_hold(make_cluster) -> None:
     cluster = make_cluster(
         host("robot-1", labels={"at": "robot"}, links=LinkSettings(rate=5 * MB)),
         host("base", labels={"at": "base"}), liveness=STEADY,
-        network=NetworkSettings(period=0.5), scoring=ScoringChoice("network"),
+        network=NetworkSettings(period=0.5), scoring=(ScoringChoice("network"),),
     )  # fmt: skip
     small = {"needs": {"memory": MIB}}
     cluster.submit(

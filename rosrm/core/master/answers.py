@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rosrm.core.master import events as happened
+from rosrm.core.master import reloading
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.master_state import MasterState
@@ -13,6 +14,7 @@ from rosrm.core.master.state.pending_orders import (
     LinkMeasurement,
     MigrationStep,
     PeriodicCheckpoint,
+    Reload,
     Replication,
 )
 
@@ -33,5 +35,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             periodic.note_answer(state, number, event, now)
         case LinkMeasurement(host):
             links.note_answer(state, host, event, now)
+        case Reload(host):
+            reloading.note_answer(state, host, event, now)
         case ImageRemoval(number):
             images.note_answer(state, number, event, now)

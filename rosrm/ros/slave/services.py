@@ -15,6 +15,7 @@ from rosrm.model.links import LinkReport
 from rosrm.model.orders import (
     DropReplica,
     MeasureLinks,
+    ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
     SetRestartPolicy,
@@ -76,6 +77,8 @@ class Duties:
             longer than the order allows, the executor's strategy counts as failing.
         read_log: returns a part of a log; raises `Refused`.
         measure_links: measures links, and calls its last argument with the report.
+        reload: reads the settings file, and calls its argument with a summary and the fault, of
+            which one is "".
     """
 
     take: Callable[[Event], None]
@@ -85,6 +88,7 @@ class Duties:
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
     read_log: Callable[[LogQuery], LogPart]
     measure_links: Callable[[MeasureLinks, Callable[[LinkReport], None]], None]
+    reload: Callable[[Callable[[str, str], None]], None]
 
 
 class SlaveServices:
@@ -122,6 +126,9 @@ class SlaveServices:
                 case MeasureLinks():
                     self._measure_links(order, respond)
                     return
+                case ReloadSettings():
+                    self._reload(respond)
+                    return
                 case ReplicateSnapshot(instance, hosts, every):
                     self._duties.keep(instance, hosts, every)
                 case DropReplica(instance):
@@ -146,6 +153,13 @@ class SlaveServices:
             respond(srv.ControlHost.Response(answer=accepted(), result=result))
 
         self._duties.measure_links(order, done)
+
+    def _reload(self, respond: Callable[[Any], None]) -> None:
+        def done(summary: str, fault: str) -> None:
+            answer = refused("invalid", fault) if fault else accepted(summary)
+            respond(srv.ControlHost.Response(answer=answer))
+
+        self._duties.reload(done)
 
     def _execute(self, order: RunExecutor, respond: Callable[[Any], None]) -> None:
         def done(outcome: ExecutorOutcome) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rosrm.extensions.declared_fields import Declared
 from rosrm.model.links import Interface
 from rosrm.model.values import ProcessSpec
 from rosrm_scoring.network import Network, NetworkOptions
@@ -190,8 +189,8 @@ def test_an_ended_process_takes_no_room_of_a_link() -> None:
 
 
 def networked(rate: dict[str, float], *specs: ProcessSpec) -> Cluster:
-    policy, declared = Network(NetworkOptions()), Declared(reads=("talks_to",))
-    cluster = Cluster(*map(machine, rate), policy=policy, declared=declared)
+    policy = Network(NetworkOptions())
+    cluster = Cluster(*map(machine, rate), policy=policy, reads=("talks_to",))
     wire(cluster, rate)
     return cluster.with_processes(*specs)
 

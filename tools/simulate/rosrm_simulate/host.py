@@ -25,6 +25,7 @@ from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.orders import (
     DropReplica,
     MeasureLinks,
+    ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
     SetRestartPolicy,
@@ -277,6 +278,8 @@ class Host(ABC, Generic[ProgramT]):
                 return self.measure(sent.order_id, order)
             case ReplicateSnapshot() | DropReplica():
                 self.replicate(order)
+            case ReloadSettings():
+                refusal = "a simulated host has no file"
             case SetRestartPolicy():
                 self._settled.clear()
                 self.tell(event_of(order), now)

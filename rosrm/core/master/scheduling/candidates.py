@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.extensions.link_views import FlowView
+from rosrm.model.values import EMPTY, ProcessSpec
 
 Columns = slice | IntArray
 
@@ -31,6 +33,8 @@ class Candidates:
         bound: (n,) highest number of processes.
         flows: flows of the process on each host; None: it has none, or no policy reads them.
         empty: True if the arrays are those of hosts without processes.
+        tenants: (n,) name to spec of each process on the host; None: as the table has them now.
+        tenants_read: True if a plugin has read which processes run on one of the hosts.
     """
 
     table: HostTable
@@ -44,9 +48,23 @@ class Candidates:
     bound: IntArray
     flows: FlowView | None = None
     empty: bool = False
+    tenants: tuple[Mapping[str, ProcessSpec], ...] | None = None
+    tenants_read: bool = False
 
     def __len__(self) -> int:
         return len(self.processes)
+
+    def tenants_of(self, row: int) -> Mapping[str, ProcessSpec]:
+        """Return name to spec of each process with an instance on the host of a row."""
+        if self.tenants is not None:
+            return self.tenants[row]
+        if self.empty:
+            return EMPTY
+        return {spec.name: spec for spec in self.host(row).instances.values()}
+
+    def keep_tenants(self) -> None:
+        """Copy the current processes of each host, because they change before they are read."""
+        self.tenants = tuple(map(self.tenants_of, range(len(self))))
 
     def host(self, row: int) -> Host:
         """Return the host of a row."""

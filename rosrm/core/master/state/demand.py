@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from rosrm.core.master.state.links import Crossing
 from rosrm.extensions.declared_fields import FLOWS_FIELD, STANDARD_FIELDS
+from rosrm.extensions.placement import NO_PLUGINS, PlacementPlugins
 from rosrm.model.values import EMPTY, ProcessSpec, Relation
 
 _MAPPINGS: Final = tuple(
@@ -86,7 +87,7 @@ class Demand:
         near: hosts with a replica of its snapshot; each counts as one more preferred label.
         neighbours: rules on its hosts, relative to other processes.
         traffic: flows between it and other processes.
-        reads: fields of the spec that scoring policies read beyond the standard ones.
+        plugins: the policies and filters that judge hosts.
         key: equal for demands with equal rankings; its first part, for demands that differ by
             their neighbours alone, or by their flows, unless the policies read them.
     """
@@ -99,7 +100,7 @@ class Demand:
     near: tuple[str, ...] = ()
     neighbours: tuple[Neighbour, ...] = ()
     traffic: Traffic = NO_TRAFFIC
-    reads: tuple[str, ...] = ()
+    plugins: PlacementPlugins = field(default=NO_PLUGINS, compare=False)
     key: RankingKey = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -108,7 +109,7 @@ class Demand:
             *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
-            *(repr(getattr(self.spec, name)) for name in self.reads), *scored,
+            *(repr(getattr(self.spec, name)) for name in self.plugins.reads), *scored,
         )  # fmt: skip
         object.__setattr__(self, "key", (alone, (*self.neighbours, *added)))
 
@@ -121,7 +122,7 @@ class Demand:
     @property
     def scores_flows(self) -> bool:
         """Return True if the scores of the policies may depend on the flows."""
-        return FLOWS_FIELD in self.reads
+        return FLOWS_FIELD in self.plugins.reads
 
     def alone(self) -> Demand:
         """Return the demand without what the second part of its key contains."""

@@ -56,6 +56,13 @@ class LinkMeasurement:
     host: str
 
 
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """The order reloads the settings of a host."""
+
+    host: str
+
+
 Purpose = (
     MigrationStep
     | ImageRemoval
@@ -63,6 +70,7 @@ Purpose = (
     | CapabilityQuery
     | PeriodicCheckpoint
     | LinkMeasurement
+    | Reload
 )
 
 #: Purposes with their own series of numbers, because they depend on optional plugins or are
