@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -283,7 +284,7 @@ specs = st.lists(
 )  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(specs, st.sampled_from(["move", "requeue"]), st.booleans(), st.integers(1, 3))
 def test_preemption_touches_only_lower_processes_without_protection_and_comes_to_an_end(
     drawn: list[tuple[int, int, bool, bool]], mode: str, backfill: bool, most: int
@@ -296,10 +297,10 @@ def test_preemption_touches_only_lower_processes_without_protection_and_comes_to
     for i, (memory, priority, moves, protect) in enumerate(drawn):
         make = movable if moves else process
         cluster.submit(make(f"p{i}", memory=memory, priority=priority, protect=protect))
-        cluster.wait(1.5)
-    cluster.wait(60.0)
+        cluster.wait(1.5, tick=0.5)
+    cluster.wait(30.0, tick=0.5)
     before = len(cluster.records)
-    cluster.wait(20.0)
+    cluster.wait(15.0, tick=0.5)
     assert cluster.records[before:] == []
     for one in cluster.records:
         if one.kind == "preempted":
@@ -313,3 +314,25 @@ def test_preemption_touches_only_lower_processes_without_protection_and_comes_to
         if one.kind == "preempted" and one.process != one.facts["for"]
     ]  # fmt: skip
     assert len(pairs) == len(set(pairs))
+
+
+def test_many_processes_that_cannot_move_do_not_hide_one_that_can() -> None:
+    """A process without a destination is tried once, not in every set."""
+    cluster = cluster_of(machine("a", 2000), machine("b", 75))
+    many = [movable(f"p{i:02}", memory=80) for i in range(24)]
+    filled(cluster, "a", *many, movable("q", memory=70, priority=1))
+    cluster.submit(process("r", memory=78, priority=5))
+    cluster.wait(5.0)
+    assert (cluster.where("r"), cluster.where("q")) == (["a"], ["b"])
+
+
+def test_a_claim_ends_with_the_setting() -> None:
+    """A reload may switch preemption off while room is made."""
+    cluster = two_hosts()
+    cluster.machines["a"].stubborn.add("x")
+    cluster.submit(process("p", memory=450, priority=5))
+    cluster.wait(3.0)
+    assert cluster.state.hosts.claims == {0: 5}
+    cluster.state.settings = replace(cluster.state.settings, preemption=False)
+    cluster.wait(1.5)
+    assert cluster.state.hosts.claims == {}

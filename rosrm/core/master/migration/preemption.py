@@ -49,7 +49,7 @@ _MOST_HOSTS: Final = 32
 _MOST_SETS: Final = 64
 #: Most combinations of one size that a review looks at on one host.
 _MOST_COMBINATIONS: Final = 5_000
-#: Most sets whose moves a review plans for one process.
+#: Most sets whose moves a review plans together in vain, for one process.
 _MOST_TRIALS: Final = 20
 #: Most reasons against processes in one answer.
 _MOST_REASONS: Final = 3
@@ -78,19 +78,21 @@ class _Search:
 
     Attributes:
         against: reasons why processes of lower priorities cannot make room.
+        stuck: names of processes that cannot leave their host, whichever others do.
     """
 
     process: Process
     ranking: Ranking
     against: list[str] = field(default_factory=list)
+    stuck: set[str] = field(default_factory=set)
 
 
 def preempt(state: MasterState, now: float) -> None:
     """Make room for the first waiting processes that fit nowhere, or continue to make it."""
-    if not state.settings.preemption or now - state.preemption.reviewed < _EVERY:
+    if now - state.preemption.reviewed < _EVERY:
         return
     state.preemption.reviewed = now
-    waits = bool(len(state.queue)) and not why_no_work(state, now)
+    waits = state.settings.preemption and len(state.queue) and not why_no_work(state, now)
     waiting = list(_waiting(state, now)) if waits else []
     made = {one.name: _review(state, one, now) for one in waiting}
     state.preemption.room_made = {name: room for name, room in made.items() if room is not None}
@@ -209,9 +211,15 @@ def _make_room(
         for host, missing in islice(_with_groups(state, search, hosts), _MOST_HOSTS)
         for chosen in _sets_on(state, search, host, missing, now)
     ]
-    sets.sort(key=lambda one: one[0])
-    for _, host, chosen in sets[:_MOST_TRIALS]:
+    trials = 0
+    for _, host, chosen in sorted(sets, key=lambda one: one[0]):
+        if trials == _MOST_TRIALS:
+            break
+        if any(group.processes[0].name in search.stuck for group in chosen):
+            continue
+        known = len(search.stuck)
         moves = _planned(state, search, chosen, now)
+        trials += len(search.stuck) == known
         if moves is not None:
             return _begin(state, search, host, chosen, moves, now)
     against = few(dict.fromkeys(search.against), _MOST_REASONS)
@@ -319,19 +327,27 @@ def _planned(
     beside the others.
     """
     moves: list[PlannedMoves | None] = []
+    rejected: Process | None = None
     with trial(state) as reserve:
         for group in chosen:
-            process = group.processes[0]
-            planned = _plan(state, search.process, process, now)
-            if isinstance(planned, Rejected):
-                if state.settings.preemption != "requeue":
-                    search.against.append(planned.reason)
-                    return None
-                moves.append(None)
-            else:
+            planned = _plan(state, search.process, group.processes[0], now)
+            if not isinstance(planned, Rejected):
                 reserve(planned)
-                moves.append(planned)
-    return moves
+            elif state.settings.preemption != "requeue":
+                rejected = group.processes[0]
+                break
+            moves.append(None if isinstance(planned, Rejected) else planned)
+    if rejected is None:
+        return moves
+    alone = _plan(state, search.process, rejected, now)
+    if isinstance(alone, Rejected):
+        search.stuck.add(rejected.name)
+        search.against.append(alone.reason)
+    else:
+        search.against.append(
+            f"no hosts have room for all that would have to leave with {rejected.name}"
+        )
+    return None
 
 
 def _plan(
