@@ -28,8 +28,9 @@ Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, Migrati
                 ReschedulePolicy
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
-                ResourceDescription, Accounting, Reading
+                ResourceDescription, Accounting, Reading, HostLabelling
   scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
+  filters       FilterOffer, PlacementFilter
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
   launchers     LauncherOffer, Launcher, LauncherContext, Launch, ProcessTreeLauncher,
@@ -75,9 +76,11 @@ if TYPE_CHECKING:
         CheckpointOffer,
         CheckpointPolicy,
         CheckpointView,
+        FilterOffer,
         FloatArray,
         GraphDepartureLauncher,
         HostChecking,
+        HostLabelling,
         HostView,
         ImageLauncher,
         Imaging,
@@ -91,6 +94,7 @@ if TYPE_CHECKING:
         MigrationStrategy,
         NoOptions,
         PeriodicImaging,
+        PlacementFilter,
         Probe,
         ProbeContext,
         ProbeOffer,
@@ -163,14 +167,14 @@ __all__ = [
     "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
-    "EventRow", "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher",
-    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
+    "EventRow", "Execute", "FilterOffer", "FloatArray", "Fraction", "GraphDepartureLauncher",
+    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLabelling", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
     "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
     "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
-    "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
-    "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
+    "PlacementFilter", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
+    "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
     "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
     "RosrmError", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
@@ -187,11 +191,11 @@ _NAMES: Final = {
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
     "extensions.contracts": (
         "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy "
-        "CheckpointView FloatArray GraphDepartureLauncher HostChecking HostView ImageLauncher "
-        "Imaging Launch Launcher LauncherContext LauncherOffer MemoryPacing MemoryView "
-        "MigrationOffer MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext "
-        "ProbeOffer ProcessMeasuring ProcessTreeLauncher ProcessView Scores ScoringOffer "
-        "ScoringPolicy Sessions SpecChecking"
+        "CheckpointView FilterOffer FloatArray GraphDepartureLauncher HostChecking HostLabelling "
+        "HostView ImageLauncher Imaging Launch Launcher LauncherContext LauncherOffer "
+        "MemoryPacing MemoryView MigrationOffer MigrationStrategy NoOptions PeriodicImaging "
+        "PlacementFilter Probe ProbeContext ProbeOffer ProcessMeasuring ProcessTreeLauncher "
+        "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
     "extensions.options": "options_of",

@@ -10,7 +10,7 @@ Config = TypeVar("Config")
 
 #: Settings of a master that apply without a restart: sections, or keys of a section.
 OF_CLUSTER: Final = (
-    "scoring.options", "migration.cooldown", "migration.hysteresis", "migration.headroom",
+    "scoring", "migration.cooldown", "migration.hysteresis", "migration.headroom",
     "migration.need", "migration.max_in_flight", "migration.automatic", "queue", "rebalance",
     "quotas", "defaults", "delivery_timeout", "max_hosts",
 )  # fmt: skip

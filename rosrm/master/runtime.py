@@ -32,8 +32,9 @@ from rosrm.core.master.reducer import step
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Instance
 from rosrm.errors import JournalBlocked, Refused
-from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy, ScoringPolicy
+from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.placement import PlacementPlugins
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys.finding import master_security
@@ -96,10 +97,9 @@ class MasterRuntime:
 
     Args:
         config: checked settings.
-        policy: the configured scoring policy.
+        placement: the configured scoring policies and filters.
         strategies: the configured migration strategies.
         plugins: rows of `rosrm plugins` for the master's own plugins.
-        fallback: name and scoring policy to use if `policy` fails.
         checkpoint: the policy that places replicas; None: snapshots stay on their own hosts.
         declared: declarations of the offers of these plugins.
 
@@ -112,10 +112,9 @@ class MasterRuntime:
     def __init__(
         self,
         config: ClusterConfig,
-        policy: ScoringPolicy,
+        placement: PlacementPlugins,
         strategies: dict[str, MigrationStrategy],
         plugins: Sequence[PluginRow],
-        fallback: tuple[str, ScoringPolicy] | None,
         checkpoint: CheckpointPolicy | None,
         *,
         declared: Declared,
@@ -123,7 +122,6 @@ class MasterRuntime:
     ) -> None:
         self._config = config
         self._reload = reload
-        self._fallback = fallback
         self._checkpoint = checkpoint
         self._declared = declared
         self._plugins = list(plugins)
@@ -154,7 +152,7 @@ class MasterRuntime:
             self._grants = GrantsWatch(security)
             self._refuse_second()
             opened.callback(self._end_record)
-            self._state = self._restored(policy, strategies)
+            self._state = self._restored(placement, strategies)
             self._endpoint = self._new_endpoint()
             self._closing = opened.pop_all()
 
@@ -172,16 +170,15 @@ class MasterRuntime:
             )
 
     def _restored(
-        self, policy: ScoringPolicy, strategies: dict[str, MigrationStrategy]
+        self, placement: PlacementPlugins, strategies: dict[str, MigrationStrategy]
     ) -> MasterState:
         last = self._last_run()
         epoch = last.epoch + 1
         state = MasterState(
-            self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
-            self._fallback, declared=self._declared,
-        )  # fmt: skip
+            self._config.core(), placement, strategies, epoch, declared=self._declared
+        )
         state.plugins.limit = self._deadlines
-        state.scoring_of = self._reload.scoring_of
+        state.chain_of = self._reload.chain_of
         state.wall = time.time()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import Any
 
+from rosrm.config.placement import settings_of_chain
 from rosrm.config.reloading import OF_CLUSTER, reloaded
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master.events import SettingsRead
 from rosrm.errors import RosrmError
-from rosrm.extensions.contracts import ScoringPolicy
+from rosrm.extensions.placement import ChainOf
 from rosrm.runtime.settings_check import SettingsCheck, SettingsSource
 
 
@@ -19,14 +19,11 @@ class SettingsReload:
     Args:
         config: the settings at the start.
         source: their origin.
-        scoring_of: returns the scoring policy with other options.
+        chain_of: creates the scoring policies with other weights and options.
     """
 
-    def __init__(
-        self, config: ClusterConfig, source: SettingsSource,
-        scoring_of: Callable[[Mapping[str, Any]], ScoringPolicy],
-    ) -> None:  # fmt: skip
-        self.scoring_of = scoring_of
+    def __init__(self, config: ClusterConfig, source: SettingsSource, chain_of: ChainOf) -> None:
+        self.chain_of = chain_of
         self._config = config
         self._check = SettingsCheck(source)
         self._hung_up = False
@@ -57,13 +54,17 @@ class SettingsReload:
         if fault:
             return SettingsRead(request, fault)
         new = ClusterConfig.from_json(text)
-        same_policy = new.scoring.policy == self._config.scoring.policy
-        allowed = [one for one in OF_CLUSTER if same_policy or one != "scoring.options"]
+        same_policies = _policies(new) == _policies(self._config)
+        allowed = [one for one in OF_CLUSTER if same_policies or one != "scoring"]
         read = reloaded(self._config, new, allowed)
-        options = read.config.scoring.options
+        chain = settings_of_chain(read.config)
         try:
-            self.scoring_of(options)
+            self.chain_of(chain)
         except RosrmError as error:
             return SettingsRead(request, f"scoring: {error}")
         self._config = read.config
-        return SettingsRead(request, "", read.config.core(), options, read.changed, read.kept)
+        return SettingsRead(request, "", read.config.core(), chain, read.changed, read.kept)
+
+
+def _policies(config: ClusterConfig) -> list[str]:
+    return [one.policy for one in config.scoring]

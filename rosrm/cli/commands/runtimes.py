@@ -160,7 +160,7 @@ def _recover(state: Path) -> str:
 
 def _master_summary(settings: ClusterConfig) -> str:
     return (
-        f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.scoring.policy}; "
+        f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.chain}; "
         f"migration {', '.join(settings.migration.strategies) or 'none'}; state in {settings.state}"
     )
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from rosrm.core.master.commands import OrderId
 from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.placement import PolicySettings
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.plan import ReportPhase
 from rosrm.model.requester import OPERATOR, Requester
@@ -257,7 +258,7 @@ class SettingsRead:
         request: number of the `ReloadRequested`; 0: the master received a signal.
         fault: why the file cannot be used; "": it can.
         settings: settings of the core from now on.
-        scoring: options of the scoring policy from now on.
+        scoring: settings of the scoring policies from now on.
         changed: paths of the changed settings.
         kept: paths of settings that differ in the file, and need a restart.
     """
@@ -265,7 +266,7 @@ class SettingsRead:
     request: int
     fault: str = ""
     settings: CoreSettings | None = None
-    scoring: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    scoring: tuple[PolicySettings, ...] = ()
     changed: tuple[str, ...] = ()
     kept: tuple[str, ...] = ()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 from math import inf
 from operator import attrgetter
@@ -13,7 +13,7 @@ import numpy as np
 from rosrm.core.master.commands import Command, OrderId, SendOrder
 from rosrm.core.master.hosts.fencing import fence_of
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
-from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
+from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand
@@ -30,9 +30,9 @@ from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, P
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
-from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
+from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
-from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
@@ -81,6 +81,7 @@ class MasterState:
     """The state of the master's core, with the changes that all handlers share.
 
     Attributes:
+        placement: the policies and filters that judge hosts.
         declared: declarations in the offers of the selected plugins.
         time_limited: names of the processes with a time limit that are not terminal.
         terminal: names of the terminal processes, in the order in which they ended.
@@ -92,7 +93,7 @@ class MasterState:
         unowned_instances: name of a removed process to its instances that may still run.
         capability_answers: answers of hosts, by strategy and host, for each strategy that must
             check its hosts.
-        scoring_of: returns the scoring policy with other options; None: the policy stays.
+        chain_of: creates the scoring policies with other settings; None: they stay.
         reloads: requests to reload, and the answers to them.
         plugins: guards every call of a plugin.
     """
@@ -100,20 +101,15 @@ class MasterState:
     def __init__(
         self,
         settings: CoreSettings,
-        policy_name: str,
-        policy: ScoringPolicy,
+        placement: PlacementPlugins,
         strategies: Mapping[str, MigrationStrategy],
         epoch: int,
-        fallback: tuple[str, ScoringPolicy] | None = None,
         *,
         declared: Declared | None = None,
     ) -> None:
         self.settings = settings
         self.declared = declared or Declared()
-        self.policy_name = policy_name
-        self.policies: tuple[NamedPolicy, ...] = ((policy_name, policy),)
-        if fallback is not None:
-            self.policies += (fallback,)
+        self.placement = placement
         self.strategies = dict(strategies)
         self.epoch = epoch
         self.hosts = HostTable()
@@ -132,12 +128,12 @@ class MasterState:
         self.preemption = Preemption()
         self.rebalancing = Rebalancing()
         self.reloads = Reloads()
-        self.scoring_of: Callable[[Mapping[str, Any]], ScoringPolicy] | None = None
+        self.chain_of: ChainOf | None = None
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
-        self.plugins = PluginCalls()
+        self.plugins = placement.calls
         self.replication = ReplicationState()
         self.capability_answers: dict[tuple[str, str], Answer] = {}
         self.images = Images()
@@ -418,7 +414,9 @@ class MasterState:
         reserved = np.where(fractions < np.inf, fractions, 0.0)
         added = Instance(instance, host, now, needs.amounts, needs.estimated, reserved)
         self.instances[instance.number] = added
-        host.instances.add(instance.number)
+        process = self.processes.get(instance.process)
+        spec = process.spec if process is not None else ProcessSpec(instance.process)
+        host.instances[instance.number] = spec
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
         self.neighbours.note_change(instance.process)
@@ -431,13 +429,18 @@ class MasterState:
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""
         del self.instances[instance.id.number]
-        instance.host.instances.discard(instance.id.number)
+        instance.host.instances.pop(instance.id.number, None)
         name = instance.id.process
         self._numbers_of(name).discard(instance.id.number)
         if not self.unowned_instances.get(name, True):
             del self.unowned_instances[name]
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
         self.neighbours.note_change(name)
+
+    def clear_left_behind(self, process: Process) -> None:
+        """Note that no instance of a process on a lost host counts as its own any more."""
+        process.left_behind = None
+        self.neighbours.note_change(process.name)
 
     def assignment(
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,

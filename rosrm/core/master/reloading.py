@@ -6,6 +6,8 @@ first: if it is refused, no slave reads its own.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import ReadSettings, Reply
 from rosrm.core.master.master_state import MasterState
@@ -49,9 +51,8 @@ def settings_read(state: MasterState, event: happened.SettingsRead, now: float) 
 def _apply(state: MasterState, event: happened.SettingsRead) -> None:
     assert event.settings is not None
     state.settings = event.settings
-    if "scoring.options" in event.changed and state.scoring_of is not None:
-        name, _ = state.policies[0]
-        state.policies = ((name, state.scoring_of(event.scoring)), *state.policies[1:])
+    if "scoring" in event.changed and state.chain_of is not None:
+        state.placement = replace(state.placement, chain=state.chain_of(event.scoring))
     for process in state.processes.values():
         process.demand = None  # needs and defaults may have changed
     state.hosts.changed()

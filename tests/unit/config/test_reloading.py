@@ -32,7 +32,7 @@ def test_only_the_settings_that_need_no_restart_are_taken_over() -> None:
         scoring=ScoringChoice(options={"weights": {"memory": 2.0}}),
     )
     read = reloaded(old, new, OF_CLUSTER)
-    assert read.changed == ("scoring.options", "migration.cooldown", "queue")
+    assert read.changed == ("scoring", "migration.cooldown", "queue")
     assert read.kept == ("migration.strategies", "liveness.lease")
     assert (read.config.migration.cooldown, read.config.queue.backfill) == (7.0, True)
     assert read.config.migration.strategies == old.migration.strategies

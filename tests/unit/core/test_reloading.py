@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import ReadSettings, Reply
+from rosrm.extensions.placement import PolicySettings, ScoringLink
 from rosrm.model.orders import ReloadSettings
 from tests.unit.core.cluster import Cluster, Eq1, Machine, process
 
@@ -100,16 +101,17 @@ def test_other_weights_of_the_policy_decide_the_next_placement() -> None:
     busy = {"memory": 0.0, "cpu": 0.5}, {"memory": 0.5, "cpu": 0.0}
     cluster = Cluster(Machine("a", busy=busy[0]), Machine("b", busy=busy[1]))
 
-    def scoring_of(options: Mapping[str, Any]) -> Eq1:
-        return Eq1(**options)
+    def chain_of(chain: Sequence[PolicySettings]) -> tuple[ScoringLink, ...]:
+        return tuple(ScoringLink(one.name, Eq1(**one.options), one.weight) for one in chain)
 
-    cluster.state.scoring_of = scoring_of
+    cluster.state.chain_of = chain_of
     cluster.submit(process("p"))
     assert cluster.where("p") == ["a"]
     cluster.tell(
         happened.SettingsRead(
-            0, settings=cluster.state.settings, scoring={"memory": 0.0, "cpu": 1.0},
-            changed=("scoring.options",),
+            0, settings=cluster.state.settings,
+            scoring=(PolicySettings("eq1", 1.0, {"memory": 0.0, "cpu": 1.0}),),
+            changed=("scoring",),
         )
     )  # fmt: skip
     cluster.submit(process("q"))

@@ -14,11 +14,11 @@ from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.images import UnwantedImage
 from rosrm.core.master.state.process import WAITING
+from rosrm.extensions.placement import PlacementPlugins
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.codec import to_plain
 from rosrm.model.records import Intent
 from rosrm.model.values import ProcessSpec
-from tests.unit.core.cluster import Eq1
 
 DATA = Path(__file__).parents[2] / "data" / "journal"
 ROWS = [json.loads(line) for line in (DATA / "rows.jsonl").read_text().splitlines()]
@@ -88,7 +88,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def state(path: Path) -> MasterState:
     """Return the state of a master that was restored from the fixture."""
-    state = MasterState(CoreSettings(), "eq1", Eq1(), {}, epoch=4)
+    state = MasterState(CoreSettings(), PlacementPlugins(), {}, epoch=4)
     state.wall = WALL
     journal = SqliteJournal(path)
     restore(state, journal.intents, NOW)

@@ -60,7 +60,7 @@ def demand_of(state: MasterState, process: Process) -> Demand:
         needs = state.estimate(process.spec)
         demand = Demand(
             process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
-            neighbours=neighbours, reads=state.declared.reads,
+            neighbours=neighbours, plugins=state.placement,
         )  # fmt: skip
         # Equal processes share one demand, because thousands of them may wait.
         known = process.demand = (version, state.demands.setdefault(demand.key, demand))
@@ -84,7 +84,7 @@ def demand_to_move(
     amounts, guessed = demand_amounts(state, process, measured_need(state, seen))
     return Demand(
         process.spec, amounts, guessed, excluded, headroom,
-        neighbours=neighbours_of(state, process, together=together), reads=state.declared.reads,
+        neighbours=neighbours_of(state, process, together=together), plugins=state.placement,
     )  # fmt: skip
 
 
@@ -97,7 +97,7 @@ def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, f
     """Return the demand of a process on the host of its image, where it is to be restored."""
     return Demand(
         process.spec, *demand_amounts(state, process, seen),
-        neighbours=neighbours_of(state, process), reads=state.declared.reads,
+        neighbours=neighbours_of(state, process), plugins=state.placement,
     )  # fmt: skip
 
 
@@ -166,7 +166,7 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
         alone = ranking_of(state, alone.demand if alone else replace(demand, neighbours=()))
         ranking = state.rankings[demand.key] = alone.beside(demand)
     else:
-        ranking = Ranking(state.hosts, state.policies, demand, state.plugins)
+        ranking = Ranking(state.hosts, demand)
         state.rankings[demand.key] = ranking
     return ranking
 

@@ -1,7 +1,8 @@
 """Placement filters: the rules by which hosts may take a process, with the reasons against a host.
 
 `FILTERS` is the complete list. Each entry has a mask over many hosts, which a ranking reads, and
-the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
+the reason against one host, which `rosrm explain` prints. A new rule is one more entry. The last
+entry stands for the filters of plugins.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from rosrm.core.master.scheduling import proximity
+from rosrm.core.master.scheduling import plugin_filters, proximity
 from rosrm.core.master.scheduling.candidates import Candidates
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
 from rosrm.core.master.state.hosts import HostCondition
@@ -299,7 +300,11 @@ FILTERS: Final = (
     Filter("request", _has_asked, _why_not_asked),
     Filter("claim", _is_unclaimed, _why_claimed),
     Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
-)
+    Filter(
+        "plugins", plugin_filters.passing_plugins, plugin_filters.why_plugin_excludes,
+        Lasts.PERMANENT, by_assignment=True,
+    ),
+)  # fmt: skip
 #: Filters that a host may fail for lack of room alone.
 OF_ROOM: Final = ("processes", "limits", "room")
 STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)

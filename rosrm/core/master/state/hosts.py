@@ -24,7 +24,7 @@ from rosrm.core.master.state.host_arrays import (
     IntArray,
 )
 from rosrm.extensions.plugin_calls import Failing, Plugin
-from rosrm.model.values import HostDescription
+from rosrm.model.values import HostDescription, ProcessSpec
 
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
@@ -67,7 +67,8 @@ class Host:
     Attributes:
         column: column of this host in the arrays of `HostTable`.
         attributed, shared: resources with this accounting on the host.
-        instances: numbers of the instances that run on the host or are assigned to it.
+        instances: number of each instance that runs on the host or is assigned to it, to the spec
+            of its process.
         over_since: resource name to the time since when the host is over this limit.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
@@ -90,7 +91,7 @@ class Host:
     pruned: bool = False
     attributed: frozenset[str] = frozenset()
     shared: frozenset[str] = frozenset()
-    instances: set[int] = field(default_factory=set)
+    instances: dict[int, ProcessSpec] = field(default_factory=dict)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
     recorded_at: dict[str, float] = field(default_factory=dict)
