@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from rosrm.core.master.migration.preemption import Group, covering_sets, rank
 from rosrm.core.master.state.process import Process, ProcessPhase
+from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.model.values import NeighbourRule, ProcessSpec
-from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
+from tests.unit.core.cluster import MIB, Cluster, Eq1, Machine, job, movable, process
 
 
 def machine(name: str, memory: float = 1000, **known: Any) -> Machine:
@@ -228,6 +229,30 @@ def test_a_process_is_not_moved_again_within_its_cool_down() -> None:
     assert "x is in its cool-down of 10 s after a move" in cluster.explain("q")["reason"]
     cluster.wait(8.0)
     assert (cluster.where("q"), cluster.where("x")) == (["b"], ["c"])
+
+
+class NotOnA(Eq1):
+    """Policy with a veto against host a, which it gives also when there is room."""
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:
+        found = super().score(hosts, process)
+        veto = np.array([name == "a" for name in hosts.names]) & (process.spec.priority > 0)
+        return Scores(found.value, veto=veto, veto_reason=lambda row: "not on a")
+
+
+def test_room_is_made_only_once_on_a_host_that_a_policy_excludes() -> None:
+    """The master cannot know a veto before there is room; processes must not leave again."""
+    cluster = cluster_of(machine("a", 600), machine("b", 400), policy=NotOnA(), cooldown=3.0)
+    filled(cluster, "a", movable("x", memory=350))
+    cluster.submit(process("p", memory=500, priority=5))
+    cluster.wait(4.0)
+    assert cluster.where("x") == ["b"]
+    cluster.wait(6.0)
+    assert "room was made on a, and the process does not fit" in cluster.explain("p")["reason"]
+    assert cluster.migrate("x", "a").accepted
+    cluster.wait(60.0, tick=0.5)
+    assert len(cluster.recorded("preempted")) == 2
+    assert (cluster.where("x"), cluster.state.hosts.claims) == (["a"], {})
 
 
 # --- properties -------------------------------------------------------------------------------
