@@ -24,7 +24,8 @@ The public names, by purpose:
 Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
-                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule
+                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule,
+                ReschedulePolicy
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
                 ResourceDescription, Accounting, Reading, HostLabelling
@@ -154,6 +155,7 @@ if TYPE_CHECKING:
         ProcessSpec,
         Readiness,
         Reading,
+        ReschedulePolicy,
         ResourceDescription,
         RestartPolicy,
         StandbyPolicy,
@@ -173,9 +175,9 @@ __all__ = [
     "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
     "PlacementFilter", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
     "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
-    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
-    "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError",
-    "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
+    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
+    "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
+    "RosrmError", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
     "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
     "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
@@ -208,8 +210,8 @@ _NAMES: Final = {
     "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
-        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ResourceDescription "
-        "RestartPolicy StandbyPolicy StopPolicy"
+        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
+        "ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {

@@ -23,7 +23,7 @@ from rosrm.config.markers import (
     ProcessSection,
     RosSection,
 )
-from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings
+from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings, Preemption
 from rosrm.errors import ConfigError
 from rosrm.extensions.units import (
     Amount,
@@ -145,10 +145,32 @@ class QueueSettings:
     Attributes:
         backfill: True: processes may be placed before an earlier one that waits for room.
         max_processes: most processes that have not ended; more are refused.
+        preemption: "move": processes of lower priorities move to make room for a process that fits
+            nowhere; "requeue": those that cannot move wait in the queue again; False: neither.
     """
 
     backfill: bool = _CORE.backfill
+    preemption: Preemption = _CORE.preemption
     max_processes: PositiveCount = _CORE.max_processes
+
+
+@dataclass(frozen=True, slots=True)
+class RebalanceSettings:
+    """Moves that even out the load of the hosts.
+
+    Attributes:
+        automatic: True: the master begins them itself; False: only `rosrm rebalance` does.
+        spread: difference between the loads of two hosts, as fractions of their limits, from which
+            on the master begins a round.
+        after: seconds for which the difference must last, and between two rounds; a host that joins
+            does not wait for it.
+        max_moves: most processes that move in one round.
+    """
+
+    automatic: bool = _CORE.rebalance
+    spread: Fraction = _CORE.rebalance_spread
+    after: Seconds = _CORE.rebalance_after
+    max_moves: PositiveCount = _CORE.rebalance_moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,6 +281,7 @@ class ClusterConfig:
         filters: names of placement filters of plugins, with their options.
         migration: strategies and limits of migrations.
         queue: order of the queue.
+        rebalance: moves that even out the load of the hosts.
         quotas: limits by name of a user; "default" applies to users without an entry, and to
             limits that an entry does not give.
         defaults: default needs of processes.
@@ -283,6 +306,7 @@ class ClusterConfig:
     )
     migration: MigrationSettings = field(default_factory=MigrationSettings)
     queue: QueueSettings = field(default_factory=QueueSettings)
+    rebalance: RebalanceSettings = field(default_factory=RebalanceSettings)
     quotas: Mapping[str, Quota] = field(default_factory=lambda: EMPTY)
     defaults: ProcessDefaults = field(default_factory=ProcessDefaults)
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
@@ -319,6 +343,11 @@ class ClusterConfig:
             need=self.migration.need,
             max_migrations=self.migration.max_in_flight,
             automatic=self.migration.automatic,
+            preemption=self.queue.preemption,
+            rebalance=self.rebalance.automatic,
+            rebalance_spread=self.rebalance.spread,
+            rebalance_after=self.rebalance.after,
+            rebalance_moves=self.rebalance.max_moves,
             order_retry=self.control.order_retry,
             keep_ended=self.journal.keep_ended,
             max_hosts=self.max_hosts,

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from rosrm.extensions.contracts import PlacementFilter, ScoringPolicy
 from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.wording import weighted
+
+
+@dataclass(frozen=True, slots=True)
+class PolicySettings:
+    """Settings of a scoring policy of a chain, with the factor of its scores in the sum."""
+
+    name: str
+    weight: float
+    options: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +73,9 @@ class PlacementPlugins:
         read = (name for one in readers for name in one.reads)
         object.__setattr__(self, "reads", tuple(dict.fromkeys(read)))
 
+
+#: Creates the policies of a chain.
+ChainOf = Callable[[Sequence[PolicySettings]], tuple[ScoringLink, ...]]
 
 #: No policy and no filter: each host that fits scores 0.
 NO_PLUGINS = PlacementPlugins()

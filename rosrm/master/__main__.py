@@ -12,12 +12,14 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import sys
 from dataclasses import replace
+from functools import partial
 
-from rosrm.config.placement import placement_of
+from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
 from rosrm.extensions.registry import Registry
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
+from rosrm.master.settings_reload import SettingsReload
 from rosrm.runtime.bootstrap import Handover, run
 
 
@@ -31,7 +33,10 @@ def serve(handover: Handover) -> int:
     rows = registry.rows("scoring", "filter", "migration", "checkpoint")
     placement = replace(placement, fallback=fallback_of(registry, config))
     declared = registry.declared(config.migration.strategies)
-    return MasterRuntime(config, placement, strategies, rows, checkpoint, declared=declared).run()
+    reload = SettingsReload(config, handover.source, partial(chain_of, registry))
+    return MasterRuntime(
+        config, placement, strategies, rows, checkpoint, declared=declared, reload=reload
+    ).run()
 
 
 def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:

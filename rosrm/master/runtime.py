@@ -20,6 +20,7 @@ from rosrm.core.master.commands import (
     Assign,
     Command,
     PublishStateConfig,
+    ReadSettings,
     Redeliver,
     Reply,
     SendOrder,
@@ -43,6 +44,7 @@ from rosrm.master.journal_stall import JournalStall
 from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
+from rosrm.master.settings_reload import SettingsReload
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.model.rows import PluginRow
@@ -52,7 +54,7 @@ from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.master_connection import find_master
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
-from rosrm.runtime.bootstrap import handle_stop_signals
+from rosrm.runtime.bootstrap import handle_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.version import __version__
 from rosrm.wording import counted, listed, one_line
@@ -116,8 +118,10 @@ class MasterRuntime:
         checkpoint: CheckpointPolicy | None,
         *,
         declared: Declared,
+        reload: SettingsReload,
     ) -> None:
         self._config = config
+        self._reload = reload
         self._checkpoint = checkpoint
         self._declared = declared
         self._plugins = list(plugins)
@@ -139,7 +143,8 @@ class MasterRuntime:
             )  # fmt: skip
             opened.callback(self._journal.close)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
-            handle_stop_signals(self._stop)
+            handle_signals(self._stop, self._reload.hang_up)
+            opened.callback(self._reload.close)
             security = master_security(config.security)
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
@@ -173,6 +178,7 @@ class MasterRuntime:
             self._config.core(), placement, strategies, epoch, declared=self._declared
         )
         state.plugins.limit = self._deadlines
+        state.chain_of = self._reload.chain_of
         state.wall = time.time()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""
@@ -241,7 +247,7 @@ class MasterRuntime:
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
-        """Serve until SIGINT, SIGTERM or SIGHUP; returns the exit code."""
+        """Serve until a signal to stop; returns the exit code."""
         # Exclude all objects of the start from garbage collection, because they stay.
         gc.collect()
         gc.freeze()
@@ -278,6 +284,7 @@ class MasterRuntime:
         self._stopping = self._stopping or signal.Signals(number).name
 
     def _tick(self, now: float) -> None:
+        self._endpoint.events += self._reload.poll()
         if self._grants.has_changed(now):
             self._endpoint.shut_revoked()
         self._endpoint.poll_readings()
@@ -400,6 +407,8 @@ class MasterRuntime:
                 links.withdraw(command, now)
             elif isinstance(command, Redeliver):
                 links.redeliver(command, now)
+            elif isinstance(command, ReadSettings):
+                self._reload.start(command.request)
 
     def _write(self, commands: Sequence[Command]) -> Sequence[StoredRecord]:
         """Write the records and intents among the commands as one group."""

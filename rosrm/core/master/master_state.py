@@ -22,15 +22,17 @@ from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.migration import Migration, migration_to_dict
+from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
+from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
-from rosrm.extensions.placement import PlacementPlugins
+from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
@@ -81,6 +83,7 @@ class MasterState:
     Attributes:
         placement: the policies and filters that judge hosts.
         declared: declarations in the offers of the selected plugins.
+        time_limited: names of the processes with a time limit that are not terminal.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
@@ -90,6 +93,8 @@ class MasterState:
         unowned_instances: name of a removed process to its instances that may still run.
         capability_answers: answers of hosts, by strategy and host, for each strategy that must
             check its hosts.
+        chain_of: creates the scoring policies with other settings; None: they stay.
+        reloads: requests to reload, and the answers to them.
         plugins: guards every call of a plugin.
     """
 
@@ -119,6 +124,11 @@ class MasterState:
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
         self.set_aside: set[str] = set()
+        self.time_limited: dict[str, None] = {}
+        self.preemption = Preemption()
+        self.rebalancing = Rebalancing()
+        self.reloads = Reloads()
+        self.chain_of: ChainOf | None = None
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
@@ -279,6 +289,8 @@ class MasterState:
         """Update `terminal`, which stays in the order in which processes ended."""
         if not process.phase.is_terminal:
             self.terminal.pop(process.name, None)
+            if process.spec.time_limit:
+                self.time_limited.setdefault(process.name)
             if process.spec.standby.wanted:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
@@ -286,6 +298,7 @@ class MasterState:
         else:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
+            self.time_limited.pop(process.name, None)
             self.neighbours.remove(process.name)
 
     def collect_garbage(self) -> None:
@@ -324,9 +337,16 @@ class MasterState:
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place, given by its priority and order of submission."""
         process.owner, process.ended_on = 0, ""
-        process.wanted = DesiredState.RUN
+        process.wanted, process.overdue = DesiredState.RUN, False
+        process.started_at, process.began = inf, 0.0
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
+        self.put_in_queue(process)
+
+    def put_in_queue(self, process: Process) -> None:
+        """Add a process whose phase is QUEUED to the queue."""
         self.queue.add(process.name, process.spec.priority, process.order)
+        if process.queue_delay:
+            self.queue.delayed.add(process.name)
 
     def unqueue(self, process: Process) -> None:
         """Remove the process from the queue and from the set-aside list."""

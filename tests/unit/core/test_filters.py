@@ -102,6 +102,7 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         table.add_reservation(host, load, processes=draw(st.sampled_from([0, 0, 1])))
         if draw(rarely):
             table.prune(host)
+    table.set_claims({0: draw(st.integers(0, 2))} if draw(rarely) else {})
     return table
 
 
@@ -111,7 +112,8 @@ def demands(draw: st.DrawFn) -> Demand:
     estimated = frozenset(name for name in needs if draw(st.booleans()))
     excluded = draw(st.dictionaries(st.sampled_from(["h0", "h1", "h2"]), st.just("no"), max_size=1))
     required = draw(labels) if draw(rarely) else {}
-    spec = ProcessSpec("p", command=("run",), required_labels=required)
+    priority = draw(st.integers(0, 2))
+    spec = ProcessSpec("p", command=("run",), required_labels=required, priority=priority)
     read = declared_spec(spec, ())  # a filter may read only what makes rankings differ
     plugins = PlacementPlugins(filters=draw(filters_of_plugins))
     headroom = draw(st.sampled_from([0.0, 0.05]))

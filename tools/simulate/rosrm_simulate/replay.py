@@ -15,7 +15,7 @@ from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
-from rosrm.extensions.placement import PlacementPlugins
+from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.recording.encoding import Happened, decisions
 from rosrm.recording.reader import Recording
 from rosrm_simulate.meter import Meter, Outcome
@@ -65,6 +65,7 @@ def replay(
     recording: Recording, settings: CoreSettings, placement: PlacementPlugins,
     strategies: Mapping[str, MigrationStrategy], watcher: Watcher | None = None,
     until: float = inf, *, declared: Declared | None = None,
+    chain_of: ChainOf | None = None,
 ) -> Replay:  # fmt: skip
     """Replay all events of a record in a core, at the same times.
 
@@ -80,9 +81,11 @@ def replay(
         until: seconds from the beginning of the record: the run is measured up to here. All of it
             is replayed nonetheless.
         declared: declarations of the offers of the strategies.
+        chain_of: returns the scoring policies with other settings, after a reload; None: they stay.
     """
     header = recording.header
     state = MasterState(settings, placement, strategies, header.epoch, declared=declared)
+    state.chain_of = chain_of
     restore(state, lambda table: header.intents.get(table, {}), header.started)
     tail = header.intents.get("cluster", {}).get("tail")
     if tail is not None:

@@ -8,12 +8,13 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Final
 
 from rosrm.config.documents import Node
-from rosrm.config.placement import placement_of
+from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import ClusterConfig
 from rosrm.errors import ConfigError, RecordError
 from rosrm.extensions.contracts import MigrationStrategy
@@ -206,7 +207,14 @@ def replay_record(
     extraction = Extraction(recording)
     placement, strategies, declared = _plugins(config, registry)
     replayed = replay(
-        recording, config.core(), placement, strategies, extraction.watch, until, declared=declared
+        recording,
+        config.core(),
+        placement,
+        strategies,
+        extraction.watch,
+        until,
+        declared=declared,
+        chain_of=partial(chain_of, registry),
     )
     return replayed, extraction.workload()
 

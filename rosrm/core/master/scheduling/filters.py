@@ -229,6 +229,20 @@ def _why_not_asked(_hosts: Candidates, _row: int) -> str:
     return "it has not requested work yet"
 
 
+def _is_unclaimed(hosts: Candidates) -> BoolArray | None:
+    claims, priority = hosts.table.claims, hosts.demand.spec.priority
+    if not claims:
+        return None
+    allowed = np.ones(len(hosts.table), np.bool_)
+    allowed[[column for column, claimed in claims.items() if priority < claimed]] = False
+    return allowed[hosts.columns]
+
+
+def _why_claimed(hosts: Candidates, row: int) -> str:
+    claimed = hosts.table.claims[hosts.host(row).column]
+    return f"room is being made there for a process of priority {claimed}"
+
+
 # --- filters that an assignment changes -------------------------------------------------------
 
 
@@ -284,11 +298,14 @@ FILTERS: Final = (
     Filter("limits", _is_accepting, _why_not_accepting),
     Filter("report", _has_reported, _why_not_reported),
     Filter("request", _has_asked, _why_not_asked),
+    Filter("claim", _is_unclaimed, _why_claimed),
     Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
     Filter(
         "plugins", plugin_filters.passing_plugins, plugin_filters.why_plugin_excludes,
         Lasts.PERMANENT, by_assignment=True,
     ),
 )  # fmt: skip
+#: Filters that a host may fail for lack of room alone.
+OF_ROOM: Final = ("processes", "limits", "room")
 STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)
 BY_ASSIGNMENT: Final = tuple(one for one in FILTERS if one.by_assignment)
