@@ -162,7 +162,7 @@ class SlaveRuntime:
         probes = registry.probes(config.probes, context)
         self._sampler = Sampler(probes.made)
         opened.callback(self._sampler.close)
-        self._labels = {**probes.labels, **config.labels}
+        self._probe_labels = probes.labels
         self._limit = self._limits()
         return probes.absent
 
@@ -227,7 +227,8 @@ class SlaveRuntime:
         config = self._config
         return HostDescription(
             name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
-            pid=os.getpid(), software_version=__version__, labels=self._labels,
+            pid=os.getpid(), software_version=__version__,
+            labels={**self._probe_labels, **config.labels},
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=self._executors.names, absent=self._absent,
         )  # fmt: skip
