@@ -25,6 +25,7 @@ from rosrm.model.values import (
     ProcessSpec,
     Readiness,
     ReadinessKind,
+    ReschedulePolicy,
     RestartCondition,
     RestartPolicy,
     StandbyPolicy,
@@ -52,6 +53,14 @@ class RestartInFile:
     factor: Annotated[float, Quantity(low=1.0, high=100.0)] = _RESTART.factor
     attempts: Count = _RESTART.attempts
     window: PositiveSeconds = _RESTART.window
+
+
+@dataclass(frozen=True, slots=True)
+class RescheduleInFile:
+    """Starts on other hosts after the restart policy has given up."""
+
+    attempts: Count = 0
+    delay: Seconds = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +180,9 @@ class ProcessInFile:
     near: tuple[NeighboursInFile, ...] = ()
     apart: tuple[NeighboursInFile, ...] = ()
     spread: SpreadInFile | None = None
+    reschedule: RescheduleInFile = field(default_factory=RescheduleInFile)
+    protect: bool = False
+    time_limit: Seconds = 0.0
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -196,6 +208,7 @@ class ProcessInFile:
             standby=_same(StandbyPolicy, self.standby),
             health=Health() if self.health is None else _same(Health, self.health),
             neighbours=tuple(self._neighbour_rules()),
+            reschedule=_same(ReschedulePolicy, self.reschedule),
             given=(),
         )
 
@@ -261,6 +274,14 @@ def _about_restarts(spec: ProcessSpec) -> Iterator[Complaint]:
     if spec.restart.max_delay < spec.restart.delay:
         text = "restart.max_delay must not be less than restart.delay"
         yield Complaint(("restart", "max_delay"), text)
+
+
+def _about_ends(spec: ProcessSpec) -> Iterator[Complaint]:
+    if spec.time_limit and spec.kind != "job":
+        yield Complaint(("time_limit",), "time_limit: only a job has one; a service runs on")
+    if spec.reschedule.delay and not spec.reschedule.attempts:
+        text = "reschedule.delay requires `attempts`, the number of other hosts to try"
+        yield Complaint(("reschedule", "delay"), text)
 
 
 def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -378,6 +399,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
     (_about_surroundings, ("working_directory", "environment")),
     (_about_restarts, ("restart",)),
+    (_about_ends, ("time_limit", "kind", "reschedule")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),

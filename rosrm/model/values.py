@@ -61,6 +61,20 @@ class RestartPolicy:
 
 
 @dataclass(frozen=True, slots=True)
+class ReschedulePolicy:
+    """Starts of a failed process on other hosts, once its restart policy has given up.
+
+    Attributes:
+        attempts: highest number of other hosts; 0: the process has failed. A process that ran for
+            `restart.window` counts from zero again.
+        delay: seconds before each attempt.
+    """
+
+    attempts: int = 0
+    delay: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Readiness:
     """Condition under which an instance counts as ready.
 
@@ -213,6 +227,9 @@ class ProcessSpec:
         avoided_labels: a host with any of these labels is chosen only if no other host fits.
         priority: processes with a higher number are placed first.
         neighbours: rules on its hosts, relative to other processes.
+        protect: True: it is neither moved nor stopped to make room for others.
+        time_limit: seconds from the first start of a job on a host until the job has failed, with
+            restarts and moves; its return to the queue begins them again. 0: no limit.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -244,6 +261,9 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
     neighbours: tuple[NeighbourRule, ...] = ()
+    reschedule: ReschedulePolicy = ReschedulePolicy()
+    protect: bool = False
+    time_limit: float = 0.0
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

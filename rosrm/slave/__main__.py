@@ -34,7 +34,7 @@ def serve(handover: Handover) -> int:
             "CAP_SYS_RESOURCE or with `OOMScoreAdjust=%d` of systemd they are",
             fault, oom_score.PROTECTED,
         )  # fmt: skip
-    return SlaveRuntime(config, registry, wait_for_security(config)).run()
+    return SlaveRuntime(config, registry, wait_for_security(config), handover.source).run()
 
 
 if __name__ == "__main__":
