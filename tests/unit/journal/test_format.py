@@ -147,7 +147,8 @@ def test_every_process_is_written_back_as_it_was_read(state: MasterState, name: 
     again = written(state)["process", name]
     # Fields that are absent in older journals.
     before = {"principal": "", "owned_from": 0, "defaulted": [], **INTENTS["process", name]}
-    before["spec"] = {"neighbours": [], "given": [], **before["spec"]}
+    added = ("neighbours", "limits", "cpus", "realtime", "nice", "given")
+    before["spec"] = {**{field: again["spec"][field] for field in added}, **before["spec"]}
     changed = {field: (before[field], value) for field, value in again.items()
                if before[field] != value}  # fmt: skip
     if process.phase not in WAITING:
