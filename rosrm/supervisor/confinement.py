@@ -13,6 +13,10 @@ from rosrm.supervisor.instance_groups import InstanceGroups
 from rosrm.supervisor.spawn import Scheduler, ScheduleRefused, SpawnError
 from rosrm.wording import by_reason, listed
 
+#: In place of the descriptor of a control group.
+NO_GROUP: Final = -1
+#: Attempts to start a process in its group.
+_ATTEMPTS: Final = 2
 _POLICIES: Final = {"fifo": os.SCHED_FIFO, "rr": os.SCHED_RR}
 
 #: Starts the process of an instance, given its group and its scheduling as in `spawn.spawn`.
@@ -64,8 +68,9 @@ class Confinement:
         own = {name: fault for name, fault in made.items() if name in wanted}
         _check_required(limits, own)
         realtime = bool(limits.policy) and "realtime" not in faults
-        pid, refused = self._spawn(key, limits, spawn, realtime)
-        own.update(refused)
+        with _on_cpus(limits.cpus, self._cpus):
+            pid, late = self._spawn(key, limits, spawn, realtime)
+        own.update(late)
         if limits.nice and "nice" not in faults:
             own.update(_set_nice(pid, limits.nice))
         enforced = tuple(name for name in wanted if name not in faults and name not in own)
@@ -79,30 +84,35 @@ class Confinement:
     def _spawn(
         self, key: Key, limits: LimitRule, spawn: Spawn, realtime: bool
     ) -> tuple[int, dict[str, str]]:
-        """Spawn the process; return its pid, and why it has no real-time scheduling."""
-        if realtime:
+        """Spawn the process; return its pid, and what the kernel has refused."""
+        if not realtime:
+            return self._spawn_inside(key, limits, spawn, None)
+        try:
             scheduler = (_POLICIES[limits.policy], os.sched_param(limits.priority))
-            try:
-                return self._spawn_inside(key, limits, spawn, scheduler), {}
-            except ScheduleRefused as error:
-                fault = {"realtime": str(error)}
-                _check_required(limits, fault)
-                return self._spawn_inside(key, limits, spawn, None), fault
-        return self._spawn_inside(key, limits, spawn, None), {}
+            return self._spawn_inside(key, limits, spawn, scheduler)
+        except ScheduleRefused as error:
+            fault = {"realtime": str(error)}
+            _check_required(limits, fault)
+            pid, others = self._spawn_inside(key, limits, spawn, None)
+            return pid, {**fault, **others}
 
     def _spawn_inside(
         self, key: Key, limits: LimitRule, spawn: Spawn, scheduler: Scheduler | None
-    ) -> int:
-        for is_last in (False, True):
+    ) -> tuple[int, dict[str, str]]:
+        """Spawn the process in its group, or without one if no process can enter it."""
+        fault = ""
+        for _ in range(_ATTEMPTS):
             try:
-                with _on_cpus(limits.cpus, self._cpus), self.groups.inside(key) as group:
-                    return spawn(group, scheduler)
-            except OSError as error:  # a supervisor beside this one removed the group as empty
-                if is_last:
-                    fault = f"its control group cannot be entered: {error.strerror}"
-                    raise SpawnError(fault, transient=True) from None
+                with self.groups.inside(key) as group:
+                    return spawn(group, scheduler), {}
+            except OSError as error:
+                fault = f"its control group cannot be entered: {error.strerror}"
+                # A supervisor beside this one may have removed the group, because it was empty.
                 self.groups.make(key, limits, realtime=bool(limits.policy))
-        raise AssertionError("unreachable")
+        faults = {name: fault for name in _wanted(limits) if name.startswith("limits.")}
+        _check_required(limits, faults)
+        self.groups.remove(key, 0.0)
+        return spawn(NO_GROUP, scheduler), faults
 
 
 def cpus_in_words(numbers: list[int]) -> str:
@@ -133,11 +143,16 @@ def _on_cpus(cpus: tuple[int, ...], own: set[int]) -> Iterator[None]:
     if not cpus:
         yield
         return
-    os.sched_setaffinity(0, cpus)
+    try:
+        os.sched_setaffinity(0, cpus)
+    except OSError as error:
+        fault = f"{cpus_in_words(list(cpus))} cannot be used: {error.strerror}"
+        raise SpawnError(fault) from None
     try:
         yield
     finally:
-        os.sched_setaffinity(0, own)
+        with contextlib.suppress(OSError):  # must not hide that the instance was started
+            os.sched_setaffinity(0, own)
 
 
 def _set_nice(leader: int, nice: int) -> dict[str, str]:

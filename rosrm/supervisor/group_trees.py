@@ -76,6 +76,9 @@ def find(state: str, root: str = "/") -> Enforcement:
             continue
         if tree is not None:
             trees.append(tree)
+            for name in _offered(mount) - known - set(tree.controllers):
+                held = f"the controller {name} is not delegated to {os.path.dirname(tree.top)}"
+                faults[name] = f"{held}. To get it, {_HOW}"
     trees.sort(key=lambda tree: _CONTROLLERS.index(tree.controllers[0]))
     return Enforcement(tuple(trees), {**_missing(trees, faults), **_missing_rights()})
 

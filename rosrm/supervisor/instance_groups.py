@@ -107,7 +107,7 @@ class InstanceGroups:
                     left.callback(os.close, group)
                 else:
                     # A thread that moves itself alone needs no grace period; this is the only one.
-                    left.callback(_enter, tree.home)
+                    left.callback(_return, tree.home)
                     _enter(path)
             yield group
 
@@ -296,12 +296,16 @@ def _make(path: str, tree: Tree) -> None:
 
 
 def _enter(path: str) -> None:
-    """Move this thread into a group of version 1."""
+    """Move this thread into a group of version 1. Raises OSError."""
+    cgroups.write(os.path.join(path, "tasks"), "0")
+
+
+def _return(home: str) -> None:
+    """Move this thread back; an error must not hide that the instance was started."""
     try:
-        cgroups.write(os.path.join(path, "tasks"), "0")
+        _enter(home)
     except OSError as error:
-        own_log.write(f"the control group {path} cannot be entered: {error.strerror}")
-        raise
+        own_log.write(f"the control group {home} cannot be entered again: {error.strerror}")
 
 
 def _number(path: str) -> float:

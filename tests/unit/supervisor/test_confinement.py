@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import shutil
 from collections.abc import Iterator
@@ -9,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.core.supervisor.rules import LimitRule
+from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime import cgroups
 from rosrm.supervisor import group_trees, instance_groups
 from rosrm.supervisor.confinement import Confinement
@@ -93,6 +95,41 @@ def test_a_group_that_cannot_be_made_refuses_a_start_that_requires_it(confinemen
         confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started)
 
 
+class Closed(InstanceGroups):
+    """Groups that can be made, and that no process can enter."""
+
+    def __init__(self, attempts: int) -> None:
+        super().__init__()
+        self.attempts = attempts
+
+    @contextlib.contextmanager
+    def inside(self, key: Key) -> Iterator[int]:
+        self.attempts -= 1
+        if self.attempts >= 0:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        yield 7
+
+
+def in_group(group: int, _scheduler: object) -> int:
+    """Return the descriptor of the group as the pid."""
+    return group
+
+
+def test_a_group_that_was_removed_is_made_again(confinement) -> None:
+    """Another supervisor may take it for a left-over."""
+    confinement.groups = Closed(1)
+    assert confinement.start(KEY, LimitRule(memory=1e8), in_group) == (7, ("limits.memory",), "")
+
+
+def test_a_group_that_no_process_can_enter_is_left_out(confinement) -> None:
+    """The process runs without, unless its limits are required."""
+    confinement.groups = Closed(9)
+    note = "limits.memory: its control group cannot be entered: Invalid argument"
+    assert confinement.start(KEY, LimitRule(memory=1e8), in_group) == (-1, (), note)
+    with pytest.raises(SpawnError, match="cannot be entered: Invalid argument"):
+        confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started)
+
+
 @pytest.mark.parametrize("required", [True, False])
 def test_realtime_that_the_kernel_refuses(confinement, required: bool) -> None:
     """Without the requirement the process runs with the default scheduling, and a note."""
@@ -172,17 +209,34 @@ def test_a_host_without_control_groups_says_so(tmp_path: Path) -> None:
     assert found.missing["limits.memory_high"] == found.missing["limits.memory"]
 
 
-@pytest.mark.parametrize("recorded", ["docker", "systemd"])
-def test_a_group_that_is_not_delegated_says_how_to_get_it(recorded: str, tmp_path: Path) -> None:
-    """A group of version 2 with processes in it gives no controllers to groups below."""
-    root = tmp_path / "root"
+def recorded_tree(recorded: str, folder: Path, given: str) -> tuple[str, str]:
+    """Copy a recorded tree, with the controllers given to groups below; return root and group."""
+    root = folder / "root"
     shutil.copytree(Path(__file__).parents[2] / "data/cgroup_v2" / recorded, root)
     (root / "sys/fs/cgroup/cgroup.controllers").write_text("cpuset cpu io memory pids\n")
     (mount,) = cgroups.mounts(str(root))
     own = cgroups.own_group(mount, str(root))
     assert own is not None
-    Path(own, "cgroup.subtree_control").write_text("\n")
-    found = group_trees.find(str(tmp_path), str(root))
+    Path(own, "cgroup.subtree_control").write_text(f"{given}\n")
+    return str(root), own
+
+
+def test_a_controller_that_is_not_delegated_is_named(tmp_path: Path, monkeypatch) -> None:
+    """The other one can be used."""
+    root, own = recorded_tree("systemd", tmp_path, "memory")
+    monkeypatch.setattr(group_trees, "make_top", lambda tree: Path(tree.top).mkdir())
+    (tree,), missing = group_trees.find(str(tmp_path), root)
+    assert (tree.version, tree.controllers, tree.home) == (2, ("memory",), own)
+    assert missing.keys() & {"limits.memory", "limits.memory_high"} == set()
+    assert missing["limits.cpu"].startswith(f"the controller cpu is not delegated to {own}. To get")
+    assert not list(Path(own).glob("rosrm-state-*"))
+
+
+@pytest.mark.parametrize("recorded", ["docker", "systemd"])
+def test_a_group_that_is_not_delegated_says_how_to_get_it(recorded: str, tmp_path: Path) -> None:
+    """A group of version 2 with processes in it gives no controllers to groups below."""
+    root, own = recorded_tree(recorded, tmp_path, "")
+    found = group_trees.find(str(tmp_path), root)
     assert found.trees == ()
     assert found.missing["limits.memory"] == found.missing["limits.cpu"]
     assert found.missing["limits.cpu"].startswith(
