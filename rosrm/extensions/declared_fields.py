@@ -17,7 +17,7 @@ from rosrm.wording import listed
 #: Fields of a spec that every policy may read, because `Demand.key` includes them.
 STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
-    "required_labels", "preferred_labels", "avoided_labels",
+    "required_labels", "preferred_labels", "avoided_labels", "limits", "cpus", "realtime", "nice",
 )  # fmt: skip
 #: Field that gives the policy the flows of the process, also the learned ones.
 FLOWS_FIELD: Final = "talks_to"
