@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rosrm.core.master.state.links import Crossing
 from rosrm.extensions.declared_fields import FLOWS_FIELD, STANDARD_FIELDS
@@ -36,8 +36,7 @@ class Neighbour:
     absent: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Flow:
+class Flow(NamedTuple):
     """A flow between the process and another one, which has a host.
 
     Attributes:
@@ -54,8 +53,7 @@ class Flow:
     incoming: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Traffic:
+class Traffic(NamedTuple):
     """The flows of a process, and their part in the load of the links.
 
     Attributes:
