@@ -34,7 +34,8 @@ def cluster(name, tmp_path):
     """Yield a cluster of robot-1, behind a link of 5 MB/s, and base, with quick measurements."""
     hosts = [HostPlan(one, disk=64 * MIB) for one in ("robot-1", "base", "desk")]
     (tmp_path / "cluster.yaml").write_text(
-        "network: {period: 500ms}\nscoring: network\nliveness: {suspect: 5s, lease: 60s}\n"
+        "network: {period: 500ms}\nscoring: {policy: network}\n"
+        "liveness: {suspect: 5s, lease: 60s}\n"
     )
     (tmp_path / "robot-1.yaml").write_text("labels: {at: robot}\nlinks: {rate: 5MB/s}\n")
     (tmp_path / "base.yaml").write_text("labels: {at: base}\n")

@@ -44,6 +44,7 @@ class Flow(NamedTuple):
         host, column: of the other process.
         rate: bytes a second.
         incoming: the process receives it from the other one, or declares it.
+        learned: it was measured, not declared.
     """
 
     process: str
@@ -51,6 +52,7 @@ class Flow(NamedTuple):
     column: int
     rate: float
     incoming: bool
+    learned: bool = False
 
 
 class Traffic(NamedTuple):
