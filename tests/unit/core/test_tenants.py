@@ -107,3 +107,16 @@ def test_a_decision_is_explained_with_the_tenants_of_its_time():
         for name in ("p", "q")
     }
     assert reasons == {"p": ["beside []", "beside []"], "q": ["beside ['p']", "beside []"]}
+
+
+def test_tenants_have_their_specs_after_a_restart_of_the_master():
+    """Instances that the journal or a slave reports have the spec of their process."""
+    policy = Crowd()
+    cluster = Cluster("a", "b", policy=policy)
+    cluster.submit(process("p", priority=7))
+    cluster.wait(1.0)
+    cluster.restart_master()
+    cluster.wait(1.0)
+    cluster.submit(process("q"))
+    specs = {name: dict(tenants) for name, tenants in policy.seen[-1].items()}
+    assert specs["a"]["p"] == cluster["p"].spec
