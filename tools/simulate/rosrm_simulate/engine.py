@@ -97,6 +97,9 @@ class Simulation(World[Machine]):
         self._patience = 2.0 + max(
             settings.settle, settings.hysteresis, settings.cooldown, settings.delivery_timeout,
             settings.lease, settings.order_retry,
+            settings.rebalance_after if settings.rebalance else 0.0,
+            *(one.spec.time_limit for one in workload.processes),
+            *(one.spec.reschedule.delay for one in workload.processes),
         )  # fmt: skip
 
     def run(self, progress: Callable[[Progress], None] | None = None) -> Outcome:
