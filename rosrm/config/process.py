@@ -12,19 +12,23 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
 from rosrm.model.description_checks import is_namespace, name_fault
+from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.values import (
     EMPTY,
+    Enforcement,
     Health,
     HostLossAction,
     HostLossPolicy,
     IsolationAction,
     IsolationPolicy,
     Kind,
+    Limits,
     MigrationPolicy,
     NeighbourRule,
     ProcessSpec,
     Readiness,
     ReadinessKind,
+    Realtime,
     ReschedulePolicy,
     RestartCondition,
     RestartPolicy,
@@ -41,6 +45,7 @@ Text = Annotated[str, PlainWord()]
 Labels = Annotated[Mapping[str, Text], NullIsEmpty()]
 _Value = TypeVar("_Value")
 ListOfWords = Annotated[tuple[Text, ...], Words()]
+_CpuNumber = Annotated[int, Quantity(high=LARGEST_CPU_NUMBER, whole=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +155,24 @@ class SpreadInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class LimitsInFile:
+    """Limits that the host of a process enforces."""
+
+    memory: Annotated[float, Quantity("size")] = 0.0
+    memory_high: Annotated[float, Quantity("size")] = 0.0
+    cpu: Annotated[float, Quantity("cores")] = 0.0
+    enforce: Enforcement = "preferred"
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeInFile:
+    """Real-time scheduling of a process."""
+
+    policy: Literal["fifo", "rr"]
+    priority: Annotated[int, Quantity(low=1, high=99, whole=True)]
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessInFile:
     """One process, with the keys of ROS 2 launch; shorthands are in long form."""
 
@@ -183,6 +206,10 @@ class ProcessInFile:
     reschedule: RescheduleInFile = field(default_factory=RescheduleInFile)
     protect: bool = False
     time_limit: Seconds = 0.0
+    limits: LimitsInFile = field(default_factory=LimitsInFile)
+    cpus: tuple[_CpuNumber, ...] = ()
+    realtime: RealtimeInFile | None = None
+    nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -209,6 +236,8 @@ class ProcessInFile:
             health=Health() if self.health is None else _same(Health, self.health),
             neighbours=tuple(self._neighbour_rules()),
             reschedule=_same(ReschedulePolicy, self.reschedule),
+            limits=_same(Limits, self.limits),
+            realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             given=(),
         )
 
@@ -310,6 +339,12 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
                 yield Complaint((key,), f"{key}: {fault}")
 
 
+def _about_limits(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = limits_fault(spec)
+    if fault:
+        yield Complaint((fault.partition(".")[0].partition(":")[0],), fault)
+
+
 def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
     health = spec.health
     if bool(health.topic) != bool(health.rate):
@@ -403,4 +438,5 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
+    (_about_limits, ("limits", "cpus", "realtime", "needs")),
 )

@@ -74,6 +74,8 @@ class ProcessRow:
         reason: why it waits, failed, ...
         stale: `cpu` and `memory` are old, because its host is silent or lost.
         owner: principal that submitted it, "user:ada"; "": unknown.
+        cpu_limit: cores that its host enforces; 0: no limit holds.
+        memory_limit: bytes that its host enforces; 0: no limit holds.
     """
 
     name: str
@@ -93,6 +95,8 @@ class ProcessRow:
     reason: str
     stale: bool = False
     owner: str = ""
+    cpu_limit: float = 0.0
+    memory_limit: int = 0
 
 
 @dataclass(frozen=True, slots=True)

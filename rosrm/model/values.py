@@ -31,6 +31,9 @@ HostLossAction = Literal["wait", "elsewhere", "stop"]
 IsolationAction = Literal["keep", "stop"]
 Accounting = Literal["attributed", "shared", "countable"]
 Relation = Literal["near", "apart"]
+Enforcement = Literal["preferred", "required"]
+#: "": the default scheduling of the operating system.
+RealtimePolicy = Literal["", "fifo", "rr"]
 
 
 class Kind(str, Enum):
@@ -192,6 +195,37 @@ class NeighbourRule:
 
 
 @dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of a process that its host enforces; 0: no limit.
+
+    Attributes:
+        memory: bytes above which the kernel kills the process.
+        memory_high: bytes above which the kernel slows the process and reclaims its memory.
+        cpu: cores; above them the process waits.
+        enforce: "required": a host that cannot enforce limits and scheduling does not run the
+            process; "preferred": such a host runs it without.
+    """
+
+    memory: float = 0.0
+    memory_high: float = 0.0
+    cpu: float = 0.0
+    enforce: Enforcement = "preferred"
+
+
+@dataclass(frozen=True, slots=True)
+class Realtime:
+    """Real-time scheduling of a process.
+
+    Attributes:
+        policy: "": none.
+        priority: 1..99; 0: no policy is given.
+    """
+
+    policy: RealtimePolicy = ""
+    priority: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Health:
     """Health checks of a running process; an unhealthy process has failed.
 
@@ -230,6 +264,8 @@ class ProcessSpec:
         protect: True: it is neither moved nor stopped to make room for others.
         time_limit: seconds from the first start of a job on a host until the job has failed, with
             restarts and moves; its return to the queue begins them again. 0: no limit.
+        cpus: numbers of the CPUs that it may use; (): all.
+        nice: its niceness, -20..19.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -264,12 +300,25 @@ class ProcessSpec:
     reschedule: ReschedulePolicy = ReschedulePolicy()
     protect: bool = False
     time_limit: float = 0.0
+    limits: Limits = Limits()
+    cpus: tuple[int, ...] = ()
+    realtime: Realtime = Realtime()
+    nice: int = 0
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         """Set the default of `ros`, which depends on `package`."""
         if self.ros is None:
             object.__setattr__(self, "ros", self.package is not None)
+
+    @property
+    def enforcement(self) -> tuple[str, ...]:
+        """Return the names of its limits and scheduling settings for which a host needs rights."""
+        settings = {
+            "limits.memory": self.limits.memory, "limits.memory_high": self.limits.memory_high,
+            "limits.cpu": self.limits.cpu, "realtime": self.realtime.policy, "nice": self.nice < 0,
+        }  # fmt: skip
+        return tuple(name for name, value in settings.items() if value)
 
     @property
     def program(self) -> str:
@@ -400,7 +449,8 @@ class InstanceStatus:
         peak_memory: peak memory of the last run in bytes; 0: unknown.
         cpu_time: CPU time of the last run in seconds.
         run_time: seconds from start to end of the last run.
-        message: text on why it failed or was refused.
+        message: text on why it failed or was refused, or runs without its limits.
+        enforced: names of the limits and scheduling settings that hold in this run.
     """
 
     instance: InstanceId
@@ -413,6 +463,7 @@ class InstanceStatus:
     cpu_time: float = 0.0
     run_time: float = 0.0
     message: str = ""
+    enforced: tuple[str, ...] = ()
 
     @property
     def known_exit(self) -> int | None:
@@ -495,6 +546,9 @@ class HostDescription:
         period: seconds between two `resource_info` messages.
         executors: names of executors that plugins offer for `Execute` steps.
         absent: probe name to the reason why the probe is absent on this host.
+        unenforced: name of a limit or scheduling setting (`ProcessSpec.enforcement`) to the reason
+            why this host cannot enforce it.
+        cpus: numbers of the CPUs that processes may use; (): unknown.
     """
 
     name: str
@@ -508,6 +562,8 @@ class HostDescription:
     period: float = 0.1
     executors: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    unenforced: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    cpus: tuple[int, ...] = ()
 
     def accounted(self, accounting: Accounting) -> frozenset[str]:
         """Return the names of the resources with this accounting."""

@@ -20,6 +20,7 @@ from rosrm.model.description_checks import (
     name_fault,
 )
 from rosrm.model.durations import LONGEST
+from rosrm.model.limits import limits_fault
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
 from rosrm.wording import sanitized, sendable
@@ -84,6 +85,7 @@ _FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
     float: (float, float),
     str | None: (lambda text: text or "", lambda text: text or None),
     tuple[str, ...]: (list, tuple),
+    tuple[int, ...]: (list, lambda numbers: tuple(map(int, numbers))),
     Mapping[str, str]: (pairs, mapping),
     values.Kind: (attrgetter("value"), values.Kind),
     values.InstanceState: (attrgetter("value"), values.InstanceState),
@@ -159,7 +161,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     fault = _spec_fault(message)
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
-    return _from_msg(
+    spec = _from_msg(
         values.ProcessSpec, message,
         parameters={
             pair.key: _json_value(pair.value, f"parameter {pair.key}")
@@ -172,6 +174,10 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         ),
         neighbours=tuple(_from_msg(values.NeighbourRule, rule) for rule in message.neighbours),
     )  # fmt: skip
+    fault = limits_fault(spec)
+    if fault:
+        raise Refused(f"process {message.name!r:.60}: {fault}")
+    return spec
 
 
 def _spec_fault(message: msg.ProcessSpec) -> str:
@@ -347,8 +353,11 @@ def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
     if [resource.slot for resource in resources] != list(range(len(resources))):
         raise Refused(f"host {message.name!r:.250}: its resources do not fill the slots 0, 1, 2, …")
     described = _description(message, resources)
-    absent = {probe: sanitized(reason) for probe, reason in described.absent.items()}
-    description = replace(described, absent=absent)
+    absent, unenforced = (
+        {name: sanitized(reason) for name, reason in reasons.items()}
+        for reasons in (described.absent, described.unenforced)
+    )
+    description = replace(described, absent=absent, unenforced=unenforced)
     fault = description_fault(description)
     if fault:
         raise Refused(fault)
@@ -450,7 +459,10 @@ def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
 def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
     """Return the inverse of `process_row_to_msg`."""
     exit_code = message.exit_code if message.exit_code_known else None
-    return _from_msg(ProcessRow, message, cpu=_fraction(message.cpu), exit_code=exit_code)
+    return _from_msg(
+        ProcessRow, message, cpu=_fraction(message.cpu), cpu_limit=_fraction(message.cpu_limit),
+        exit_code=exit_code,
+    )  # fmt: skip
 
 
 def plugin_row_to_msg(row: PluginRow) -> msg.PluginState:

@@ -62,7 +62,7 @@ from rosrm.slave.shutdown import STOP_ALL, Shutdown
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.usage import UsageWatch
 from rosrm.version import __version__
-from rosrm.wording import counted, reload_summary
+from rosrm.wording import by_reason, counted, reload_summary
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -127,7 +127,7 @@ class SlaveRuntime:
             )
             launchers = Launchers.of(offered, registry.capabilities_of())
             sessions = SessionTable(launchers=launchers)
-            self._usage = UsageWatch(sessions)
+            self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
             self._absent = self._open_probes(registry, sessions, opened)
             first = self._sampler.first().reports
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
@@ -173,6 +173,9 @@ class SlaveRuntime:
             ended=lambda fault: self._ending.note_supervisor_left(fault),  # noqa: PLW0108 - made later
         )  # fmt: skip
         opened.callback(self._supervisor.close)
+        if self._supervisor.unenforced:
+            missing = by_reason((name, why) for name, why in self._supervisor.unenforced.items())
+            _log.info("limits and scheduling that are not enforced here: %s", missing)
 
     def _join_ros(self, opened: contextlib.ExitStack) -> GraphWatch:
         """Create participant and endpoint; return the view of the ROS graph."""
@@ -231,6 +234,7 @@ class SlaveRuntime:
             labels={**self._probe_labels, **config.labels},
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=self._executors.names, absent=self._absent,
+            unenforced=self._supervisor.unenforced, cpus=tuple(sorted(os.sched_getaffinity(0))),
         )  # fmt: skip
 
     def _adopt(self) -> None:

@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from rosrm.cli.output import tables
-from rosrm.wording import amount, counted, duration, listed, size, words
+from rosrm.wording import amount, by_reason, counted, duration, listed, size, words
 
 #: Wording of each decision of the master about a process.
 _DECIDED: Final = {
@@ -37,6 +37,8 @@ def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield _replicas(explanation["kept"])
     if explanation.get("checkpoint"):
         yield _checkpoint(explanation["checkpoint"])
+    if explanation.get("limits"):
+        yield _limits(explanation["limits"])
     decision = explanation.get("decision")
     if decision:
         yield Text()
@@ -91,6 +93,17 @@ def _checkpoint(checkpoint: Mapping[str, Any]) -> Text:
             f"({size(checkpoint['size'])}; the process was paused for {checkpoint['pause']:.1f} s)"
         )
     return Text(f"{text}: {checkpoint['trouble']}" if checkpoint["trouble"] else f"{text}.")
+
+
+def _limits(limits: Mapping[str, Mapping[str, Any]]) -> Text:
+    """Return limits and scheduling, and those that do not hold in this run with the reasons."""
+    values = ", ".join(f"{name} {setting['value']}" for name, setting in limits.items())
+    unmet = [(name, one["reason"]) for name, one in limits.items() if not one.get("holds", True)]
+    if not unmet:
+        holds = " The host enforces them." if any("holds" in one for one in limits.values()) else ""
+        return Text(f"Limits and scheduling: {values}.{holds}")
+    reasons = by_reason((name, reason or "see above") for name, reason in unmet)
+    return Text(f"Limits and scheduling: {values}. ").append(f"Not enforced: {reasons}.", "yellow")
 
 
 def _sentence(name: str, decision: Mapping[str, Any]) -> Text:

@@ -131,6 +131,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
         return
     before = instance.state
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
+    instance.enforced = status.enforced
     _note_load(state, instance, before, now)
     if status.state.ended:
         _ended(state, instance, status, before, now)

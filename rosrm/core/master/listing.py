@@ -13,6 +13,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.process_defaults import defaulted_values
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
+from rosrm.model.limits import limits_in_words
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy, qualified_name
 
@@ -86,8 +87,15 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         exit_code=process.exit_code, priority=process.spec.priority,
         queue_position=state.queue.position(process.name), since=now - process.since,
         cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
+        cpu_limit=_limit(process, owner, "cpu"), memory_limit=int(_limit(process, owner, "memory")),
         stale=bool(silence), owner=process.principal,
     )  # fmt: skip
+
+
+def _limit(process: Process, owner: Instance | None, name: str) -> float:
+    """Return a limit that holds for the owning instance; 0: none does."""
+    holds = owner is not None and owner.pid and f"limits.{name}" in owner.enforced
+    return float(getattr(process.spec.limits, name)) if holds else 0.0
 
 
 def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
@@ -150,6 +158,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "process": name, "state": row.state, "host": row.host, "owner": row.owner,
         "reason": "; ".join(filter(None, reasons)),
         "decision": None if decision is None else {**decision, "elapsed": age},
+        "limits": _limits(state, process),
         "defaults": defaulted_values(process.spec, process.defaulted),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
@@ -158,6 +167,23 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
             for at, kind, message in process.history
         ],
     }  # fmt: skip
+
+
+def _limits(state: MasterState, process: Process) -> Mapping[str, Any]:
+    """Return limits and scheduling settings of a process with their values; {}: it has none.
+
+    If it runs: also whether each holds, and why not.
+    """
+    owner = state.instances.get(process.owner)
+    runs = owner is not None and owner.is_running
+    found: dict[str, Any] = {}
+    for name, value in limits_in_words(process.spec).items():
+        found[name] = {"value": value}
+        if owner is not None and runs:
+            reason = owner.host.description.unenforced.get(name, "")
+            holds = name in owner.enforced
+            found[name] |= {"holds": holds, "reason": "" if holds else reason}
+    return found
 
 
 def _replicas(state: MasterState, process: Process, now: float) -> list[Mapping[str, Any]]:

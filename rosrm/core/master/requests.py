@@ -29,6 +29,7 @@ from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.limits import limits_fault
 from rosrm.model.orders import RestartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.values import ProcessSpec
@@ -156,7 +157,10 @@ def _submission_fault(
 
 
 def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
-    """Return why the migration or the standby of a spec is refused; "": it is not."""
+    """Return why the limits, the migration or the standby of a spec are refused; "": not."""
+    fault = limits_fault(spec)
+    if fault:
+        return fault
     strategy = spec.migration.strategy
     if strategy is not None and strategy not in state.strategies:
         return why_not_selected(state, strategy)
@@ -168,9 +172,13 @@ def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
     return ""
 
 
+#: Paths of the fields that `_spec_fault` checks.
+_CHECKED: Final = ("migration.", "standby.", "limits.", "needs", "cpus", "realtime.", "nice")
+
+
 def _origin(defaulted: Sequence[str]) -> str:
     """Return the part of a refusal that names the fields with defaults of the cluster, if any."""
-    concerned = [path for path in defaulted if path.startswith(("migration.", "standby."))]
+    concerned = [path for path in defaulted if path.startswith(_CHECKED)]
     if not concerned:
         return ""
     given = "is" if len(concerned) == 1 else "are"

@@ -29,6 +29,7 @@ from rosrm.core.supervisor.instance import (
     Then,
     end,
     ending,
+    killed_for_memory,
     stopping,
 )
 from rosrm.core.supervisor.rules import RestartRule
@@ -47,7 +48,8 @@ def _spawned(instance: Instance, event: events.Event, now: float) -> list[Comman
     instance.phase = RUNNING
     instance.pid = event.pid
     instance.started = now
-    instance.message = instance.fault = ""
+    instance.message, instance.fault = event.note, ""
+    instance.enforced = event.enforced
     if instance.then == THEN_END:
         return _stop(instance, event, now)
     return [ReportStatus(instance.key)]
@@ -84,6 +86,8 @@ def _exited(instance: Instance, event: events.Event, now: float) -> list[Command
     instance.peak_memory = event.peak_memory
     instance.cpu_time = event.cpu_time
     instance.run_time = max(0.0, now - instance.started)
+    if event.out_of_memory and (event.code or event.signal) and not instance.fault:
+        instance.fault = killed_for_memory(*event.out_of_memory)
     if not event.leftovers:
         return _when_nothing_is_left(instance, now)
     if instance.phase == STOPPING:

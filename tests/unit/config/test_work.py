@@ -13,10 +13,12 @@ from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (
     Kind,
+    Limits,
     MigrationPolicy,
     NeighbourRule,
     ProcessSpec,
     Readiness,
+    Realtime,
     RestartPolicy,
     StopPolicy,
 )
@@ -59,6 +61,9 @@ def test_every_key_is_read(file):
                 migration: {strategy: relaunch, overlap: false, options: {a: 1}}
                 readiness: {kind: graph, timeout: 10s}
                 stop: {interrupt_grace: 1s, terminate_grace: 500ms}
+                limits: {memory: 600MB, memory_high: 550 MB, cpu: 1.5 cores, enforce: required}
+                cpus: [2, 3]
+                nice: -5
             """
         )
     )
@@ -76,6 +81,8 @@ def test_every_key_is_read(file):
     assert spec.migration == MigrationPolicy("relaunch", False, {"a": 1})
     assert spec.readiness == Readiness("graph", 10.0)
     assert spec.stop == StopPolicy(1.0, 0.5)
+    assert spec.limits == Limits(6e8, 5.5e8, 1.5, "required")
+    assert (spec.cpus, spec.nice) == ((2, 3), -5)
 
 
 @pytest.mark.parametrize(
@@ -112,6 +119,11 @@ def test_every_key_is_read(file):
             "command: x, spread: {group: g, prefer: true}",
             "neighbours",
             (NeighbourRule("apart", group="g", prefer=True),),
+        ),
+        (
+            "command: x, realtime: {policy: fifo, priority: 40}",
+            "realtime",
+            Realtime("fifo", 40),
         ),
         ("module: m", "ros", False),
         ("module: m, ros: true, remappings: [[a, b]]", "remappings", {"a": "b"}),

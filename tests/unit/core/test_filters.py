@@ -17,7 +17,7 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.declared_fields import declared_spec
 from rosrm.extensions.placement import PlacementPlugins, SelectedFilter
-from rosrm.model.values import HostDescription, ProcessSpec, ResourceDescription
+from rosrm.model.values import HostDescription, Limits, ProcessSpec, ResourceDescription
 
 RESOURCES = ("memory", "cpu", "gpu")
 
@@ -84,6 +84,8 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         description = HostDescription(
             name, number + 1, labels=draw(labels), resources=described,
             max_processes=draw(st.sampled_from([0, 1, 2])),
+            unenforced={"limits.cpu": "no group"} if draw(rarely) else {},
+            cpus=draw(st.sampled_from([(), (0, 1), (0, 1, 2, 3)])),
         )  # fmt: skip
         host = table.register(description, 0.0)
         column = host.column
@@ -112,8 +114,11 @@ def demands(draw: st.DrawFn) -> Demand:
     estimated = frozenset(name for name in needs if draw(st.booleans()))
     excluded = draw(st.dictionaries(st.sampled_from(["h0", "h1", "h2"]), st.just("no"), max_size=1))
     required = draw(labels) if draw(rarely) else {}
-    priority = draw(st.integers(0, 2))
-    spec = ProcessSpec("p", command=("run",), required_labels=required, priority=priority)
+    limits = Limits(cpu=1.0, enforce=draw(st.sampled_from(["preferred", "required"])))
+    spec = ProcessSpec(
+        "p", command=("run",), required_labels=required, limits=limits,
+        cpus=draw(st.sampled_from([(), (1,), (1, 3)])), priority=draw(st.integers(0, 2)),
+    )  # fmt: skip
     read = declared_spec(spec, ())  # a filter may read only what makes rankings differ
     plugins = PlacementPlugins(filters=draw(filters_of_plugins))
     headroom = draw(st.sampled_from([0.0, 0.05]))

@@ -18,7 +18,7 @@ from rosrm.core.master.scheduling import plugin_filters, proximity
 from rosrm.core.master.scheduling.candidates import Candidates
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
 from rosrm.core.master.state.hosts import HostCondition
-from rosrm.wording import amount, counted
+from rosrm.wording import amount, by_reason, counted, listed
 
 #: Tolerance in comparisons of sums of fractions.
 _CLOSE: Final = 1e-9
@@ -147,6 +147,28 @@ def _why_no_resources(hosts: Candidates, row: int) -> str:
     needs = zip(hosts.resources, hosts.need[:, row].tolist(), strict=True)
     there = {name for name, need in needs if need < np.inf}
     return f"it has no {min(hosts.demand.declared - there)}"
+
+
+def _can_enforce(hosts: Candidates) -> BoolArray | None:
+    required, cpus = _to_enforce(hosts)
+    if not required and not cpus:
+        return None
+    return hosts.table.enforcing(required, cpus)[hosts.columns]
+
+
+def _why_not_enforced(hosts: Candidates, row: int) -> str:
+    own, (required, cpus) = hosts.host(row).description, _to_enforce(hosts)
+    lacking = [str(number) for number in cpus if own.cpus and number not in own.cpus]
+    if lacking:
+        return f"it has no CPU {listed(lacking)}; it has {listed(map(str, own.cpus))}"
+    faults = ((name, own.unenforced[name]) for name in required if name in own.unenforced)
+    return f"it cannot enforce {by_reason(faults)}"
+
+
+def _to_enforce(hosts: Candidates) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Return the settings that a host must be able to enforce, and the CPUs that it must have."""
+    spec = hosts.demand.spec
+    return (spec.enforcement if spec.limits.enforce == "required" else ()), spec.cpus
 
 
 # --- neighbours -------------------------------------------------------------------------------
@@ -288,6 +310,7 @@ FILTERS: Final = (
     EXCLUSION,
     Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),
     Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
+    Filter("enforcement", _can_enforce, _why_not_enforced, Lasts.PERMANENT),
     NEIGHBOURS,
     Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
     Filter("expected", _is_not_expected, _why_not_up, Lasts.RETURN),

@@ -111,6 +111,13 @@ class Host:
         """Return the name of the host."""
         return self.description.name
 
+    def enforces(self, settings: tuple[str, ...], cpus: tuple[int, ...]) -> bool:
+        """Return True if the host can enforce these settings, and is not known to lack a CPU."""
+        own = self.description
+        return own.unenforced.keys().isdisjoint(settings) and not (
+            own.cpus and set(cpus).difference(own.cpus)
+        )
+
 
 class HostTable(HostColumns):
     """All known hosts.
@@ -129,6 +136,7 @@ class HostTable(HostColumns):
         self.touched: list[int] = []
         self.claims: dict[int, int] = {}
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}
+        self._enforcing: dict[tuple[tuple[str, ...], tuple[int, ...]], BoolArray] = {}
         self._listed: list[Host] | None = None
 
     # --- registration --------------------------------------------------------------------
@@ -175,6 +183,7 @@ class HostTable(HostColumns):
         self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
         self.refused_since[column] = np.inf
         self._labelled.clear()
+        self._enforcing.clear()
         self.changed()
         return host
 
@@ -198,6 +207,7 @@ class HostTable(HostColumns):
             known.clear()
         self.incarnation[host.column] = 0
         self._labelled.clear()
+        self._enforcing.clear()
         self.set_closed(host, cordoned=False, draining=False)
         self.set_condition(host, HostCondition.LEFT)
 
@@ -228,6 +238,17 @@ class HostTable(HostColumns):
         if known is None or len(known) != len(self):
             found = [host.description.labels.get(key) == value for host in self.hosts]
             known = self._labelled[key, value] = np.array(found, np.bool_)
+        return known
+
+    def enforcing(self, settings: tuple[str, ...], cpus: tuple[int, ...]) -> BoolArray:
+        """Return the mask, (H,), of hosts that can enforce these settings and have these CPUs.
+
+        Cached until a host registers.
+        """
+        known = self._enforcing.get((settings, cpus))
+        if known is None or len(known) != len(self):
+            found = [host.enforces(settings, cpus) for host in self.hosts]
+            known = self._enforcing[settings, cpus] = np.array(found, np.bool_)
         return known
 
     # --- changes -------------------------------------------------------------------------

@@ -75,6 +75,7 @@ class Instance:
         at_once: it must be killed without delay, because another instance owns the name.
         order_at: time of the last order to stop or withdraw it; -inf: none.
         node_name: name of its node, if it differs from the name of the process.
+        enforced: names of its limits and scheduling settings that hold, as its slave reports.
         ready_at: time at which the first report of its readiness arrived at this master.
     """
 
@@ -98,6 +99,7 @@ class Instance:
     at_once: bool = False
     order_at: float = -inf
     node_name: str = ""
+    enforced: tuple[str, ...] = ()
     ready_at: float = inf
 
     @property
