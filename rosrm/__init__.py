@@ -24,11 +24,13 @@ The public names, by purpose:
 Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
-                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule
+                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule,
+                ReschedulePolicy
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
-                ResourceDescription, Accounting, Reading
+                ResourceDescription, Accounting, Reading, HostLabelling
   scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
+  filters       FilterOffer, PlacementFilter
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
   launchers     LauncherOffer, Launcher, LauncherContext, Launch, ProcessTreeLauncher,
@@ -74,9 +76,11 @@ if TYPE_CHECKING:
         CheckpointOffer,
         CheckpointPolicy,
         CheckpointView,
+        FilterOffer,
         FloatArray,
         GraphDepartureLauncher,
         HostChecking,
+        HostLabelling,
         HostView,
         ImageLauncher,
         Imaging,
@@ -90,6 +94,7 @@ if TYPE_CHECKING:
         MigrationStrategy,
         NoOptions,
         PeriodicImaging,
+        PlacementFilter,
         Probe,
         ProbeContext,
         ProbeOffer,
@@ -150,6 +155,7 @@ if TYPE_CHECKING:
         ProcessSpec,
         Readiness,
         Reading,
+        ReschedulePolicy,
         ResourceDescription,
         RestartPolicy,
         StandbyPolicy,
@@ -161,17 +167,17 @@ __all__ = [
     "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
-    "EventRow", "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher",
-    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
+    "EventRow", "Execute", "FilterOffer", "FloatArray", "Fraction", "GraphDepartureLauncher",
+    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLabelling", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
     "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
     "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
-    "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
-    "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
-    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
-    "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError",
-    "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
+    "PlacementFilter", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
+    "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
+    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
+    "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
+    "RosrmError", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
     "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
     "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
@@ -185,11 +191,11 @@ _NAMES: Final = {
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
     "extensions.contracts": (
         "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy "
-        "CheckpointView FloatArray GraphDepartureLauncher HostChecking HostView ImageLauncher "
-        "Imaging Launch Launcher LauncherContext LauncherOffer MemoryPacing MemoryView "
-        "MigrationOffer MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext "
-        "ProbeOffer ProcessMeasuring ProcessTreeLauncher ProcessView Scores ScoringOffer "
-        "ScoringPolicy Sessions SpecChecking"
+        "CheckpointView FilterOffer FloatArray GraphDepartureLauncher HostChecking HostLabelling "
+        "HostView ImageLauncher Imaging Launch Launcher LauncherContext LauncherOffer "
+        "MemoryPacing MemoryView MigrationOffer MigrationStrategy NoOptions PeriodicImaging "
+        "PlacementFilter Probe ProbeContext ProbeOffer ProcessMeasuring ProcessTreeLauncher "
+        "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
     "extensions.options": "options_of",
@@ -204,8 +210,8 @@ _NAMES: Final = {
     "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
-        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ResourceDescription "
-        "RestartPolicy StandbyPolicy StopPolicy"
+        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
+        "ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {

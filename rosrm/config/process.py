@@ -29,6 +29,7 @@ from rosrm.model.values import (
     Readiness,
     ReadinessKind,
     Realtime,
+    ReschedulePolicy,
     RestartCondition,
     RestartPolicy,
     StandbyPolicy,
@@ -57,6 +58,14 @@ class RestartInFile:
     factor: Annotated[float, Quantity(low=1.0, high=100.0)] = _RESTART.factor
     attempts: Count = _RESTART.attempts
     window: PositiveSeconds = _RESTART.window
+
+
+@dataclass(frozen=True, slots=True)
+class RescheduleInFile:
+    """Starts on other hosts after the restart policy has given up."""
+
+    attempts: Count = 0
+    delay: Seconds = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +207,9 @@ class ProcessInFile:
     cpus: tuple[_CpuNumber, ...] = ()
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
+    reschedule: RescheduleInFile = field(default_factory=RescheduleInFile)
+    protect: bool = False
+    time_limit: Seconds = 0.0
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -225,6 +237,7 @@ class ProcessInFile:
             neighbours=tuple(self._neighbour_rules()),
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
+            reschedule=_same(ReschedulePolicy, self.reschedule),
             given=(),
         )
 
@@ -290,6 +303,14 @@ def _about_restarts(spec: ProcessSpec) -> Iterator[Complaint]:
     if spec.restart.max_delay < spec.restart.delay:
         text = "restart.max_delay must not be less than restart.delay"
         yield Complaint(("restart", "max_delay"), text)
+
+
+def _about_ends(spec: ProcessSpec) -> Iterator[Complaint]:
+    if spec.time_limit and spec.kind != "job":
+        yield Complaint(("time_limit",), "time_limit: only a job has one; a service runs on")
+    if spec.reschedule.delay and not spec.reschedule.attempts:
+        text = "reschedule.delay requires `attempts`, the number of other hosts to try"
+        yield Complaint(("reschedule", "delay"), text)
 
 
 def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -413,6 +434,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
     (_about_surroundings, ("working_directory", "environment")),
     (_about_restarts, ("restart",)),
+    (_about_ends, ("time_limit", "kind", "reschedule")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),

@@ -69,6 +69,17 @@ class ProcessMeasuring(Protocol):
         """
 
 
+class HostLabelling(Protocol):
+    """A probe that also labels its host."""
+
+    @property
+    def labels(self) -> Mapping[str, str]:
+        """Return labels of the host, as `{"gpu.model": "A100"}`; read once, after `create`.
+
+        A label of the same key in host.yaml replaces that of the probe.
+        """
+
+
 class Sessions(Protocol):
     """The sessions (process trees) that the slave runs, for probes whose scope is the slice."""
 
@@ -141,7 +152,11 @@ class HostView:
         limit: (N, R) upper limits, fractions; 1 where a host has none.
         capacity: (N, R) base units at usage 1.0; NaN as in `usage`.
         processes: (N,) number of processes on the host or reserved for it.
-        labels: (N,) mappings, the labels of each host.
+        labels: (N,) read-only mappings, the labels of each host, those of its probes included.
+        tenants: (N,) read-only mappings, for each host: name to spec of each process with an
+            instance there, assigned ones included. A spec is as at the start of the instance.
+
+    Arrays are read-only, too. `labels` and `tenants` are made when they are read, host by host.
     """
 
     names: Sequence[str]
@@ -151,6 +166,11 @@ class HostView:
     capacity: FloatArray
     processes: npt.NDArray[np.int64]
     labels: Sequence[Mapping[str, str]] = ()
+    tenants: Sequence[Mapping[str, ProcessSpec]] = ()
+
+    def labelled(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (N,), of the hosts with a label of this value, as a new array."""
+        return np.array([labels.get(key) == value for labels in self.labels], np.bool_)
 
     def column(self, resource: str, missing: float = 0.0) -> FloatArray:
         """Return the usage of one resource, (N,), as a new array without NaN.
@@ -170,13 +190,14 @@ class HostView:
 
 @dataclass(frozen=True)
 class ProcessView:
-    """The process to place, for a scoring policy.
+    """The process to place, for a scoring policy or a filter.
 
     Attributes:
-        spec: as submitted. A policy gets the standard fields (program, `namespace`, `kind`,
+        spec: as submitted. A plugin gets the standard fields (program, `namespace`, `kind`,
             `priority`, `needs` and labels) and those that its offer declares in `reads`; any other
             field raises `UndeclaredField`.
-        need: (N, R) demand of the process on each host, fractions of that host's capacity.
+        need: (N, R) demand of the process on each host, fractions of that host's capacity; inf
+            where a host lacks a needed resource, never NaN.
     """
 
     spec: ProcessSpec
@@ -224,6 +245,40 @@ class ScoringOffer:
     options: type[Any] = NoOptions
     summary: str = ""
     reads: tuple[str, ...] = ()
+
+
+# --- filters (master, pure) -------------------------------------------------------------------
+
+
+class PlacementFilter(Protocol):
+    """A placement rule of a plugin: which hosts may take a process. Pure, as a scoring policy."""
+
+    def mask(self, hosts: HostView, process: ProcessView) -> BoolArray:
+        """Return (N,) booleans, True: the host may take the process.
+
+        No row may depend on another row. The core calls this once for all hosts, and again for
+        single rows that have changed.
+        """
+
+    def reason(self, hosts: HostView, process: ProcessView, row: int) -> str:
+        """Return why the host of a row fails, as a predicate: "it has no label floor"."""
+
+
+@dataclass(frozen=True)
+class FilterOffer:
+    """Registers a placement filter; the fields are as in `ScoringOffer`.
+
+    Attributes:
+        permanent: True: a host that fails without any process on it fails until it registers again.
+            A process that every host fails for good is set aside, and does not block the queue.
+    """
+
+    name: str
+    create: Callable[[Any], PlacementFilter]
+    options: type[Any] = NoOptions
+    summary: str = ""
+    reads: tuple[str, ...] = ()
+    permanent: bool = False
 
 
 # --- migration (master, pure; executors on the slaves) ----------------------------------------

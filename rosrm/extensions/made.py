@@ -24,6 +24,7 @@ from rosrm.wording import get_close_matches
 _METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
     "probe": ("resources", "read", "close"),
     "scoring": ("score",),
+    "filter": ("mask", "reason"),
     "migration": ("propose",),
     "checkpoint": ("choose",),
     "launcher": ("prepare",),
@@ -35,13 +36,18 @@ _FAILED_PERIOD: Final = 10.0
 
 @dataclass(frozen=True)
 class MadeProbe:
-    """A probe on this host; period and deadline, in seconds, are those of its offer."""
+    """A probe on this host; period and deadline, in seconds, are those of its offer.
+
+    Attributes:
+        labels: labels that the probe gives to the host.
+    """
 
     name: str
     probe: Probe
     resources: tuple[ResourceDescription, ...]
     period: float
     deadline: float
+    labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,11 @@ class Probes:
 
     made: tuple[MadeProbe, ...]
     absent: Mapping[str, str]
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Return the labels of the host from all its probes."""
+        return {key: value for one in self.made for key, value in one.labels.items()}
 
 
 class FailedProbe:
@@ -168,6 +179,23 @@ def fault_of_resources(
     if len(taken) + len(resources) > RESOURCE_SLOTS:
         return f"exceeds the {RESOURCE_SLOTS} resources that a host may have"
     return ""
+
+
+def fault_of_labels(labels: object, before: Sequence[MadeProbe]) -> str:
+    """Return why a host cannot have these labels of a probe, as a predicate; "": it can."""
+    if not isinstance(labels, Mapping):
+        return f'has the labels {labels!r:.100}; a mapping is required, as {{"key": "value"}}'
+    for key, value in labels.items():
+        if not (key and _is_text(key) and _is_text(value)):
+            return f"has the label {key!r:.100}: {value!r:.100}; printable text is required"
+        others = [one.name for one in before if one.labels.get(key, value) != value]
+        if others:
+            return f"gives the label {key!r} another value than {others[0]!r}"
+    return ""
+
+
+def _is_text(word: object) -> bool:
+    return isinstance(word, str) and word.isprintable()
 
 
 def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:

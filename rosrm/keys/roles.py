@@ -77,8 +77,8 @@ class Grant:
     """The role of a principal.
 
     Attributes:
-        generation: number of the principal's key, from 1; 0: a key without a grant, derived by a
-            program that can read the cluster's secret.
+        generation: number that distinguishes the keys of the principal, from 1; 0: a key without a
+            grant, derived by a program that can read the cluster's secret.
     """
 
     principal: Principal
@@ -109,6 +109,8 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "checkpoint": _SUBMITTERS,
     "restore": _SUBMITTERS,
     "prune": _OPERATORS,
+    "rebalance": _OPERATORS,
+    "reload": _OPERATORS,
     "set_host_state": _OPERATORS,
     "register_host": _HOSTS,
     "leave": _HOSTS,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 from rosrm.model.values import EMPTY, Assignment, InstanceId, RestartPolicy
 
@@ -56,6 +56,11 @@ class ReportInstances:
 
 
 @dataclass(frozen=True, slots=True)
+class ReloadSettings:
+    """Read the settings of the host from its file again; the answer says what has changed."""
+
+
+@dataclass(frozen=True, slots=True)
 class RunExecutor:
     """Run an executor of a plugin.
 
@@ -98,9 +103,14 @@ InstanceOrder = (
     | SetRestartPolicy
     | ReportInstances
 )
-Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica
+Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica | ReloadSettings
+
+#: Seconds that the check of a settings file may take.
+CHECK_TIMEOUT: Final = 20.0
 
 
 def seconds_of(order: Order) -> float:
     """Return the seconds for which a slave may execute an order before it answers."""
+    if isinstance(order, ReloadSettings):
+        return CHECK_TIMEOUT
     return order.timeout if isinstance(order, RunExecutor) else 0.0

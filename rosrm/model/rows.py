@@ -9,7 +9,7 @@ from typing import Any, Literal
 from rosrm.model.values import EMPTY, HostDescription
 
 #: Kinds of offers; "plugin": a plugin that failed before its offers were known.
-PluginKind = Literal["probe", "scoring", "migration", "checkpoint", "launcher", "plugin"]
+PluginKind = Literal["probe", "scoring", "filter", "migration", "checkpoint", "launcher", "plugin"]
 PluginState = Literal["selected", "available", "absent", "broken", "failing"]
 
 

@@ -64,6 +64,20 @@ class RestartPolicy:
 
 
 @dataclass(frozen=True, slots=True)
+class ReschedulePolicy:
+    """Starts of a failed process on other hosts, once its restart policy has given up.
+
+    Attributes:
+        attempts: highest number of other hosts; 0: the process has failed. A process that ran for
+            `restart.window` counts from zero again.
+        delay: seconds before each attempt.
+    """
+
+    attempts: int = 0
+    delay: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Readiness:
     """Condition under which an instance counts as ready.
 
@@ -249,6 +263,9 @@ class ProcessSpec:
         neighbours: rules on its hosts, relative to other processes.
         cpus: numbers of the CPUs that it may use; (): all.
         nice: its niceness, -20..19.
+        protect: True: it is neither moved nor stopped to make room for others.
+        time_limit: seconds from the first start of a job on a host until the job has failed, with
+            restarts and moves; its return to the queue begins them again. 0: no limit.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -284,6 +301,9 @@ class ProcessSpec:
     cpus: tuple[int, ...] = ()
     realtime: Realtime = Realtime()
     nice: int = 0
+    reschedule: ReschedulePolicy = ReschedulePolicy()
+    protect: bool = False
+    time_limit: float = 0.0
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

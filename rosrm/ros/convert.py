@@ -258,6 +258,8 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "host_loss.delay": message.host_loss.delay,
         "isolation.after": message.isolation.after,
         "health.timeout": message.health.timeout,
+        "reschedule.delay": message.reschedule.delay,
+        "time_limit": message.time_limit,
     }
     for name, seconds in times.items():
         if not 0.0 <= seconds <= LONGEST:

@@ -14,12 +14,14 @@ from rosrm.errors import NoMaster, Refused
 from rosrm.keys.finding import user_security
 from rosrm.keys.roles import SecurityMode
 from rosrm.keys.security import Member
+from rosrm.model.orders import CHECK_TIMEOUT
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import Listing, LogPart
 from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.control import ControlClient, check_answer
+from rosrm.ros.deferred_signals import signals_deferred
 from rosrm.ros.introductions import introduction_of, introduction_request
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
 _LOOK: Final = 0.005
 #: Least seconds that a discovered master has for a request.
 _REQUEST: Final = 10.0
+#: Seconds for a reload, in which master and slaves check their files one after the other.
+_RELOAD: Final = 2 * CHECK_TIMEOUT + _REQUEST
 #: Seconds after which a request without an answer is sent again.
 _AGAIN: Final = 2.0
 #: The same for a handshake, which costs the master nothing.
@@ -43,12 +47,18 @@ _UNKNOWN_EPOCH: Final = 0
 _MASTER: Final = "the master"
 
 
+def _spin(participant: Participant, timeout: float) -> None:
+    """Handle incoming messages for at most `timeout` seconds, and then the signals that arrived."""
+    with signals_deferred():
+        participant.spin(timeout)
+
+
 def wait_for_service(participant: Participant, client: Any, deadline: float) -> bool:
     """Return True if a service is discovered before `deadline` (monotonic seconds)."""
     while not client.service_is_ready():
         if time.monotonic() >= deadline:
             return False
-        participant.spin(_LOOK)
+        _spin(participant, _LOOK)
     return True
 
 
@@ -58,7 +68,7 @@ def wait_until(participant: Participant, done: Callable[[], bool], deadline: flo
         left = deadline - time.monotonic()
         if left <= 0.0:
             return False
-        participant.spin(min(left, 0.1))
+        _spin(participant, min(left, 0.1))
     return True
 
 
@@ -131,7 +141,8 @@ def _ask_until_answered(
         if now >= deadline:
             return answers
         answers.sent += 1
-        client.call_async(request).add_done_callback(participant.counted(answers.take))
+        with signals_deferred():
+            client.call_async(request).add_done_callback(participant.counted(answers.take))
         wait_until(participant, lambda: bool(answers.first), min(deadline, now + again))
     return answers
 
@@ -230,7 +241,7 @@ class MasterClient:
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""
-        self._participant.spin(timeout)
+        _spin(self._participant, timeout)
         self._control.expire(time.monotonic())
 
     def cancel(self, processes: Sequence[str]) -> str:
@@ -260,6 +271,14 @@ class MasterClient:
     def prune(self, processes: Sequence[str] = (), hosts: Sequence[str] = ()) -> str:
         """Remove ended processes and departed hosts from the listings; without names: all."""
         return self._ask(srv.Prune, names.PRUNE, processes=list(processes), hosts=list(hosts))
+
+    def rebalance(self, *, plan_only: bool = False) -> str:
+        """Begin one round of moves that even out the load of the hosts, or return its plan."""
+        return self._ask(srv.Rebalance, names.REBALANCE, plan_only=plan_only)
+
+    def reload(self) -> str:
+        """Let master and slaves read their files again; return a line for each."""
+        return self._ask(srv.Reload, names.RELOAD, patience=_RELOAD)
 
     # --- listings and logs ---------------------------------------------------------------
 
@@ -329,13 +348,16 @@ class MasterClient:
             self._master, self._last_contact = hello, time.monotonic()
         return self._control.envelope(self._master.beat, self._master.epoch)
 
-    def _ask(self, kind: Any, name: str, **fields: Any) -> str:
-        """Send a request that acts, and return the master's message."""
+    def _ask(self, kind: Any, name: str, *, patience: float = 0.0, **fields: Any) -> str:
+        """Send a request that acts, and return the master's message.
+
+        `patience`: seconds for the answer, if more than for other requests.
+        """
         request = kind.Request(**fields)
         for is_repeated in (False, True):
             request.envelope = self._envelope()
             try:
-                return str(self._call(kind, name, request).answer.message)
+                return str(self._call(kind, name, request, patience).answer.message)
             except Refused as refusal:
                 if is_repeated or refusal.code != "stale":
                     raise
@@ -406,11 +428,11 @@ class MasterClient:
         known.client.peer, known.until = slave, until
         return known
 
-    def _call(self, kind: Any, name: str, request: Any) -> Any:
+    def _call(self, kind: Any, name: str, request: Any, patience: float = 0.0) -> Any:
         """Send a request to the master until it is answered."""
         client = self._client(kind, name)
         try:
-            return self._answered(client, kind, request, _MASTER)
+            return self._answered(client, kind, request, _MASTER, patience)
         except Refused as refusal:
             if refusal.code != "stale" or hasattr(request, "envelope"):
                 raise
@@ -418,14 +440,16 @@ class MasterClient:
             # be repeated.
             return self._answered(client, kind, request, _MASTER)
 
-    def _answered(self, client: SealedClient, kind: Any, request: Any, who: str) -> Any:
+    def _answered(
+        self, client: SealedClient, kind: Any, request: Any, who: str, patience: float = 0.0
+    ) -> Any:
         """Send a request until an answer comes; the receiver repeats a lost answer.
 
         Every request may be repeated: it only reads, or carries an id by which it is recognised.
         One that exceeds its bounds is not sent: `Refused` names the field.
         """
         check_bounds(request)
-        deadline = time.monotonic() + self._timeout
+        deadline = time.monotonic() + max(self._timeout, patience)
         answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
         response = answers.answer
         acts = hasattr(request, "envelope")  # read-only requests have none

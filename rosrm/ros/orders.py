@@ -13,6 +13,7 @@ from rosrm.model.orders import (
     DropReplica,
     FenceInstance,
     Order,
+    ReloadSettings,
     ReplicateSnapshot,
     ReportInstances,
     RestartInstance,
@@ -36,6 +37,7 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
     FenceInstance: _Request.FENCE,
     ReplicateSnapshot: _Request.REPLICATE,
     DropReplica: _Request.DROP_REPLICA,
+    ReloadSettings: _Request.RELOAD,
 }
 #: Orders by an instance alone.
 _OF_INSTANCE: Final[Mapping[int, Callable[[InstanceId], Order]]] = {
@@ -51,7 +53,7 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
             request.executor, request.timeout = executor, float(timeout)
             request.arguments = json.dumps(dict(arguments))
             return request
-        case ReportInstances():
+        case ReportInstances() | ReloadSettings():
             return request
         case StartInstance(assignment):
             request.assignment = convert.assignment_to_msg(assignment)
@@ -77,6 +79,8 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
             return RunExecutor(request.executor, arguments, request.timeout)
         case _Request.REPORT:
             return ReportInstances()
+        case _Request.RELOAD:
+            return ReloadSettings()
         case _Request.SET_RESTART:
             return SetRestartPolicy(instance, convert.restart_from_msg(request.restart))
         case _Request.REPLICATE:

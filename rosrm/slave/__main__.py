@@ -35,7 +35,7 @@ def serve(handover: Handover) -> int:
             fault, oom_score.PROTECTED,
         )  # fmt: skip
     cgroups.delegate()  # first, because the supervisor inherits the group
-    return SlaveRuntime(config, registry, wait_for_security(config)).run()
+    return SlaveRuntime(config, registry, wait_for_security(config), handover.source).run()
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from rosrm.config.reloading import OF_HOST, reloaded
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
 from rosrm.core.slave.events import Event, Registered, TimePassed
@@ -45,7 +46,8 @@ from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
-from rosrm.runtime.bootstrap import handle_stop_signals
+from rosrm.runtime.bootstrap import handle_signals
+from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
@@ -60,7 +62,7 @@ from rosrm.slave.shutdown import STOP_ALL, Shutdown
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.usage import UsageWatch
 from rosrm.version import __version__
-from rosrm.wording import by_reason, counted
+from rosrm.wording import by_reason, counted, reload_summary
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -85,14 +87,19 @@ class SlaveRuntime:
 
     Args:
         security: of the slave, with its key.
+        source: origin of the settings.
 
     Raises:
         Refused: another slave runs on this state directory.
         SupervisorError: the supervisor cannot be started or reached.
     """
 
-    def __init__(self, config: HostConfig, registry: Registry, security: Member) -> None:
+    def __init__(
+        self, config: HostConfig, registry: Registry, security: Member, source: SettingsSource
+    ) -> None:
         self._config = config
+        self._settings_check = SettingsCheck(source)
+        self._hung_up = False
         self._security = security
         self._incarnation = _random_number()
         self._stopping = ""
@@ -121,12 +128,13 @@ class SlaveRuntime:
             launchers = Launchers.of(offered, registry.capabilities_of())
             sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
-            absent = self._open_probes(registry, sessions, opened)
+            self._absent = self._open_probes(registry, sessions, opened)
             first = self._sampler.first().reports
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
-            handle_stop_signals(self._stop)
+            handle_signals(self._stop, self._hang_up)
+            opened.callback(self._settings_check.close)
             self._open_supervisor(opened)
-            graph = self._join_ros(absent, opened)
+            graph = self._join_ros(opened)
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._note_probes(first)
             self._note_broken(offered.broken)
@@ -154,6 +162,7 @@ class SlaveRuntime:
         probes = registry.probes(config.probes, context)
         self._sampler = Sampler(probes.made)
         opened.callback(self._sampler.close)
+        self._labels = {**probes.labels, **config.labels}
         self._limit = self._limits()
         return probes.absent
 
@@ -168,7 +177,7 @@ class SlaveRuntime:
             missing = by_reason((name, why) for name, why in self._supervisor.unenforced.items())
             _log.info("limits and scheduling that are not enforced here: %s", missing)
 
-    def _join_ros(self, absent: Mapping[str, str], opened: contextlib.ExitStack) -> GraphWatch:
+    def _join_ros(self, opened: contextlib.ExitStack) -> GraphWatch:
         """Create participant and endpoint; return the view of the ROS graph."""
         config = self._config
         self._participant = Participant(
@@ -177,7 +186,7 @@ class SlaveRuntime:
         opened.callback(self._participant.close)
         self._endpoints = SealedEndpoints(self._participant, self._security)
         self._endpoint = SlaveEndpoint(
-            self._endpoints, self._description(absent), self._state, take=self._take,
+            self._endpoints, self._description(), self._state, take=self._take,
             snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
             seen=JournalWatermark(config.state / "journal_seen"),
         )  # fmt: skip
@@ -202,7 +211,7 @@ class SlaveRuntime:
         )  # fmt: skip
         duties = Duties(
             self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
-            self._execute, self._read_log,
+            self._execute, self._read_log, self._reload,
         )  # fmt: skip
         SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
@@ -217,13 +226,13 @@ class SlaveRuntime:
             limit[slot] = self._config.limits.get(resource.name, 1.0)
         return limit
 
-    def _description(self, absent: Mapping[str, str]) -> HostDescription:
+    def _description(self) -> HostDescription:
         config = self._config
         return HostDescription(
             name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
-            pid=os.getpid(), software_version=__version__, labels=config.labels,
+            pid=os.getpid(), software_version=__version__, labels=self._labels,
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
-            period=config.period, executors=self._executors.names, absent=absent,
+            period=config.period, executors=self._executors.names, absent=self._absent,
             unenforced=self._supervisor.unenforced, cpus=tuple(sorted(os.sched_getaffinity(0))),
         )  # fmt: skip
 
@@ -249,7 +258,7 @@ class SlaveRuntime:
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
-        """Serve until SIGINT, SIGTERM or SIGHUP; returns the exit code."""
+        """Serve until a signal to stop; returns the exit code."""
         self._supervisor.listen()
         with self._closing:
             self._serve(lambda: not self._stopping and not self._endpoint.failure)
@@ -327,8 +336,40 @@ class SlaveRuntime:
             self._from_threads.append(lambda: self._ending.log_progress())  # noqa: PLW0108 - as above
         self._stopping = self._stopping or signal.Signals(number).name
 
+    def _hang_up(self, _number: int, _frame: Any) -> None:
+        self._hung_up = True
+
+    # --- reload --------------------------------------------------------------------------
+
+    def _reload(self, done: Checked) -> None:
+        """Read the file of this host again; call `done` with what has changed, or the fault."""
+
+        def checked(text: str, fault: str) -> None:
+            done("" if fault else self._apply(HostConfig.from_json(text)), fault)
+
+        self._settings_check.start(checked)
+
+    def _apply(self, new: HostConfig) -> str:
+        """Apply the settings that need no restart, and return a summary."""
+        read = reloaded(self._config, new, OF_HOST)
+        self._config = read.config
+        self._limit = self._limits()
+        description = self._description()
+        if description != self._endpoint.description:
+            self._endpoint.describe_again(description)
+        return reload_summary(read.changed, read.kept)
+
+    def _review_reload(self) -> None:
+        if self._hung_up:
+            self._hung_up = False
+            self._reload(
+                lambda summary, fault: _log.info("SIGHUP: %s", summary or f"not reloaded: {fault}")
+            )
+        self._settings_check.poll()
+
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
+        self._review_reload()
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)

@@ -17,6 +17,7 @@ itself absent (`SkipPlugin`), its contract is skipped with that reason.
 
 from rosrm.extensions.registry import Registry
 from rosrm.testing.checkpoints import CheckpointContract
+from rosrm.testing.filters import FilterContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
 from rosrm.testing.launchers import LauncherContract
 from rosrm.testing.migrations import MigrationContract, before_commit, with_options
@@ -35,6 +36,7 @@ __all__ = [
     "FakeClock",
     "FakeProbe",
     "FakeSessions",
+    "FilterContract",
     "JournalContract",
     "LauncherContract",
     "MemoryJournal",

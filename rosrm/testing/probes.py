@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from rosrm.extensions.contracts import Probe, ProbeContext, ProbeOffer
-from rosrm.extensions.made import MadeProbe, unmeasured
+from rosrm.extensions.contracts import HostLabelling, Probe, ProbeContext, ProbeOffer
+from rosrm.extensions.made import MadeProbe, fault_of_labels, unmeasured
+from rosrm.extensions.plugin_calls import implements
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.values import EMPTY, Reading, ResourceDescription
 from rosrm.slave.probe_reads import read_processes, read_values
@@ -149,6 +150,16 @@ class ProbeContract:
         assert set(names) <= set(self.offer.resources), (
             f"ProbeOffer.resources is {self.offer.resources}, and it reads {names}"
         )
+
+    def test_labels_are_text(self) -> None:
+        """Labels, if the probe has any, map printable text to printable text, and do not change."""
+        probe: object = self.make()
+        if not implements(probe, HostLabelling):
+            return
+        labels = probe.labels
+        fault = fault_of_labels(labels, ())
+        assert not fault, f"the probe {fault}"
+        assert probe.labels == labels, f"labels were {labels}, and are {probe.labels}"
 
     def test_reads_each_resource_once(self) -> None:
         """Every read returns one valid reading of each resource, and no other reading."""

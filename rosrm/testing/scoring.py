@@ -1,4 +1,4 @@
-"""Hosts and processes for tests of scoring policies, and their contract with the master."""
+"""Hosts and processes for tests of policies and filters; the contract of scoring policies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy.typing as npt
 from rosrm.core.master.scheduling.host_views import checked_scores
 from rosrm.extensions.contracts import (
     BoolArray,
-    FloatArray,
     HostView,
     ProcessView,
     Scores,
@@ -34,6 +33,7 @@ def host_view(
     capacity: float = 1.0,
     processes: Sequence[int] = (),
     labels: Sequence[Mapping[str, str]] = (),
+    tenants: Sequence[Sequence[str]] = (),
 ) -> HostView:
     """Return hosts h0, h1, ... for a scoring policy.
 
@@ -43,6 +43,7 @@ def host_view(
         capacity: of every resource on every host, base units.
         processes: number of processes by host; (): 0 on every host.
         labels: by host; (): no labels.
+        tenants: names of the processes by host; (): none.
     """
     # The core stores one row for each resource, and a policy gets the transpose, as here.
     table = np.array(list(usage.values()), np.float64).reshape(len(usage), -1)
@@ -56,6 +57,7 @@ def host_view(
         capacity=np.where(missing, np.nan, capacity).T,
         processes=np.array(processes or [0] * hosts, np.int64),
         labels=labels or [EMPTY] * hosts,
+        tenants=[{name: ProcessSpec(name) for name in names} for names in tenants or [()] * hosts],
     )
 
 
@@ -79,7 +81,8 @@ def process_view(
     for name, amount in needs.items():
         if name in hosts.resources:
             row = hosts.resources.index(name)
-            need[row] = amount / hosts.capacity[:, row]
+            part = amount / hosts.capacity[:, row]
+            need[row] = np.where(np.isnan(part), np.inf if amount > 0 else 0.0, part)
     return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T)
 
 
@@ -95,6 +98,30 @@ _SPECS: Final[Sequence[Mapping[str, Any]]] = (
     {"name": "9.lives-", "command": (), "module": "pkg.main", "needs": {"gpu": 1.0}},
     {"command": (), "package": "demo", "executable": "talker"},
 )  # fmt: skip
+
+
+def placements(reads: Sequence[str]) -> Sequence[tuple[HostView, ProcessView]]:
+    """Return hosts and processes of many kinds, the same in every run.
+
+    `reads`: fields of the spec that the offer declares; the specs have no others.
+    """
+    chance = np.random.default_rng(7)
+    cases = []
+    for count in (1, 2, 7, 100, 1000):
+        usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
+        usage["gpu"][chance.random(count) < 0.5] = np.nan
+        hosts = host_view(
+            {name: list(column) for name, column in usage.items()},
+            limit=0.9,
+            processes=[n % 3 for n in range(count)],
+            labels=[{"rack": str(n % 3)} if n % 4 else {} for n in range(count)],
+            tenants=[[f"q{n}_{k}" for k in range(n % 3)] for n in range(count)],
+        )
+        cases += [(hosts, process_view(hosts, reads=tuple(reads), **spec)) for spec in _SPECS]
+    for resource in ("memory", "something"):
+        bare = host_view({resource: [0.2, 0.4]})
+        cases.append((bare, process_view(bare, reads=tuple(reads))))
+    return cases
 
 
 class ScoringContract:
@@ -124,25 +151,8 @@ class ScoringContract:
         return call("score", CALL_LIMIT, ask)
 
     def cases(self) -> Sequence[tuple[HostView, ProcessView]]:
-        """Return hosts and processes of many kinds, the same in every run."""
-        chance = np.random.default_rng(7)
-        cases = []
-        for count in (1, 2, 7, 100, 1000):
-            usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
-            usage["gpu"][chance.random(count) < 0.5] = np.nan
-            hosts = host_view({name: list(column) for name, column in usage.items()}, limit=0.9)
-            labels = [{"rack": str(n % 3)} if n % 4 else {} for n in range(count)]
-            hosts = replace(hosts, labels=labels)
-            cases += [(hosts, self._process(hosts, **spec)) for spec in _SPECS]
-        lean = host_view({"memory": [0.2, 0.4]})
-        cases.append((lean, self._process(lean)))
-        bare = host_view({"something": [0.2, 0.4]})
-        cases.append((bare, self._process(bare)))
-        return cases
-
-    def _process(self, hosts: HostView, **spec: Any) -> ProcessView:
-        """Return a process whose spec has only the declared fields, as passed by the master."""
-        return process_view(hosts, reads=tuple(self.offer.reads), **spec)
+        """Return hosts and processes of many kinds, as passed by the master."""
+        return placements(self.offer.reads)
 
     def test_scores_every_host(self) -> None:
         """The policy returns one number for each host, finite without a veto and never NaN."""
@@ -197,7 +207,8 @@ class ScoringContract:
     def test_no_hosts(self) -> None:
         """The policy accepts an empty list of hosts."""
         hosts = host_view({"memory": [], "cpu": []})
-        self._scores(self.make(), hosts, self._process(hosts))
+        process = process_view(hosts, reads=tuple(self.offer.reads))
+        self._scores(self.make(), hosts, process)
 
 
 def _same(array: npt.ArrayLike, other: npt.ArrayLike) -> bool:
@@ -212,17 +223,8 @@ def vetoes(scores: Scores, count: int) -> BoolArray:
 def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, ProcessView]:
     """Return the arguments of `score` for one host alone."""
     one = slice(row, row + 1)
-
-    def part(array: FloatArray) -> FloatArray:
-        return array[one]
-
-    alone = HostView(
-        hosts.names[one],
-        hosts.resources,
-        part(hosts.usage),
-        part(hosts.limit),
-        part(hosts.capacity),
-        hosts.processes[one],
-        hosts.labels[one],
-    )
-    return alone, replace(process, need=part(process.need))
+    parts = {
+        name: getattr(hosts, name)[one]
+        for name in ("names", "usage", "limit", "capacity", "processes", "labels", "tenants")
+    }
+    return replace(hosts, **parts), replace(process, need=process.need[one])

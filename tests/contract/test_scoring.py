@@ -78,7 +78,7 @@ def test_an_undeclared_field_fails_the_contract_with_its_name():
     """The error shows the declaration that is missing from the offer."""
     contract = ScoringContract()
     contract.offer = ScoringOffer("named", lambda options: _ByName())
-    with pytest.raises(LookupError, match=r"'name'.*ScoringOffer\(\.\.\., reads=\('name',\)\)"):
+    with pytest.raises(LookupError, match=r"'name'.*add reads=\('name',\) to the offer"):
         contract.test_scores_every_host()
 
 

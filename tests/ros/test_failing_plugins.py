@@ -213,7 +213,7 @@ def plugins(cluster) -> list:
 )
 def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, policy, said) -> None:
     """A process is placed without the failing policy, with an event; the master keeps running."""
-    cluster = make_cluster(host("h0"), scoring=ScoringChoice(policy))
+    cluster = make_cluster(host("h0"), scoring=(ScoringChoice(policy),))
     cluster.submit(job("judged", "true"))
     event = cluster.wait_for_event("plugin_failed", says=f"'{policy}'")
     assert said in event.message
@@ -461,7 +461,7 @@ def test_a_plugin_that_does_not_import_is_listed_as_broken(cluster) -> None:
 )
 def test_an_unknown_name_is_refused_at_start(make_cluster, part, said) -> None:
     """The error has the given and the allowed names; exit code 2, no traceback, no supervisor."""
-    cluster = make_cluster(started=False, scoring=ScoringChoice("wieghted"))
+    cluster = make_cluster(started=False, scoring=(ScoringChoice("wieghted"),))
     if part == "master":
         process = cluster.start_master().process
     else:

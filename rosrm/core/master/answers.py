@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rosrm.core.master import events as happened
+from rosrm.core.master import reloading
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
@@ -12,6 +13,7 @@ from rosrm.core.master.state.pending_orders import (
     ImageRemoval,
     MigrationStep,
     PeriodicCheckpoint,
+    Reload,
     Replication,
 )
 
@@ -30,5 +32,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             capabilities.note_answer(state, purpose, event, now)
         case PeriodicCheckpoint(number):
             periodic.note_answer(state, number, event, now)
+        case Reload(host):
+            reloading.note_answer(state, host, event, now)
         case ImageRemoval(number):
             images.note_answer(state, number, event, now)

@@ -16,6 +16,7 @@ from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
+from rosrm.core.master.migration.rebalancing import begin_round, plan_round
 from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.process_defaults import with_defaults
@@ -253,7 +254,8 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
 
 
 def _cancel(state: MasterState, process: Process, now: float, by: Requester) -> None:
-    process.wanted, process.left_behind = DesiredState.CANCEL, None
+    process.wanted, process.overdue = DesiredState.CANCEL, False
+    state.clear_left_behind(process)
     state.record(
         now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
         process=process.name, by=by,
@@ -319,6 +321,7 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         replication.drop_former_replicas(state, process)
         process.excluded.clear()
         process.demand = None
+        process.reschedules, process.queue_delay = 0, 0.0
         process.order = state.next_order
         state.next_order += 1
         state.enqueue(process, now)
@@ -413,3 +416,14 @@ def host_state_requested(
     reconsider_set_aside(state, now)
     details = f": {departures(state, host)}" if host.draining else ""
     state.emit(Reply(event.request, message=f"{host.name} is {done}{details}"))
+
+
+def rebalance_requested(state: MasterState, event: happened.RebalanceRequested, now: float) -> None:
+    """Begin one round of moves that even out the load of the hosts, or reply with its plan."""
+    if state.rebalancing.pending:
+        names = listed([name for name, _ in state.rebalancing.pending])
+        raise RequestRefused(f"a round is under way: {names} will move yet")
+    planned = plan_round(state, now)
+    if planned.shifts and not event.plan_only:
+        begin_round(state, planned, now)
+    state.emit(Reply(event.request, message=str(planned)))

@@ -56,6 +56,9 @@ _MISSED_BEATS: Final = 10
 _MISSED_BY_ANOTHER: Final = 3
 #: Seconds after which the slave logs that the master receives none of its messages.
 _SILENCE_LOGGED: Final = 5.0
+#: Seconds between two reports of messages without a valid key, and the highest number in one.
+_STRANGERS_EVERY: Final = 10.0
+_MOST_STRANGERS: Final = 2**32 - 1
 #: Seconds between two beats that no master exceeds.
 _LONGEST_BEAT_PERIOD: Final = 3600.0
 
@@ -80,6 +83,7 @@ class SlaveEndpoint:
         seen: newest journal records of the masters that this host knows.
 
     Attributes:
+        description: of this host.
         link: state of the connection to the master.
         failure: reason to give up; "": there is none.
         cluster: name of the last master that greeted this slave; "" before the first one.
@@ -97,7 +101,7 @@ class SlaveEndpoint:
         self._endpoints = endpoints
         self._master = endpoints.security.master
         self._state, self._take, self._snapshots = state, take, snapshots
-        self._description = description
+        self.description = description
         self._seen = seen or JournalWatermark()
         self.link = MasterLink.SEARCHING
         self.failure = ""
@@ -123,6 +127,9 @@ class SlaveEndpoint:
         self._poll_again = _FIRST_POLL_AGAIN
         self._status_sequence = 0
         self._silent_since = math.inf  # -inf: the silence is logged
+        self._strangers = 0
+        self._strangers_at = -math.inf
+        endpoints.refused = self._note_stranger
         participant = endpoints.participant
         self._control = ControlClient(participant, f"slave {description.name}")
         self._names = names.Names(participant.settings.namespace)
@@ -143,7 +150,7 @@ class SlaveEndpoint:
         readings = endpoints.participant.node.create_publisher(
             msg.SealedReading, topic, qos.READING_OUT
         )
-        channel, description = reading_channel(topic), self._description
+        channel, description = reading_channel(topic), self.description
         self._reporter = Reporter(
             lambda reading: readings.publish(seal_reading(master, channel, reading)),
             description.incarnation, description.period,
@@ -158,6 +165,11 @@ class SlaveEndpoint:
         )
         endpoints.follow(msg.MasterBeat, path(names.MASTER_BEAT), qos.BEAT_IN, self._take_beat)
 
+    def _note_stranger(self, topic: str) -> None:
+        """Count a message without a valid key for the next statuses."""
+        del topic
+        self._strangers = min(self._strangers + 1, _MOST_STRANGERS)
+
     # --- finding the master --------------------------------------------------------------
 
     def advance(self, now: float) -> None:
@@ -171,13 +183,17 @@ class SlaveEndpoint:
             silence = now - self._beat_at
             keep = "; processes keep running" if self._leaves is None else ""
             self._lose_master(f"the master has been silent for {silence:.1f} s{keep}")
+        is_due = self._strangers and now - self._strangers_at >= _STRANGERS_EVERY
+        if is_due and self.link is MasterLink.REGISTERED:
+            self._strangers_at = now
+            self.publish_statuses((), complete=False)
 
     def _greet(self, now: float) -> None:
         self.link = MasterLink.GREETING
         self._asked_at = now
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role="slave",
-            name=self._description.name,
+            name=self.description.name,
         )  # fmt: skip
         self._control.call(
             self._clients[srv.Handshake], request, now + _PATIENCE, self._take_greeting
@@ -206,7 +222,7 @@ class SlaveEndpoint:
             return
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
-            host=convert.host_to_msg(self._description),
+            host=convert.host_to_msg(self.description),
             instances=[convert.status_to_msg(status) for status in self._state.statuses()],
             snapshots=[convert.snapshot_to_msg(one) for one in self._snapshots()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
@@ -279,6 +295,12 @@ class SlaveEndpoint:
     def _patience(self) -> float:
         found = any(not status.state.ended for status in self._state.statuses())
         return _NAME_TAKEN_BY_FORMER if found and not self.host_id else _NAME_TAKEN
+
+    def describe_again(self, description: HostDescription) -> None:
+        """Register again, with another description of the same run of this slave."""
+        self.description = description
+        if self.link is not MasterLink.SEARCHING:
+            self._lose_master("the settings of this host have changed; registering again")
 
     def _lose_master(self, reason: str) -> None:
         self.link = MasterLink.SEARCHING
@@ -359,7 +381,7 @@ class SlaveEndpoint:
             self._poll.deadline = now + _PATIENCE
         request = srv.RequestProcess.Request(
             envelope=self._control.envelope(self._master_beat, self.epoch),
-            host_id=self.host_id, incarnation=self._description.incarnation,
+            host_id=self.host_id, incarnation=self.description.incarnation,
         )  # fmt: skip
         self._poll = self._control.call(
             self._clients[srv.RequestProcess], request, math.inf, self._take_work
@@ -406,8 +428,9 @@ class SlaveEndpoint:
         self._statuses.publish(
             msg.ProcessStatusBatch(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
-                incarnation=self._description.incarnation, sequence=self._status_sequence,
-                complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
+                incarnation=self.description.incarnation, sequence=self._status_sequence,
+                complete=complete, strangers=self._strangers,
+                statuses=[convert.status_to_msg(one) for one in statuses],
                 failing=[
                     msg.PluginState(
                         kind=kind, name=name, state="failing",
@@ -417,6 +440,7 @@ class SlaveEndpoint:
                 ],
             )
         )  # fmt: skip
+        self._strangers = 0
 
     def publish_usage(
         self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int],
@@ -432,7 +456,7 @@ class SlaveEndpoint:
             self._usages.publish(
                 msg.ProcessUsage(
                     protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
-                    incarnation=self._description.incarnation, numbers=numbers, cpu=cpu,
+                    incarnation=self.description.incarnation, numbers=numbers, cpu=cpu,
                     memory=memory,
                     others=[
                         msg.ResourceUsage(slot=slot, amounts=amounts)
@@ -448,7 +472,7 @@ class SlaveEndpoint:
         self._snapshot_reports.publish(
             msg.SnapshotReports(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
-                incarnation=self._description.incarnation,
+                incarnation=self.description.incarnation,
                 snapshots=[convert.snapshot_to_msg(one) for one in states],
             )
         )  # fmt: skip
@@ -481,7 +505,7 @@ class SlaveEndpoint:
     def _send_leave(self, running: Sequence[InstanceStatus], done: Callable[[], None]) -> None:
         request = srv.Leave.Request(
             envelope=self._control.envelope(self._master_beat, self.epoch),
-            host_id=self.host_id, incarnation=self._description.incarnation,
+            host_id=self.host_id, incarnation=self.description.incarnation,
             left_running=[convert.status_to_msg(status) for status in running],
         )  # fmt: skip
         self._control.call(

@@ -6,6 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
+from rosrm.core.master.assignment.neighbours import locate
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
 
@@ -50,3 +51,9 @@ def the_books_balance(state: MasterState) -> None:
             total[: len(instance.reserved)] += instance.reserved
         assert np.allclose(state.hosts.load[:, host.column], total, atol=1e-6)
         assert (state.hosts.load[:, host.column] >= 0.0).all()
+
+
+def known_places_are_current(state: MasterState) -> None:
+    """Check that the index of neighbours has the hosts on which the processes run or may run."""
+    for name, at in state.neighbours.located.items():
+        assert at == locate(state, name), name

@@ -16,7 +16,7 @@ from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.declared_fields import declared_spec
-from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.extensions.placement import PlacementPlugins, SelectedFilter
 from rosrm.model.values import HostDescription, Limits, ProcessSpec, ResourceDescription
 
 RESOURCES = ("memory", "cpu", "gpu")
@@ -32,6 +32,43 @@ resources = st.sampled_from([RESOURCES, RESOURCES[:2], RESOURCES[1:], ()]).map(
 conditions = st.sampled_from([HostCondition.UP] * 9 + [*HostCondition])
 rarely = st.sampled_from([False] * 7 + [True])
 usually = st.sampled_from([True] * 7 + [False])
+
+
+class Armed:
+    """Filter of a plugin by a label."""
+
+    def mask(self, hosts, process):
+        return ~hosts.labelled("arm", "no")
+
+    def reason(self, hosts, process, row):
+        return "it has no arm"
+
+
+class Idle:
+    """Filter of a plugin by what assignments change."""
+
+    def mask(self, hosts, process):
+        return hosts.processes < 2
+
+    def reason(self, hosts, process, row):
+        return f"it runs {hosts.processes[row]} processes"
+
+
+class Broken(Armed):
+    """Filter of a plugin that fails."""
+
+    def mask(self, hosts, process):
+        raise RuntimeError("out of order")
+
+
+filters_of_plugins = st.sampled_from(
+    [
+        (),
+        (SelectedFilter("armed", Armed(), permanent=True),),
+        (SelectedFilter("idle", Idle()), SelectedFilter("armed", Armed())),
+        (SelectedFilter("broken", Broken(), permanent=True),),
+    ]
+)
 
 
 @st.composite
@@ -67,6 +104,7 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         table.add_reservation(host, load, processes=draw(st.sampled_from([0, 0, 1])))
         if draw(rarely):
             table.prune(host)
+    table.set_claims({0: draw(st.integers(0, 2))} if draw(rarely) else {})
     return table
 
 
@@ -78,15 +116,17 @@ def demands(draw: st.DrawFn) -> Demand:
     required = draw(labels) if draw(rarely) else {}
     limits = Limits(cpu=1.0, enforce=draw(st.sampled_from(["preferred", "required"])))
     spec = ProcessSpec(
-        "p", command=("run",), required_labels=required, limits=limits,
-        cpus=draw(st.sampled_from([(), (1,), (1, 3)])),
+        "p", command=("run",), required_labels=required, priority=draw(st.integers(0, 2)),
+        limits=limits, cpus=draw(st.sampled_from([(), (1,), (1, 3)])),
     )  # fmt: skip
     read = declared_spec(spec, ())  # a filter may read only what makes rankings differ
-    return Demand(read, needs, estimated, excluded, draw(st.sampled_from([0.0, 0.05])))
+    plugins = PlacementPlugins(filters=draw(filters_of_plugins))
+    headroom = draw(st.sampled_from([0.0, 0.05]))
+    return Demand(read, needs, estimated, excluded, headroom, plugins=plugins)
 
 
 def ranked(table: HostTable, demand: Demand) -> Ranking:
-    return Ranking(table, (), demand, PluginCalls())
+    return Ranking(table, demand)
 
 
 def test_no_two_filters_have_one_name() -> None:

@@ -101,14 +101,16 @@ class Play(RuleBasedStateMachine):
 
     @initialize(
         backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2), first=ways, second=ways,
-        loss=losses,
+        loss=losses, preemption=st.sampled_from(["move", "requeue", False]), rebalance=chance,
     )  # fmt: skip
     def begin(
-        self, backfill: bool, most: int, slots: int, first: str, second: str, loss: str
-    ) -> None:
+        self, backfill: bool, most: int, slots: int, first: str, second: str, loss: str,
+        preemption: str | bool, rebalance: bool,
+    ) -> None:  # fmt: skip
         self.cluster = Cluster(
             backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
             delivery_timeout=2.0, cooldown=2.0, hysteresis=0.4, order_retry=1.0,
+            preemption=preemption, rebalance=rebalance, rebalance_after=3.0, rebalance_spread=0.2,
             strategies={
                 "relaunch": StartFirstOrStopFirst(timeout=3.0),
                 "handoff": HandOver(timeout=3.0),

@@ -13,6 +13,7 @@ from rosrm.model.orders import (
     DropReplica,
     FenceInstance,
     Order,
+    ReloadSettings,
     ReplicateSnapshot,
     ReportInstances,
     RestartInstance,
@@ -41,6 +42,7 @@ ORDERS = [
     RunExecutor("criu_dump", {"of": 7, "to": ["b"]}, 2.5),
     ReplicateSnapshot(ONE, ("b", "c"), 0.5),
     DropReplica(ONE),
+    ReloadSettings(),
 ]
 
 
@@ -54,7 +56,7 @@ def test_an_order_is_the_same_after_its_way_to_the_slave(order):
 
 
 @pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -1.0, 4e8])
-@pytest.mark.parametrize("order", [ORDERS[-3], ORDERS[-2]], ids=["timeout", "replicate_every"])
+@pytest.mark.parametrize("order", [ORDERS[-4], ORDERS[-3]], ids=["timeout", "replicate_every"])
 def test_an_order_with_a_time_that_never_ends_is_refused(order, seconds):
     request = order_to_msg(order)
     request.timeout = request.replicate_every = seconds

@@ -22,11 +22,11 @@ from rosrm.core.master.commands import (
     SendOrder,
 )
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.slave.events import AssignmentsReceived, TimePassed
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.placement import PlacementPlugins
 from rosrm.model.orders import seconds_of
 from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, Assignment
@@ -62,7 +62,7 @@ class Simulation(World[Machine]):
     Args:
         workload: to be run; its first arrival must not be after its end.
         settings: of the master's core.
-        policy: that orders the hosts, with its name.
+        placement: the policies and filters that judge hosts.
         strategies: by name.
         declared: declarations of their offers. A simulated host has all executors.
     """
@@ -71,7 +71,7 @@ class Simulation(World[Machine]):
         self,
         workload: Workload,
         settings: CoreSettings,
-        policy: NamedPolicy,
+        placement: PlacementPlugins,
         strategies: Mapping[str, MigrationStrategy],
         declared: Declared | None = None,
     ) -> None:
@@ -82,7 +82,7 @@ class Simulation(World[Machine]):
         )
         super().__init__(
             MasterState(
-                settings, policy[0], policy[1], strategies, epoch=1,
+                settings, placement, strategies, epoch=1,
                 declared=replace(declared or Declared(), executors=EMPTY),
             )
         )  # fmt: skip

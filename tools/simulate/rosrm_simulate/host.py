@@ -22,7 +22,13 @@ from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.slave import commands, events, reducer
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
-from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
+from rosrm.model.orders import (
+    DropReplica,
+    ReloadSettings,
+    ReplicateSnapshot,
+    RunExecutor,
+    SetRestartPolicy,
+)
 from rosrm.model.values import (
     EMPTY,
     MOST_USED,
@@ -265,6 +271,8 @@ class Host(ABC, Generic[ProgramT]):
                 return self.execute(sent.order_id, order)
             case ReplicateSnapshot() | DropReplica():
                 self.replicate(order)
+            case ReloadSettings():
+                refusal = "a simulated host has no file"
             case SetRestartPolicy():
                 self._settled.clear()
                 self.tell(event_of(order), now)

@@ -60,7 +60,7 @@ def demand_of(state: MasterState, process: Process) -> Demand:
         needs = state.estimate(process.spec)
         demand = Demand(
             process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
-            neighbours=neighbours, reads=state.declared.reads,
+            neighbours=neighbours, plugins=state.placement,
         )  # fmt: skip
         # Equal processes share one demand, because thousands of them may wait.
         known = process.demand = (version, state.demands.setdefault(demand.key, demand))
@@ -84,7 +84,7 @@ def demand_to_move(
     amounts, guessed = demand_amounts(state, process, measured_need(state, seen))
     return Demand(
         process.spec, amounts, guessed, excluded, headroom,
-        neighbours=neighbours_of(state, process, together=together), reads=state.declared.reads,
+        neighbours=neighbours_of(state, process, together=together), plugins=state.placement,
     )  # fmt: skip
 
 
@@ -97,7 +97,7 @@ def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, f
     """Return the demand of a process on the host of its image, where it is to be restored."""
     return Demand(
         process.spec, *demand_amounts(state, process, seen),
-        neighbours=neighbours_of(state, process), reads=state.declared.reads,
+        neighbours=neighbours_of(state, process), plugins=state.placement,
     )  # fmt: skip
 
 
@@ -166,7 +166,7 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
         alone = ranking_of(state, alone.demand if alone else replace(demand, neighbours=()))
         ranking = state.rankings[demand.key] = alone.beside(demand)
     else:
-        ranking = Ranking(state.hosts, state.policies, demand, state.plugins)
+        ranking = Ranking(state.hosts, demand)
         state.rankings[demand.key] = ranking
     return ranking
 
@@ -231,13 +231,26 @@ def _first_request_awaited(state: MasterState, now: float) -> str:
 
 
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
-    """Return the processes that wait for a snapshot and do not block those behind them."""
+    """Return the processes that wait for a time or snapshot, and do not block those behind them."""
+    delayed = _delayed(state, now)
     if not np.isin(state.hosts.condition, _AWAY).any():
-        return frozenset()
+        return delayed
     names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
     for name in names:
         _record_wait_reason(state, state.processes[name], _AWAITS_SNAPSHOT, now)
-    return frozenset(names)
+    return delayed.union(names)
+
+
+def _delayed(state: MasterState, now: float) -> frozenset[str]:
+    """Return the processes that wait for the end of their delay."""
+    for name in list(state.queue.delayed):
+        process = state.processes[name]
+        if now >= process.placed_from:
+            state.queue.delayed.remove(name)
+            continue
+        why = f"it is placed on another host after {process.queue_delay:g} s"
+        _record_wait_reason(state, process, why, now)
+    return frozenset(state.queue.delayed)
 
 
 def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
@@ -328,6 +341,7 @@ def _assign(
     state.reserve(instance, host, now, ranking)
     ranking.note_assignment()
     process.owner, process.left_behind, process.exit_code = instance.number, None, None
+    process.queue_delay = 0.0
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     state.record(
@@ -398,7 +412,9 @@ def _record_waiting(state: MasterState, process: Process, demand: Demand, now: f
     if not state.hosts.listed():
         _record_wait_reason(state, process, "no host has registered yet", now)
         return
-    reason = why_all_away(state.hosts, demand) or "no host can take it now"
+    room = state.preemption.room_made.get(process.name)
+    made = room.reason if room is not None and room.host is not None else ""
+    reason = why_all_away(state.hosts, demand) or made or "no host can take it now"
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _record_wait_reason(state, process, reason, now, {"decision": process.decision})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.model.values import EMPTY, ProcessSpec
 
 Columns = slice | IntArray
 
@@ -28,6 +30,8 @@ class Candidates:
         processes: (n,) number of processes on the host or reserved for it.
         bound: (n,) highest number of processes.
         empty: True if the arrays are those of hosts without processes.
+        tenants: (n,) name to spec of each process on the host; None: as the table has them now.
+        tenants_read: True if a plugin has read which processes run on one of the hosts.
     """
 
     table: HostTable
@@ -40,9 +44,23 @@ class Candidates:
     processes: IntArray
     bound: IntArray
     empty: bool = False
+    tenants: tuple[Mapping[str, ProcessSpec], ...] | None = None
+    tenants_read: bool = False
 
     def __len__(self) -> int:
         return len(self.processes)
+
+    def tenants_of(self, row: int) -> Mapping[str, ProcessSpec]:
+        """Return name to spec of each process with an instance on the host of a row."""
+        if self.tenants is not None:
+            return self.tenants[row]
+        if self.empty:
+            return EMPTY
+        return {spec.name: spec for spec in self.host(row).instances.values()}
+
+    def keep_tenants(self) -> None:
+        """Copy the current processes of each host, because they change before they are read."""
+        self.tenants = tuple(map(self.tenants_of, range(len(self))))
 
     def host(self, row: int) -> Host:
         """Return the host of a row."""

@@ -55,7 +55,7 @@ def refused_everywhere(table: HostTable, demand: Demand) -> bool:
     """Return True if every host that might have taken the process has refused it."""
     if not demand.excluded:
         return False
-    allowed = Demand(demand.spec, demand.amounts, demand.estimated)
+    allowed = Demand(demand.spec, demand.amounts, demand.estimated, plugins=demand.plugins)
     might = may_ever_take(table, allowed)
     return all(table.hosts[column].name in demand.excluded for column in np.flatnonzero(might))
 

@@ -1,7 +1,8 @@
 """Placement filters: the rules by which hosts may take a process, with the reasons against a host.
 
 `FILTERS` is the complete list. Each entry has a mask over many hosts, which a ranking reads, and
-the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
+the reason against one host, which `rosrm explain` prints. A new rule is one more entry. The last
+entry stands for the filters of plugins.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from rosrm.core.master.scheduling import proximity
+from rosrm.core.master.scheduling import plugin_filters, proximity
 from rosrm.core.master.scheduling.candidates import Candidates
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
 from rosrm.core.master.state.hosts import HostCondition
@@ -250,6 +251,20 @@ def _why_not_asked(_hosts: Candidates, _row: int) -> str:
     return "it has not requested work yet"
 
 
+def _is_unclaimed(hosts: Candidates) -> BoolArray | None:
+    claims, priority = hosts.table.claims, hosts.demand.spec.priority
+    if not claims:
+        return None
+    allowed = np.ones(len(hosts.table), np.bool_)
+    allowed[[column for column, claimed in claims.items() if priority < claimed]] = False
+    return allowed[hosts.columns]
+
+
+def _why_claimed(hosts: Candidates, row: int) -> str:
+    claimed = hosts.table.claims[hosts.host(row).column]
+    return f"room is being made there for a process of priority {claimed}"
+
+
 # --- filters that an assignment changes -------------------------------------------------------
 
 
@@ -306,7 +321,14 @@ FILTERS: Final = (
     Filter("limits", _is_accepting, _why_not_accepting),
     Filter("report", _has_reported, _why_not_reported),
     Filter("request", _has_asked, _why_not_asked),
+    Filter("claim", _is_unclaimed, _why_claimed),
     Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
-)
+    Filter(
+        "plugins", plugin_filters.passing_plugins, plugin_filters.why_plugin_excludes,
+        Lasts.PERMANENT, by_assignment=True,
+    ),
+)  # fmt: skip
+#: Filters that a host may fail for lack of room alone.
+OF_ROOM: Final = ("processes", "limits", "room")
 STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)
 BY_ASSIGNMENT: Final = tuple(one for one in FILTERS if one.by_assignment)

@@ -1,4 +1,4 @@
-"""Views of hosts for scoring policies, and the check of a policy's scores."""
+"""Views of hosts for scoring policies and filters, and the checks of their answers."""
 
 from __future__ import annotations
 
@@ -11,32 +11,44 @@ import numpy.typing as npt
 
 from rosrm.core.master.scheduling.candidates import Candidates
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray
-from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.declared_fields import declared_spec
 from rosrm.extensions.plugin_calls import given, required
+from rosrm.model.values import ProcessSpec
 
 T = TypeVar("T")
 
 
 def host_view(hosts: Candidates) -> HostView:
-    """Return the view of some hosts for a policy."""
-    return HostView(
+    """Return the view of some hosts for a plugin."""
+    return _View(
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
-        _read_only(hosts.processes[:]), _Labels(hosts),
+        _read_only(hosts.processes[:]), _Labels(hosts), _Tenants(hosts),
     )  # fmt: skip
 
 
-def process_view(hosts: Candidates) -> ProcessView:
-    """Return the view of a process for a policy, with its needs on each host."""
-    spec = declared_spec(hosts.demand.spec, hosts.demand.reads)
+class _View(HostView):
+    """A view whose masks of labels come from the cache of the table."""
+
+    def labelled(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (N,), of the hosts with a label of this value, as a new array."""
+        assert isinstance(self.labels, _Labels)
+        return self.labels.mask(key, value)
+
+
+def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
+    """Return the view of a process with its needs on each host.
+
+    `reads`: fields of the spec that the offer of the plugin declares.
+    """
+    spec = declared_spec(hosts.demand.spec, reads)
     return ProcessView(spec, _read_only(hosts.need.T))
 
 
 def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Make a view of a shared array read-only, because a policy might write into it."""
+    """Make a view of a shared array read-only, because a plugin might write into it."""
     view.flags.writeable = False
     return view
 
@@ -52,26 +64,47 @@ class _PerHost(Sequence[T]):
 
     def __getitem__(self, row: Any) -> Any:
         rows = range(len(self._hosts))[row]
-        if isinstance(rows, int):
-            return self._of(self._hosts.host(rows))
-        return [self._of(self._hosts.host(one)) for one in rows]
+        return self._of(rows) if isinstance(rows, int) else [self._of(one) for one in rows]
 
-    def _of(self, host: Host) -> T:
+    def _of(self, row: int) -> T:
         raise NotImplementedError
 
 
 class _Names(_PerHost[str]):
     """The name of each host."""
 
-    def _of(self, host: Host) -> str:
-        return host.name
+    def _of(self, row: int) -> str:
+        return self._hosts.host(row).name
 
 
 class _Labels(_PerHost[Mapping[str, str]]):
     """The labels of each host."""
 
-    def _of(self, host: Host) -> Mapping[str, str]:
-        return MappingProxyType(dict(host.description.labels))
+    def _of(self, row: int) -> Mapping[str, str]:
+        return MappingProxyType(dict(self._hosts.host(row).description.labels))
+
+    def mask(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (n,), of the hosts with a label of this value, as a new array."""
+        return np.array(self._hosts.table.labelled(key, value)[self._hosts.columns])
+
+
+class _Tenants(_PerHost[Mapping[str, ProcessSpec]]):
+    """The processes of each host; notes that a plugin has read them."""
+
+    def _of(self, row: int) -> Mapping[str, ProcessSpec]:
+        self._hosts.tenants_read = True
+        return MappingProxyType(self._hosts.tenants_of(row))
+
+
+def checked_mask(mask: object, count: int) -> BoolArray:
+    """Return the mask of a filter; raise PluginError if it breaks the contract."""
+    found = np.asarray(mask)
+    if found.dtype != np.bool_:
+        shown = given(mask) if found.dtype == np.object_ else f"a mask of type {found.dtype}"
+        raise PluginError(f"answered {shown}; booleans are required, True: the host may be chosen")
+    if found.shape != (count,):
+        raise PluginError(f"a mask of shape {found.shape} for {count} hosts")
+    return found
 
 
 def checked_scores(

@@ -8,6 +8,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from rosrm.extensions.declared_fields import STANDARD_FIELDS
+from rosrm.extensions.placement import NO_PLUGINS, PlacementPlugins
 from rosrm.model.values import EMPTY, ProcessSpec, Relation
 
 _MAPPINGS: Final = tuple(
@@ -49,7 +50,7 @@ class Demand:
         headroom: fraction by which a host must stay under each limit.
         near: hosts with a replica of its snapshot; each counts as one more preferred label.
         neighbours: rules on its hosts, relative to other processes.
-        reads: fields of the spec that scoring policies read beyond the standard ones.
+        plugins: the policies and filters that judge hosts.
         key: equal for demands with equal rankings; its first part, for demands that differ by
             their neighbours alone.
     """
@@ -61,7 +62,7 @@ class Demand:
     headroom: float = 0.0
     near: tuple[str, ...] = ()
     neighbours: tuple[Neighbour, ...] = ()
-    reads: tuple[str, ...] = ()
+    plugins: PlacementPlugins = field(default=NO_PLUGINS, compare=False)
     key: RankingKey = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -69,7 +70,7 @@ class Demand:
             *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
-            *(repr(getattr(self.spec, name)) for name in self.reads),
+            *(repr(getattr(self.spec, name)) for name in self.plugins.reads),
         )  # fmt: skip
         object.__setattr__(self, "key", (without_neighbours, self.neighbours))
 

@@ -7,7 +7,7 @@ values of single hosts (description, labels) are in `Host`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Final, Literal
 
@@ -24,13 +24,16 @@ from rosrm.core.master.state.host_arrays import (
     IntArray,
 )
 from rosrm.extensions.plugin_calls import Failing, Plugin
-from rosrm.model.values import HostDescription
+from rosrm.model.values import HostDescription, ProcessSpec
 
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
 _MOST_GUESSED: Final = 0.5
 #: Greatest step from one sequence of a host to the next; a greater one is an error or a forgery.
 MOST_AHEAD: Final = 1000
+
+#: Fields of a description that may change while the slave runs.
+CHANGEABLE: Final = ("labels",)
 
 
 class HostCondition(IntEnum):
@@ -64,7 +67,8 @@ class Host:
     Attributes:
         column: column of this host in the arrays of `HostTable`.
         attributed, shared: resources with this accounting on the host.
-        instances: numbers of the instances that run on the host or are assigned to it.
+        instances: number of each instance that runs on the host or is assigned to it, to the spec
+            of its process.
         over_since: resource name to the time since when the host is over this limit.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
@@ -87,7 +91,7 @@ class Host:
     pruned: bool = False
     attributed: frozenset[str] = frozenset()
     shared: frozenset[str] = frozenset()
-    instances: set[int] = field(default_factory=set)
+    instances: dict[int, ProcessSpec] = field(default_factory=dict)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
     recorded_at: dict[str, float] = field(default_factory=dict)
@@ -120,6 +124,7 @@ class HostTable(HostColumns):
 
     Attributes:
         version: counter of changes that concern many hosts.
+        claims: column of a host on which room is made for a process -> priority of the process.
         touched: columns that assignments and ends have changed since `version` grew.
     """
 
@@ -129,6 +134,7 @@ class HostTable(HostColumns):
         self.hosts: list[Host] = []
         self.version = 0
         self.touched: list[int] = []
+        self.claims: dict[int, int] = {}
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}
         self._enforcing: dict[tuple[tuple[str, ...], tuple[int, ...]], BoolArray] = {}
         self._listed: list[Host] | None = None
@@ -180,6 +186,18 @@ class HostTable(HostColumns):
         self._enforcing.clear()
         self.changed()
         return host
+
+    def redescribe(self, host: Host, description: HostDescription) -> tuple[str, ...]:
+        """Take over what a slave may change while it runs; return the names of what has changed."""
+        new = {name: getattr(description, name) for name in CHANGEABLE}
+        changed = tuple(
+            name for name, value in new.items() if value != getattr(host.description, name)
+        )
+        if changed:
+            host.description = replace(host.description, **new)
+            self._labelled.clear()
+            self.changed()
+        return changed
 
     def prune(self, host: Host) -> None:
         """Remove a host from every listing; its slave may register it later as a new host."""
@@ -239,6 +257,12 @@ class HostTable(HostColumns):
         """Note that many hosts have changed, which makes earlier rankings void."""
         self.version += 1
         self.touched.clear()
+
+    def set_claims(self, claims: dict[int, int]) -> None:
+        """Set for which priorities hosts are reserved while room is made there."""
+        if claims != self.claims:
+            self.claims = claims
+            self.changed()
 
     def ask(self, host: Host) -> None:
         """Note a request for work; placement also waits for the host's first reading."""

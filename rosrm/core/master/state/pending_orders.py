@@ -49,7 +49,14 @@ class PeriodicCheckpoint:
     number: int
 
 
-Purpose = MigrationStep | ImageRemoval | Replication | CapabilityQuery | PeriodicCheckpoint
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """The order reloads the settings of a host."""
+
+    host: str
+
+
+Purpose = MigrationStep | ImageRemoval | Replication | CapabilityQuery | PeriodicCheckpoint | Reload
 
 #: Purposes with their own series of numbers, because they depend on optional plugins: a replay
 #: without such a plugin must give all other orders the same numbers.

@@ -153,7 +153,7 @@ class Image:
 #: Fields of a process that are journaled unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
-    "principal", "owned_from", "defaulted",
+    "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
 )  # fmt: skip
 
 
@@ -187,6 +187,11 @@ class Process:
         standby_at: time before which no standby is started.
         standby_tries: number of standbys that were lost in a row.
         standby_reason: condition of its standby, for listings.
+        started_at: time at which it first started since it left the queue; inf: not yet.
+        began: unix time of `started_at`; 0: not yet.
+        overdue: True: its time limit has passed, and it is being stopped.
+        reschedules: number of hosts on which it has failed in a row.
+        queue_delay: seconds in the queue before its next placement.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
@@ -218,6 +223,11 @@ class Process:
     standby_at: float = 0.0
     standby_tries: int = 0
     standby_reason: str = ""
+    started_at: float = inf
+    began: float = 0.0
+    overdue: bool = False
+    reschedules: int = 0
+    queue_delay: float = 0.0
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     defaulted: tuple[str, ...] = ()
     demand: tuple[int, Demand] | None = None
@@ -231,3 +241,8 @@ class Process:
     def name(self) -> str:
         """Return its name."""
         return self.spec.name
+
+    @property
+    def placed_from(self) -> float:
+        """Return the time from which a queued process may be placed."""
+        return self.since + self.queue_delay

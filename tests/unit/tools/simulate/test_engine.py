@@ -275,3 +275,32 @@ def test_progress_is_told():
     simulation([host("a", 8000.0)], plans).run(told.append)
     assert [one.events for one in told] == sorted(one.events for one in told)
     assert told[-1].ended <= 400 == told[-1].processes
+
+
+# --- moves for more than limits -----------------------------------------------------------------
+
+
+def test_a_process_of_a_lower_priority_makes_room_on_virtual_time():
+    """Settings of the preemption can be tried without a cluster."""
+    hosts = [host("a", 1000.0), host("b", 400.0)]
+    plans = [
+        plan("low", 300.0, strategy="relaunch"),
+        plan("high", 700.0, at=10.0, duration=5.0, priority=5),
+    ]
+    assert run(hosts, plans, until=60.0).finished == 1
+    assert run(hosts, plans, until=60.0, preemption=False).finished == 0
+
+
+def test_the_load_is_evened_out_on_virtual_time():
+    """Here the one host gets all processes before the other one is there."""
+    plans = [plan(f"p{i}", 150.0, strategy="relaunch") for i in range(4)]
+    hosts = [host("a", 1000.0), host("b", 1000.0, joins=20.0)]
+    for automatic, used in ((False, 0.6), (True, 0.3)):
+        outcome = run(hosts, plans, until=100.0, rebalance=automatic)
+        assert outcome.curves.usage["memory"][-1, 0] == pytest.approx(used, abs=0.01)
+
+
+def test_a_job_is_stopped_after_its_time_limit_on_virtual_time():
+    """It has not finished."""
+    plans = [plan("p", duration=50.0, time_limit=10.0), plan("q", duration=5.0, time_limit=10.0)]
+    assert run([host("a")], plans, until=100.0).finished == 1

@@ -87,14 +87,30 @@ def test_variants_say_their_own_word_over_the_settings(load):
     )  # fmt: skip
     base, calm, threshold, five = made.variants
     assert (base.name, calm.name) == ("as given", "calm")
-    assert base.cluster.scoring.options == {"weights": {"cpu": 1.0}, "missing": "worst"}
+    assert base.cluster.scoring[0].options == {"weights": {"cpu": 1.0}, "missing": "worst"}
     assert (calm.cluster.migration.automatic, calm.cluster.migration.cooldown) == (False, 7.0)
     assert calm.cluster.scoring == base.cluster.scoring
-    assert (threshold.name, threshold.cluster.scoring.policy) == (
+    assert (threshold.name, threshold.cluster.scoring[0].policy) == (
         "scoring.policy threshold", "threshold",
     )  # fmt: skip
-    assert threshold.cluster.scoring.options["weights"] == {"memory": 1.0, "cpu": 0.5, "disk": 0.0}
+    assert threshold.cluster.scoring[0].options["weights"] == {
+        "memory": 1.0,
+        "cpu": 0.5,
+        "disk": 0.0,
+    }
     assert (five.name, five.hosts) == ("hosts 5", 5)
+
+
+def test_a_variant_may_chain_policies(load, registry):
+    """A chain replaces a single policy and its options, and runs."""
+    comparison = load(
+        HOST + PROCESS + "cluster: {scoring: {policy: weighted, options: {missing: ignore}}}\n",
+        "scoring: [{policy: weighted}, {policy: threshold, weight: 0.5}]",
+    )
+    _, chained = comparison.variants
+    assert chained.cluster.chain == "weighted + 0.5 x threshold"
+    assert chained.cluster.scoring[0].options["missing"] == "worst"
+    assert run(comparison.workload, chained, registry).outcome.running == 1
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,64 @@
+"""Room on hosts: the load of single instances, and trials of moves that have not begun."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration.eviction import PlannedMoves
+from rosrm.core.master.state.host_arrays import FloatArray
+from rosrm.core.master.state.process import Instance
+from rosrm.model.plan import Aim
+
+
+def share_of(state: MasterState, instance: Instance) -> FloatArray:
+    """Return the fractions, (R,), of its host that an instance uses, or that are reserved for it.
+
+    It is the part of `HostColumns.busy` that its end frees.
+    """
+    host, table = instance.host, state.hosts
+    shared = host.shared if instance.shown else frozenset[str]()
+    declared = {name: much for name, much in instance.demand.items() if name in shared}
+    share = table.fractions_of(host, {**instance.measured, **declared})
+    share[np.isinf(share)] = 0.0
+    share[: len(instance.reserved)] += instance.reserved
+    return share
+
+
+def is_leaving(state: MasterState, instance: Instance) -> bool:
+    """Return True if an instance is being stopped, or is the source of a move that goes forward."""
+    migration = state.migrations.get(instance.id.process)
+    moves = (
+        migration is not None
+        and migration.source == instance.id
+        and migration.aim is Aim.MOVE
+        and migration.undo is None
+        and not migration.stuck
+    )
+    return moves or instance.stopping
+
+
+@contextmanager
+def trial(state: MasterState) -> Iterator[Callable[[PlannedMoves], None]]:
+    """Yield a function that reserves the room of planned moves until the end of the block."""
+    table = state.hosts
+    before: dict[int, tuple[FloatArray, int]] = {}
+
+    def reserve(planned: PlannedMoves) -> None:
+        host = planned.destination
+        column = host.column
+        saved = table.cells[:, :, column].copy(), int(table.processes[column])
+        before.setdefault(column, saved)
+        for _, _, own, _ in planned.steps:
+            table.add_reservation(host, own.need[:, column], processes=1)
+
+    try:
+        yield reserve
+    finally:
+        for column, (cells, processes) in before.items():
+            table.cells[:, :, column] = cells
+            table.processes[column] = processes
+            table.touched.append(column)
