@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from types import MappingProxyType
 from typing import Any, Final, cast
 
 from rosrm.extensions.contracts import Capabilities
@@ -33,7 +34,7 @@ class UndeclaredField(LookupError):
 
 
 class DeclaredSpec:
-    """A spec that gives a plugin the standard fields and the declared ones, and no others."""
+    """A read-only spec that gives a plugin the standard fields and the declared ones, no others."""
 
     __slots__ = ("_reads", "_spec")
 
@@ -43,7 +44,8 @@ class DeclaredSpec:
 
     def __getattr__(self, name: str) -> Any:
         if name in STANDARD_FIELDS or name in self._reads:
-            return getattr(self._spec, name)
+            value = getattr(self._spec, name)
+            return MappingProxyType(value) if isinstance(value, dict) else value
         if name in SPEC_FIELDS:
             raise UndeclaredField(
                 f"the plugin reads {name!r} of the spec, which its offer does not declare: "

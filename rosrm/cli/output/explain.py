@@ -118,7 +118,11 @@ def _checkpoint(checkpoint: Mapping[str, Any]) -> Text:
 
 def _limits(limits: Mapping[str, Mapping[str, Any]]) -> Text:
     """Return limits and scheduling, and those that do not hold in this run with the reasons."""
-    values = ", ".join(f"{name} {setting['value']}" for name, setting in limits.items())
+    values = ", ".join(
+        f"{name} {one['value']}"
+        + (f" (earlier runs of its program used {one['used']})" if "used" in one else "")
+        for name, one in limits.items()
+    )
     unmet = [(name, one["reason"]) for name, one in limits.items() if not one.get("holds", True)]
     if not unmet:
         holds = " The host enforces them." if any("holds" in one for one in limits.values()) else ""

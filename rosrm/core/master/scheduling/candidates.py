@@ -60,7 +60,7 @@ class Candidates:
             return self.tenants[row]
         if self.empty:
             return EMPTY
-        return {spec.name: spec for spec in self.host(row).instances.values()}
+        return dict(self.host(row).instances.values())
 
     def keep_tenants(self) -> None:
         """Copy the current processes of each host, because they change before they are read."""

@@ -68,8 +68,8 @@ class Host:
     Attributes:
         column: column of this host in the arrays of `HostTable`.
         attributed, shared: resources with this accounting on the host.
-        instances: number of each instance that runs on the host or is assigned to it, to the spec
-            of its process.
+        instances: number of each instance that runs on the host or is assigned to it, to the name
+            and the read-only spec of its process.
         over_since: resource name to the time since when the host is over this limit.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
@@ -92,7 +92,7 @@ class Host:
     pruned: bool = False
     attributed: frozenset[str] = frozenset()
     shared: frozenset[str] = frozenset()
-    instances: dict[int, ProcessSpec] = field(default_factory=dict)
+    instances: dict[int, tuple[str, ProcessSpec]] = field(default_factory=dict)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
     recorded_at: dict[str, float] = field(default_factory=dict)
