@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.model.devices import Device
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
     EMPTY,
@@ -67,6 +68,25 @@ class ProcessMeasuring(Protocol):
         probe, and may have others: eviction then moves the process with the largest usage. Pids
         outside of the slave's sessions have no effect.
         """
+
+
+class DeviceFinding(Protocol):
+    """A probe that also finds devices of its host."""
+
+    def devices(self) -> Iterable[Device]:
+        """Return every device, also one that is `missing` now, with the reason; units are fixed.
+
+        Called after each `read`, in the same thread, also if `read` raised. The settings of the
+        host take precedence: they choose the units of a kind.
+        """
+
+
+class HostLabelling(Protocol):
+    """A probe that also adds labels to its host."""
+
+    @property
+    def labels(self) -> Mapping[str, str]:
+        """Return labels such as "gpu.model"; fixed. A label in the settings takes precedence."""
 
 
 class Sessions(Protocol):
@@ -142,6 +162,8 @@ class HostView:
         capacity: (N, R) base units at usage 1.0; NaN as in `usage`.
         processes: (N,) number of processes on the host or reserved for it.
         labels: (N,) mappings, the labels of each host.
+        devices: (N,) mappings, the number of free units of each kind of devices; shares of units
+            count. A kind that the host lacks is absent.
     """
 
     names: Sequence[str]
@@ -151,6 +173,7 @@ class HostView:
     capacity: FloatArray
     processes: npt.NDArray[np.int64]
     labels: Sequence[Mapping[str, str]] = ()
+    devices: Sequence[Mapping[str, float]] = ()
 
     def column(self, resource: str, missing: float = 0.0) -> FloatArray:
         """Return the usage of one resource, (N,), as a new array without NaN.
@@ -174,8 +197,8 @@ class ProcessView:
 
     Attributes:
         spec: as submitted. A policy gets the standard fields (program, `namespace`, `kind`,
-            `priority`, `needs` and labels) and those that its offer declares in `reads`; any other
-            field raises `UndeclaredField`.
+            `priority`, `needs`, `devices` and labels) and those that its offer declares in
+            `reads`; any other field raises `UndeclaredField`.
         need: (N, R) demand of the process on each host, fractions of that host's capacity.
     """
 

@@ -17,7 +17,7 @@ from rosrm.wording import listed
 #: Fields of a spec that every policy may read, because `Demand.key` includes them.
 STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
-    "required_labels", "preferred_labels", "avoided_labels",
+    "required_labels", "preferred_labels", "avoided_labels", "devices",
 )  # fmt: skip
 #: All fields of a spec, which an offer may declare; `given` is of use at the submission only.
 SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec) if f.name != "given")

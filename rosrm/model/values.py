@@ -12,6 +12,8 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
+from rosrm.model.devices import Device, DeviceNeed, HeldDevice
+
 #: Slots of a `resource_info` message: highest number of resources of one host.
 RESOURCE_SLOTS: Final = 16
 #: A usage above this is an error, not a measurement (a CPU reading of 1.2 can be real).
@@ -213,6 +215,7 @@ class ProcessSpec:
         avoided_labels: a host with any of these labels is chosen only if no other host fits.
         priority: processes with a higher number are placed first.
         neighbours: rules on its hosts, relative to other processes.
+        devices: devices that it holds while it runs, each kind once.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -244,6 +247,7 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
     neighbours: tuple[NeighbourRule, ...] = ()
+    devices: tuple[DeviceNeed, ...] = ()
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -315,6 +319,7 @@ class Assignment:
             restarted until an order to its slave allows restarts.
         state_key: key by which slaves encrypt the replicas of the process's snapshots; b"": they
             are not encrypted.
+        devices: units of its host that it holds while it runs.
     """
 
     instance: InstanceId
@@ -327,6 +332,7 @@ class Assignment:
     snapshots_from: int = 0
     restored: bool = False
     state_key: bytes = field(default=b"", repr=False)
+    devices: tuple[HeldDevice, ...] = ()
 
     @property
     def has_snapshots(self) -> bool:
@@ -381,6 +387,7 @@ class InstanceStatus:
         cpu_time: CPU time of the last run in seconds.
         run_time: seconds from start to end of the last run.
         message: text on why it failed or was refused.
+        devices: devices of its host that it holds.
     """
 
     instance: InstanceId
@@ -393,6 +400,7 @@ class InstanceStatus:
     cpu_time: float = 0.0
     run_time: float = 0.0
     message: str = ""
+    devices: tuple[HeldDevice, ...] = ()
 
     @property
     def known_exit(self) -> int | None:
@@ -465,7 +473,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class HostDescription:
-    """Facts about a host that do not change while its slave runs.
+    """Facts about a host that do not change while its slave runs, except its devices.
 
     Attributes:
         name: unique among live slaves.
@@ -475,6 +483,7 @@ class HostDescription:
         period: seconds between two `resource_info` messages.
         executors: names of executors that plugins offer for `Execute` steps.
         absent: probe name to the reason why the probe is absent on this host.
+        devices: devices that the host gives to its processes.
     """
 
     name: str
@@ -488,6 +497,7 @@ class HostDescription:
     period: float = 0.1
     executors: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    devices: tuple[Device, ...] = ()
 
     def accounted(self, accounting: Accounting) -> frozenset[str]:
         """Return the names of the resources with this accounting."""

@@ -23,6 +23,7 @@ from rosrm.extensions.contracts import (
 from rosrm.extensions.declared_fields import SPEC_FIELDS, declared_spec
 from rosrm.extensions.plugin_calls import required
 from rosrm.extensions.time_limit import CALL_LIMIT
+from rosrm.model.devices import DeviceNeed
 from rosrm.model.values import EMPTY, Kind, MigrationPolicy, ProcessSpec
 from rosrm.testing.calls import call, made
 
@@ -34,6 +35,7 @@ def host_view(
     capacity: float = 1.0,
     processes: Sequence[int] = (),
     labels: Sequence[Mapping[str, str]] = (),
+    devices: Sequence[Mapping[str, float]] = (),
 ) -> HostView:
     """Return hosts h0, h1, ... for a scoring policy.
 
@@ -43,6 +45,7 @@ def host_view(
         capacity: of every resource on every host, base units.
         processes: number of processes by host; (): 0 on every host.
         labels: by host; (): no labels.
+        devices: number of free units by kind, by host; (): no devices.
     """
     # The core stores one row for each resource, and a policy gets the transpose, as here.
     table = np.array(list(usage.values()), np.float64).reshape(len(usage), -1)
@@ -56,6 +59,7 @@ def host_view(
         capacity=np.where(missing, np.nan, capacity).T,
         processes=np.array(processes or [0] * hosts, np.int64),
         labels=labels or [EMPTY] * hosts,
+        devices=devices or [EMPTY] * hosts,
     )
 
 
@@ -93,7 +97,7 @@ _SPECS: Final[Sequence[Mapping[str, Any]]] = (
         "migration": MigrationPolicy("relaunch", options={"settle": "2s"}),
     },
     {"name": "9.lives-", "command": (), "module": "pkg.main", "needs": {"gpu": 1.0}},
-    {"command": (), "package": "demo", "executable": "talker"},
+    {"command": (), "package": "demo", "executable": "talker", "devices": (DeviceNeed("gpu"),)},
 )  # fmt: skip
 
 
@@ -132,7 +136,10 @@ class ScoringContract:
             usage["gpu"][chance.random(count) < 0.5] = np.nan
             hosts = host_view({name: list(column) for name, column in usage.items()}, limit=0.9)
             labels = [{"rack": str(n % 3)} if n % 4 else {} for n in range(count)]
-            hosts = replace(hosts, labels=labels)
+            devices = [
+                {"gpu": n / 2, "camera": float(n % 2)} if n % 3 else {} for n in range(count)
+            ]
+            hosts = replace(hosts, labels=labels, devices=devices)
             cases += [(hosts, self._process(hosts, **spec)) for spec in _SPECS]
         lean = host_view({"memory": [0.2, 0.4]})
         cases.append((lean, self._process(lean)))
@@ -224,5 +231,6 @@ def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, 
         part(hosts.capacity),
         hosts.processes[one],
         hosts.labels[one],
+        hosts.devices[one],
     )
     return alone, replace(process, need=part(process.need))

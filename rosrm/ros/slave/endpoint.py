@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from enum import Enum
 from typing import Final
 
@@ -86,6 +87,7 @@ class SlaveEndpoint:
         epoch: newest known epoch of the master.
         failing: kind and name of each failing plugin on this host, with the reason; sent with the
             statuses. A probe is named by the resource that it reads.
+        devices: devices of this host, as they are now; sent with the registration and the statuses.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class SlaveEndpoint:
         self.failure = ""
         self.cluster = ""
         self.failing: dict[Plugin, str] = {}
+        self.devices = description.devices
         self.host_id = 0
         self.epoch = 0
         self._master_beat = 0
@@ -206,7 +209,7 @@ class SlaveEndpoint:
             return
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
-            host=convert.host_to_msg(self._description),
+            host=convert.host_to_msg(replace(self._description, devices=self.devices)),
             instances=[convert.status_to_msg(status) for status in self._state.statuses()],
             snapshots=[convert.snapshot_to_msg(one) for one in self._snapshots()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
@@ -415,6 +418,7 @@ class SlaveEndpoint:
                     )
                     for (kind, name), reason in self.failing.items()
                 ],
+                devices=convert.devices_to_msg(self.devices),
             )
         )  # fmt: skip
 

@@ -17,7 +17,8 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.declared_fields import declared_spec
 from rosrm.extensions.plugin_calls import PluginCalls
-from rosrm.model.values import HostDescription, ProcessSpec, ResourceDescription
+from rosrm.model.devices import Device, DeviceNeed
+from rosrm.model.values import HostDescription, InstanceId, ProcessSpec, ResourceDescription
 
 RESOURCES = ("memory", "cpu", "gpu")
 
@@ -29,6 +30,22 @@ labels = st.dictionaries(st.just("arm"), st.sampled_from(["yes", "no"]), max_siz
 resources = st.sampled_from([RESOURCES, RESOURCES[:2], RESOURCES[1:], ()]).map(
     lambda names: tuple(ResourceDescription(name, "", 10.0) for name in names)
 )
+devices = st.lists(
+    st.builds(
+        Device, st.sampled_from(["gpu", "camera"]), st.sampled_from("012"),
+        shareable=st.sampled_from([1, 1, 3]), missing=st.sampled_from(["", "", "", "gone"]),
+    ),
+    max_size=4, unique_by=lambda one: (one.kind, one.unit),
+).map(tuple)  # fmt: skip
+device_needs = st.lists(
+    st.one_of(
+        st.builds(
+            DeviceNeed, st.sampled_from(["gpu", "camera"]), st.sampled_from([0.4, 0.5, 1.0, 2.0])
+        ),
+        st.builds(DeviceNeed, st.just("gpu"), st.just(1.0), st.sampled_from([("0",), ("1",)])),
+    ),
+    max_size=2, unique_by=lambda need: need.kind,
+).map(tuple)  # fmt: skip
 conditions = st.sampled_from([HostCondition.UP] * 9 + [*HostCondition])
 rarely = st.sampled_from([False] * 7 + [True])
 usually = st.sampled_from([True] * 7 + [False])
@@ -46,7 +63,7 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         described = draw(resources)
         description = HostDescription(
             name, number + 1, labels=draw(labels), resources=described,
-            max_processes=draw(st.sampled_from([0, 1, 2])),
+            max_processes=draw(st.sampled_from([0, 1, 2])), devices=draw(devices),
         )  # fmt: skip
         host = table.register(description, 0.0)
         column = host.column
@@ -63,6 +80,10 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         table.set_condition(host, draw(conditions))
         load = np.array([draw(fractions) / 4 for _ in table.resources])
         table.add_reservation(host, load, processes=draw(st.sampled_from([0, 0, 1])))
+        inventory = table.devices[column]
+        for other in draw(device_needs):
+            held = inventory.choose((other,))
+            table.hold(host, InstanceId("other", number), held or ())
         if draw(rarely):
             table.prune(host)
     return table
@@ -74,7 +95,7 @@ def demands(draw: st.DrawFn) -> Demand:
     estimated = frozenset(name for name in needs if draw(st.booleans()))
     excluded = draw(st.dictionaries(st.sampled_from(["h0", "h1", "h2"]), st.just("no"), max_size=1))
     required = draw(labels) if draw(rarely) else {}
-    spec = ProcessSpec("p", command=("run",), required_labels=required)
+    spec = ProcessSpec("p", command=("run",), required_labels=required, devices=draw(device_needs))
     read = declared_spec(spec, ())  # a filter may read only what makes rankings differ
     return Demand(read, needs, estimated, excluded, draw(st.sampled_from([0.0, 0.05])))
 
@@ -137,6 +158,10 @@ def test_a_refreshed_ranking_equals_a_new_one(
         host = (fitting or table.hosts)[number % len(fitting or table.hosts)]
         own = bool(fitting) and number % 3 > 0
         need = ranking.need[:, host.column] if own else np.full(len(table.resources), 0.1)
+        if own:
+            held = table.devices[host.column].choose(demand.spec.devices)
+            assert held is not None
+            table.hold(host, InstanceId("own", len(table.touched)), held)
         table.add_reservation(host, need, processes=1)
         if own:
             ranking.note_assignment()
@@ -150,5 +175,5 @@ def test_no_process_is_set_aside_if_a_host_takes_it_now(table: HostTable, demand
     never = why_never(table, demand)
     if (ranked(table, demand).value < np.inf).any():
         assert never == ""
-    if never and "no host reports" not in never:
+    if never and "no host reports" not in never and "no host has" not in never:
         assert all(host.name in never for host in table.listed())

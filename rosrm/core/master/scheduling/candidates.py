@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
 
@@ -27,6 +28,10 @@ class Candidates:
         busy: (R, n) reading plus reservations.
         processes: (n,) number of processes on the host or reserved for it.
         bound: (n,) highest number of processes.
+        inventories: (n,) devices of each host.
+        sets: (n,) number of further processes of this demand for which the host has devices; at
+            most COUNTED.
+        more: (n,) number of processes of this demand that were added to each host; None: none.
         empty: True if the arrays are those of hosts without processes.
     """
 
@@ -39,6 +44,9 @@ class Candidates:
     busy: FloatArray
     processes: IntArray
     bound: IntArray
+    inventories: list[Inventory]
+    sets: IntArray | None = None
+    more: IntArray | None = None
     empty: bool = False
 
     def __len__(self) -> int:
@@ -66,10 +74,15 @@ def candidates(
     busy, processes = cells[BUSY], table.processes[columns]
     if more is not None:
         busy, processes = busy + need * more, processes + more
-    return Candidates(
+    hosts = Candidates(
         table=table, demand=demand, columns=columns, resources=table.resources, need=need,
         cells=cells, busy=busy, processes=processes, bound=table.bound[columns],
+        inventories=table.devices.at(columns), more=more,
     )  # fmt: skip
+    if demand.spec.devices:
+        sets = table.devices.counts(demand.spec.devices)[columns]
+        hosts.sets = sets if more is None else sets - more
+    return hosts
 
 
 def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:
@@ -78,4 +91,6 @@ def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidate
     hosts = candidates(table, demand, need, columns)
     hosts.busy, hosts.processes = np.zeros_like(hosts.busy), np.zeros_like(hosts.processes)
     hosts.empty = True
+    if demand.spec.devices:
+        hosts.sets = table.devices.counts(demand.spec.devices, empty=True)[columns]
     return hosts

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from rosrm.core.master.scheduling.candidates import Candidates
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray
-from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.declared_fields import declared_spec
@@ -25,7 +24,7 @@ def host_view(hosts: Candidates) -> HostView:
     return HostView(
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
-        _read_only(hosts.processes[:]), _Labels(hosts),
+        _read_only(hosts.processes[:]), _Labels(hosts), _FreeDevices(hosts),
     )  # fmt: skip
 
 
@@ -53,25 +52,36 @@ class _PerHost(Sequence[T]):
     def __getitem__(self, row: Any) -> Any:
         rows = range(len(self._hosts))[row]
         if isinstance(rows, int):
-            return self._of(self._hosts.host(rows))
-        return [self._of(self._hosts.host(one)) for one in rows]
+            return self._of(rows)
+        return [self._of(one) for one in rows]
 
-    def _of(self, host: Host) -> T:
+    def _of(self, row: int) -> T:
         raise NotImplementedError
 
 
 class _Names(_PerHost[str]):
     """The name of each host."""
 
-    def _of(self, host: Host) -> str:
-        return host.name
+    def _of(self, row: int) -> str:
+        return self._hosts.host(row).name
 
 
 class _Labels(_PerHost[Mapping[str, str]]):
     """The labels of each host."""
 
-    def _of(self, host: Host) -> Mapping[str, str]:
-        return MappingProxyType(dict(host.description.labels))
+    def _of(self, row: int) -> Mapping[str, str]:
+        return MappingProxyType(dict(self._hosts.host(row).description.labels))
+
+
+class _FreeDevices(_PerHost[Mapping[str, float]]):
+    """The free units of each host by kind."""
+
+    def _of(self, row: int) -> Mapping[str, float]:
+        hosts = self._hosts
+        inventory = hosts.inventories[row]
+        if hosts.more is not None:
+            inventory = inventory.after(hosts.demand.spec.devices, int(hosts.more[row]))
+        return MappingProxyType(inventory.free_by_kind())
 
 
 def checked_scores(

@@ -28,6 +28,7 @@ from rosrm.core.master.scheduling.filters import (
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.scheduling.proximity import keeping_all, preference
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.devices import COUNTED
 from rosrm.core.master.state.host_arrays import FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
 from rosrm.errors import PluginError
@@ -40,7 +41,7 @@ TIE: Final = 1e-9
 #: Number of runners-up that an explanation names beside the chosen host, if there are many hosts.
 _RUNNERS_UP: Final = 3
 #: Number of equal processes for which one call of the policy scores a host ahead.
-_AT_A_TIME: Final = 8
+_AT_A_TIME: Final = COUNTED
 
 #: A scoring policy with its name.
 NamedPolicy = tuple[str, ScoringPolicy]

@@ -7,12 +7,13 @@ values of single hosts (description, labels) are in `Host`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Final, Literal
 
 import numpy as np
 
+from rosrm.core.master.state.devices import DeviceTable
 from rosrm.core.master.state.host_arrays import (
     BUSY,
     LOAD,
@@ -24,7 +25,8 @@ from rosrm.core.master.state.host_arrays import (
     IntArray,
 )
 from rosrm.extensions.plugin_calls import Failing, Plugin
-from rosrm.model.values import HostDescription
+from rosrm.model.devices import Device, HeldDevice
+from rosrm.model.values import HostDescription, InstanceId
 
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
@@ -114,6 +116,7 @@ class HostTable(HostColumns):
     Attributes:
         version: counter of changes that concern many hosts.
         touched: columns that assignments and ends have changed since `version` grew.
+        devices: devices of each host, and the instances that hold them.
     """
 
     def __init__(self) -> None:
@@ -122,6 +125,7 @@ class HostTable(HostColumns):
         self.hosts: list[Host] = []
         self.version = 0
         self.touched: list[int] = []
+        self.devices = DeviceTable()
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}
         self._listed: list[Host] | None = None
 
@@ -133,6 +137,7 @@ class HostTable(HostColumns):
         """Add a host before its first contact, so that its number stays across restarts."""
         host = Host(self.add_column(), HostDescription(name, 0))
         self.hosts.append(host)
+        self.devices.add_column()
         self.by_name[name] = host
         self._listed = None
         self.last_contact[host.column] = now
@@ -169,7 +174,7 @@ class HostTable(HostColumns):
         self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
         self.refused_since[column] = np.inf
         self._labelled.clear()
-        self.changed()
+        self.set_devices(host, description.devices)
         return host
 
     def prune(self, host: Host) -> None:
@@ -180,6 +185,7 @@ class HostTable(HostColumns):
             known.clear()
         self.incarnation[host.column] = 0
         self._labelled.clear()
+        self.set_devices(host, ())
         self.set_closed(host, cordoned=False, draining=False)
         self.set_condition(host, HostCondition.LEFT)
 
@@ -252,6 +258,23 @@ class HostTable(HostColumns):
         if int(self.bound[host.column]) != bound:
             self.bound[host.column] = bound
             self.touched.append(host.column)
+
+    def set_devices(self, host: Host, devices: tuple[Device, ...]) -> None:
+        """Replace the devices of a host; instances keep what they hold."""
+        if host.description.devices != devices:
+            host.description = replace(host.description, devices=devices)
+        self.devices[host.column] = replace(self.devices[host.column], devices=devices)
+        self.changed()
+
+    def hold(self, host: Host, instance: InstanceId, held: tuple[HeldDevice, ...]) -> None:
+        """Note that an instance holds these devices of a host and no others."""
+        before = self.devices[host.column]
+        if before.held.get(instance, ()) != held:
+            self.devices[host.column] = before.with_held(instance, held)
+
+    def touch(self, host: Host) -> None:
+        """Note that something else than the reservations of one host has changed."""
+        self.touched.append(host.column)
 
     def add_reservation(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
         """Add to the reservations and process count of one host; negative values release.
