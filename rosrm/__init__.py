@@ -22,12 +22,12 @@ A plugin marks its hooks with `hookimpl` and returns offers::
 The public names, by purpose:
 
 Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
-                HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
+                HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
-                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule
+                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed
 Plugins         hookimpl, NoOptions, SkipPlugin
-  probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
-                ResourceDescription, Accounting, Reading
+  probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
+                Sessions, ResourceDescription, Accounting, Reading, Device
   scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
@@ -74,9 +74,11 @@ if TYPE_CHECKING:
         CheckpointOffer,
         CheckpointPolicy,
         CheckpointView,
+        DeviceFinding,
         FloatArray,
         GraphDepartureLauncher,
         HostChecking,
+        HostLabelling,
         HostView,
         ImageLauncher,
         Imaging,
@@ -114,6 +116,7 @@ if TYPE_CHECKING:
         ResourceName,
         Seconds,
     )
+    from rosrm.model.devices import Device, DeviceNeed
     from rosrm.model.plan import (
         AwaitReady,
         AwaitReleased,
@@ -130,6 +133,7 @@ if TYPE_CHECKING:
     )
     from rosrm.model.ros_settings import RosSettings
     from rosrm.model.rows import (
+        DeviceRow,
         EventRow,
         HostRow,
         Listing,
@@ -161,8 +165,9 @@ __all__ = [
     "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
+    "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
     "EventRow", "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher",
-    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
+    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLabelling", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
     "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
@@ -184,10 +189,10 @@ _NAMES: Final = {
     "config.work": "load_work",
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
     "extensions.contracts": (
-        "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy "
-        "CheckpointView FloatArray GraphDepartureLauncher HostChecking HostView ImageLauncher "
-        "Imaging Launch Launcher LauncherContext LauncherOffer MemoryPacing MemoryView "
-        "MigrationOffer MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext "
+        "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
+        "DeviceFinding FloatArray GraphDepartureLauncher HostChecking HostLabelling HostView "
+        "ImageLauncher Imaging Launch Launcher LauncherContext LauncherOffer MemoryPacing "
+        "MemoryView MigrationOffer MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext "
         "ProbeOffer ProcessMeasuring ProcessTreeLauncher ProcessView Scores ScoringOffer "
         "ScoringPolicy Sessions SpecChecking"
     ),
@@ -196,12 +201,13 @@ _NAMES: Final = {
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
     ),
+    "model.devices": "Device DeviceNeed",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "
         "SetRestart Start Step Stop"
     ),
     "model.ros_settings": "RosSettings",
-    "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
+    "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
         "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ResourceDescription "

@@ -35,13 +35,18 @@ _FAILED_PERIOD: Final = 10.0
 
 @dataclass(frozen=True)
 class MadeProbe:
-    """A probe on this host; period and deadline, in seconds, are those of its offer."""
+    """A probe on this host; period and deadline, in seconds, are those of its offer.
+
+    Attributes:
+        labels: labels that it adds to the host.
+    """
 
     name: str
     probe: Probe
     resources: tuple[ResourceDescription, ...]
     period: float
     deadline: float
+    labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
 
 @dataclass(frozen=True)
@@ -185,6 +190,15 @@ def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:
         f"gives {attributed[0]!r} the accounting 'attributed', and has no `by_process` that "
         "measures it"
     )
+
+
+def fault_of_labels(labels: object) -> str:
+    """Return why a probe cannot add these labels, as a predicate; "" if it can."""
+    if not isinstance(labels, Mapping):
+        return f"has `labels` of type {type(labels).__name__}; a mapping is required"
+    texts = [text for item in labels.items() for text in item]
+    wrong = [text for text in texts if not (isinstance(text, str) and text.isprintable())]
+    return f"has the label {wrong[0]!r:.100}; printable text is required" if wrong else ""
 
 
 def close_quietly(probe: Probe) -> None:

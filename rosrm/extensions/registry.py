@@ -48,6 +48,7 @@ from rosrm.extensions.made import (
     Probes,
     close_quietly,
     failed_probe,
+    fault_of_labels,
     fault_of_resources,
     missing_method,
     unmeasured,
@@ -358,13 +359,15 @@ class Registry:
         try:
             resources = tuple(probe.resources)
             fault = fault_of_resources(resources, offer, before) or unmeasured(probe, resources)
+            labels = getattr(probe, "labels", EMPTY)
+            fault = fault or fault_of_labels(labels)
             fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
         except FAULTS as raised:
-            resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
+            fault = f"its description raised {describe_plugin_fault(raised)}"
         if fault:
             close_quietly(probe)
             raise self._fault("probe", name, fault)
-        return MadeProbe(name, probe, resources, offer.period, offer.deadline)
+        return MadeProbe(name, probe, resources, offer.period, offer.deadline, dict(labels))
 
     def _required(self, kind: PluginKind, name: str, options: Mapping[str, Any]) -> Any:
         """Create an object that the master needs, so that its absence here is an error."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
-from rosrm.core.slave.events import Event, Registered, TimePassed
+from rosrm.core.slave.events import DevicesMissed, Event, Registered, TimePassed
 from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
@@ -47,6 +47,8 @@ from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
+from rosrm.slave.devices import LOOK_PERIOD as LOOK_AT_DEVICES
+from rosrm.slave.devices import DeviceWatch
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
@@ -123,6 +125,8 @@ class SlaveRuntime:
             self._usage = UsageWatch(sessions)
             absent = self._open_probes(registry, sessions, opened)
             first = self._sampler.first().reports
+            self._devices = DeviceWatch(config.devices)
+            self._devices.look(self._sampler.devices)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_stop_signals(self._stop)
             self._open_supervisor(opened)
@@ -155,6 +159,8 @@ class SlaveRuntime:
         self._sampler = Sampler(probes.made)
         opened.callback(self._sampler.close)
         self._limit = self._limits()
+        added = {name: text for made in probes.made for name, text in made.labels.items()}
+        self._labels = {**added, **config.labels}
         return probes.absent
 
     def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
@@ -218,9 +224,10 @@ class SlaveRuntime:
         config = self._config
         return HostDescription(
             name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
-            pid=os.getpid(), software_version=__version__, labels=config.labels,
+            pid=os.getpid(), software_version=__version__, labels=self._labels,
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=self._executors.names, absent=absent,
+            devices=self._devices.devices,
         )  # fmt: skip
 
     def _adopt(self) -> None:
@@ -285,7 +292,7 @@ class SlaveRuntime:
     def _serve(self, condition: Callable[[], bool]) -> None:
         now = time.monotonic()
         guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
-        next_sample = next_usage = next_graph = next_health = now
+        next_sample = next_usage = next_graph = next_health = next_devices = now
         logged_at = now - _LOG_PERIOD
         while condition():
             if now >= next_sample:
@@ -299,6 +306,9 @@ class SlaveRuntime:
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
                 guard.call(self._starter.look_at_graph, awaited)
+            if now >= next_devices:
+                next_devices = now + LOOK_AT_DEVICES
+                self._look_at_devices()
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
                 guard.call(self._look_at_health, now)
@@ -314,6 +324,14 @@ class SlaveRuntime:
             self._work(now)
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
+
+    def _look_at_devices(self) -> None:
+        """Report changes of the devices to the master, and lost ones to the core."""
+        if self._devices.look(self._sampler.devices):
+            self._endpoint.devices = self._devices.devices
+            self._endpoint.publish_statuses((), complete=False)
+        if self._devices.lost:
+            self._take(DevicesMissed(self._devices.lost))
 
     def _look_at_health(self, now: float) -> None:
         self._events.extend(self._health.look(self._state.watched(), now))

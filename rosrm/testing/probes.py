@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rosrm.extensions.contracts import Probe, ProbeContext, ProbeOffer
-from rosrm.extensions.made import MadeProbe, unmeasured
+from rosrm.extensions.made import MadeProbe, fault_of_labels, unmeasured
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.values import EMPTY, Reading, ResourceDescription
-from rosrm.slave.probe_reads import read_processes, read_values
+from rosrm.slave.probe_reads import read_devices, read_processes, read_values
 from rosrm.testing.calls import call, made
 
 
@@ -155,6 +155,18 @@ class ProbeContract:
         probe = self.make()
         for _ in range(5):
             self._read(probe)
+        probe.close()
+
+    def test_devices_and_labels_are_well_described(self) -> None:
+        """Devices and labels, if the probe has any, are valid; no unit comes or goes."""
+        probe = self.make()
+        labels = getattr(probe, "labels", EMPTY)
+        assert not (fault := fault_of_labels(labels)), f"the probe {fault}"
+        units = []
+        for _ in range(3):
+            self._read(probe)
+            units.append([(one.kind, one.unit) for one in read_devices(probe)])
+        assert units[0] == units[1] == units[2], f"the units were {units}; use `missing` instead"
         probe.close()
 
     def test_resources_stay(self) -> None:
