@@ -30,8 +30,10 @@ from rosrm.ros.sealed_codec import Envelope, decode, encode
 from rosrm_lab import Lab
 from rosrm_msgs import msg, srv
 
-#: Messages and requests a second.
+#: Deliveries a second, over all receivers of all messages, requests and answers.
 RATE: Final = 200.0
+#: Sent messages by which the intruder tells its own ones from those to record.
+_MOST_OWN: Final = 100
 #: Recorded messages of each topic and service that are repeated.
 _MOST_RECORDED: Final = 500
 #: Seconds between two lines about the number of messages.
@@ -74,13 +76,20 @@ def intruder(lab: Lab, log: Path) -> Iterator[None]:
 
 
 class Intruder:
-    """A participant without a key, which sends one message at a time."""
+    """A participant without a key, which sends one message at a time.
+
+    Attributes:
+        delivered: number of deliveries of its messages and answers.
+    """
 
     def __init__(self, participant: Participant, seed: int) -> None:
         self._participant = participant
         self._random = random.Random(seed)  # noqa: S311 - a repeatable draw
         self._recorded: dict[str, deque[bytes]] = {}
+        self._own: deque[bytes] = deque(maxlen=_MOST_OWN)
         self._send: dict[str, Callable[[bytes], object]] = {}
+        self._receivers: dict[str, Callable[[], int]] = {}
+        self.delivered = 0
         for name, (kind, profile) in _TOPICS.items():
             self._join_topic(_PATH(name), kind, profile)
         for name in _OF_MASTER:
@@ -89,25 +98,32 @@ class Intruder:
             for name in _OF_SLAVES:
                 self._join_service(_PATH.of_host(host, name))
 
-    def _join_topic(self, topic: str, kind: Any, profile: Any) -> None:
-        node = self._participant.node
-        recorded = self._recorded[topic] = deque(maxlen=_MOST_RECORDED)
+    def _recorder(self, name: str) -> Callable[[bytes], None]:
+        """Return a function that records the messages of others."""
+        recorded = self._recorded[name] = deque(maxlen=_MOST_RECORDED)
 
         def record(data: bytes) -> None:
-            recorded.append(data)
+            if data not in self._own:
+                recorded.append(data)
 
-        node.create_subscription(kind, topic, record, profile, raw=True)
-        self._send[topic] = node.create_publisher(kind, topic, profile).publish
+        return record
+
+    def _join_topic(self, topic: str, kind: Any, profile: Any) -> None:
+        node = self._participant.node
+        node.create_subscription(kind, topic, self._recorder(topic), profile, raw=True)
+        publisher = node.create_publisher(kind, topic, profile)
+        self._send[topic] = publisher.publish
+        self._receivers[topic] = publisher.get_subscription_count
 
     def _join_service(self, service: str) -> None:
-        recorded = self._recorded[service] = deque(maxlen=_MOST_RECORDED)
+        node = self._participant.node
+        record = self._recorder(service)
+        client = node.create_client(srv.Sealed, service, qos_profile=qos.SERVICE)
 
         def take(request: srv.Sealed.Request, opened: OpenRequest) -> None:
-            recorded.append(serialize_message(request.message))
+            record(serialize_message(request.message))
             opened.answer(srv.Sealed.Response(message=request.message))
-
-        self._participant.serve(srv.Sealed, service, take)
-        client = self._participant.node.create_client(srv.Sealed, service, qos_profile=qos.SERVICE)
+            self.delivered += node.count_clients(service)
 
         def send(data: bytes) -> None:
             found = decode(data)
@@ -116,7 +132,9 @@ class Intruder:
                 future = client.call_async(srv.Sealed.Request(message=message))
                 client.remove_pending_request(future)
 
+        self._participant.serve(srv.Sealed, service, take)
         self._send[service] = send
+        self._receivers[service] = lambda: node.count_services(service)
 
     def send_one(self) -> None:
         """Send a recorded message as it was or with changes, or an invented one."""
@@ -126,8 +144,11 @@ class Intruder:
         change = self._random.choice((_unchanged, _newer, _of_another_run, _damaged))
         if self._random.random() < 0.3:
             data = self._invented()
+        sent = change(data)
+        self._own.append(sent)
         with contextlib.suppress(RCLError):  # the sender's own library refuses some sizes
-            self._send[name](change(data))
+            self._send[name](sent)
+            self.delivered += max(1, self._receivers[name]())
 
     def _invented(self) -> bytes:
         principal = self._random.choice(
@@ -160,14 +181,19 @@ def _of_another_run(data: bytes) -> bytes:
 def main() -> None:
     """Send until this process is killed."""
     with Participant(RosSettings(), "intruder") as participant:
-        sender, sent, told_at = Intruder(participant, seed=1), 0, time.monotonic()
+        sender, told_at = Intruder(participant, seed=1), time.monotonic()
+        due, paid = told_at, 0
         while True:
-            sender.send_one()
-            sent += 1
-            participant.spin(1.0 / RATE)
+            now = time.monotonic()
+            if now >= due:
+                sender.send_one()
+            due = max(due, now) + (sender.delivered - paid) / RATE
+            paid = sender.delivered
+            participant.spin(max(0.0, due - now))
             if time.monotonic() - told_at >= _TOLD_EVERY:
                 told_at = time.monotonic()
-                print(f"{sent} messages", flush=True)
+                cpu = time.process_time()
+                print(f"{sender.delivered} deliveries, {cpu:.1f} s of CPU", flush=True)
 
 
 if __name__ == "__main__":

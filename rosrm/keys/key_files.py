@@ -10,6 +10,7 @@ import base64
 import contextlib
 import fcntl
 import os
+import secrets
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -37,6 +38,8 @@ GRANTS_FILE: Final = "principals.yaml"
 _LOCK_FILE: Final = "keys.lock"
 _OTHERS: Final = 0o077
 _LARGEST: Final = 1 << 20
+#: Generations of a key are below this number.
+_GENERATIONS: Final = 1 << 32
 #: Fields of a grant, which may be shown.
 _PUBLIC: Final = frozenset({"principal", "role", "generation"})
 _WARNING: Final = "# Secret: a reader of this file can act as its owner. Mode 0600.\n"
@@ -128,10 +131,10 @@ def add_grant(home: Path, principal: Principal, role: Role) -> Grant:
         ConfigError: the file is invalid, others can read it, or it cannot be written.
     """
     with _locked(home):
-        entries = _all_grants(home)
-        former = [old.generation for old, _ in entries if old.principal == principal]
-        grant = Grant(principal, role, max(former, default=0) + 1)
-        others = [(old, revoked) for old, revoked in entries if old.principal != principal]
+        others = [one for one in _all_grants(home) if one[0].principal != principal]
+        # Drawn at random, because a counter would repeat the generation of a revoked key if the
+        # file of the grants was lost or comes from a backup. Then that key would be valid again.
+        grant = Grant(principal, role, 1 + secrets.randbelow(_GENERATIONS - 1))
         _write_grants(home, [*others, (grant, False)])
     return grant
 
@@ -293,8 +296,9 @@ def _grant_in(fields: Any, path: Path) -> Grant:
         raise ConfigError(f"{path}: invalid entry {shown!r}: {error}") from None
     if (role is Role.HOST) is not (principal.kind == "host"):
         raise ConfigError(f"{path}: {principal} cannot have the role {role.value}")
-    if not isinstance(generation, int) or not 1 <= generation < 1 << 32:
-        raise ConfigError(f"{path}: the generation of {principal} must be from 1 to {2**32 - 1}")
+    if not isinstance(generation, int) or not 1 <= generation < _GENERATIONS:
+        last = _GENERATIONS - 1
+        raise ConfigError(f"{path}: the generation of {principal} must be from 1 to {last}")
     return Grant(principal, role, generation)
 
 

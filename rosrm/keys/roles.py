@@ -77,8 +77,8 @@ class Grant:
     """The role of a principal.
 
     Attributes:
-        generation: number of the principal's key, from 1; 0: a key without a grant, derived by a
-            program that can read the cluster's secret.
+        generation: number that distinguishes the keys of the principal, from 1; 0: a key without a
+            grant, derived by a program that can read the cluster's secret.
     """
 
     principal: Principal

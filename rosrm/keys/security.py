@@ -132,12 +132,14 @@ class MemberSecurity:
         self._bearers: dict[Principal, OrderedDict[str, Peer]] = {}
 
     def peer(self, name: str, generation: int) -> Peer | None:
-        """Return the master, or the bearer of a ticket for this slave."""
+        """Return the master, or the bearer of a ticket for this slave, which may have expired."""
         if (name, generation) == (self.master.name, self.master.generation):
             return self.master
         ticket = ticket_of(name)
-        if ticket is None or not ticket.is_valid(time.monotonic_ns()):
+        if ticket is None:
             return None
+        if not ticket.is_valid(time.monotonic_ns()):
+            return self._bearer_of(ticket)  # the bearer is genuine, if its message opens
         held: Mapping[str, Peer] = self._bearers.get(ticket.bearer, {})
         return held.get(name) or (self._bearer_of(ticket) if self._has_room(held) else None)
 
@@ -154,7 +156,7 @@ class MemberSecurity:
 
     def remember(self, peer: Peer) -> None:
         """Keep a bearer whose request was genuine, as long as its ticket is valid."""
-        if peer.ticket is None:
+        if peer.ticket is None or _is_void(peer):
             return
         held = self._bearers.setdefault(peer.ticket.bearer, OrderedDict())
         held[peer.name] = peer

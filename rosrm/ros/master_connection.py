@@ -20,6 +20,7 @@ from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.control import ControlClient, check_answer
+from rosrm.ros.deferred_signals import signals_deferred
 from rosrm.ros.introductions import introduction_of, introduction_request
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
@@ -43,12 +44,18 @@ _UNKNOWN_EPOCH: Final = 0
 _MASTER: Final = "the master"
 
 
+def _spin(participant: Participant, timeout: float) -> None:
+    """Handle incoming messages for at most `timeout` seconds, and then the signals that arrived."""
+    with signals_deferred():
+        participant.spin(timeout)
+
+
 def wait_for_service(participant: Participant, client: Any, deadline: float) -> bool:
     """Return True if a service is discovered before `deadline` (monotonic seconds)."""
     while not client.service_is_ready():
         if time.monotonic() >= deadline:
             return False
-        participant.spin(_LOOK)
+        _spin(participant, _LOOK)
     return True
 
 
@@ -58,7 +65,7 @@ def wait_until(participant: Participant, done: Callable[[], bool], deadline: flo
         left = deadline - time.monotonic()
         if left <= 0.0:
             return False
-        participant.spin(min(left, 0.1))
+        _spin(participant, min(left, 0.1))
     return True
 
 
@@ -131,7 +138,8 @@ def _ask_until_answered(
         if now >= deadline:
             return answers
         answers.sent += 1
-        client.call_async(request).add_done_callback(participant.counted(answers.take))
+        with signals_deferred():
+            client.call_async(request).add_done_callback(participant.counted(answers.take))
         wait_until(participant, lambda: bool(answers.first), min(deadline, now + again))
     return answers
 
@@ -230,7 +238,7 @@ class MasterClient:
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""
-        self._participant.spin(timeout)
+        _spin(self._participant, timeout)
         self._control.expire(time.monotonic())
 
     def cancel(self, processes: Sequence[str]) -> str:

@@ -9,6 +9,7 @@ receivers are signed, in a `rosrm_msgs/Signed`, and not encrypted.
 from __future__ import annotations
 
 import struct
+import time
 from array import array
 from collections.abc import Callable
 from typing import Any, Final, Generic, TypeVar
@@ -33,7 +34,9 @@ from rosrm_msgs import msg, srv
 #: Refusal of a request that was meant for another run of the receiver.
 _OTHER_RUN: Final = "the request is for another run of the receiver; nothing was done"
 #: Refusal of a request whose sender may have lost its key since it got the ticket.
-_OLD_TICKET: Final = "keys have changed since the ticket was made; ask the master for a new one"
+_OLD_TICKET: Final = (
+    "the ticket has expired, or keys have changed since it was made; ask the master for a new one"
+)
 
 #: Runs of masters whose newest signed message is remembered.
 _MOST_RUNS: Final = 64
@@ -208,7 +211,7 @@ class SealedEndpoints(Generic[SecurityT]):
                 genuine.answer(failed_response(service_type, refusal, "denied"))
             elif not first_contact and envelope.receiver_run != self.security.run:
                 genuine.answer(failed_response(service_type, _OTHER_RUN, "stale"))
-            elif peer.ticket is not None and peer.ticket.version < self.security.tickets_from:
+            elif peer.ticket is not None and not self._is_in_force(peer.ticket):
                 genuine.answer(failed_response(service_type, _OLD_TICKET, "stale"))
             else:
                 fault = guard.call(lambda: handle(_plain(service_type.Request, plain), genuine))
@@ -216,6 +219,10 @@ class SealedEndpoints(Generic[SecurityT]):
                     genuine.answer(failed_response(service_type, fault))
 
         self.participant.serve(srv.Sealed, name, take)
+
+    def _is_in_force(self, ticket: Ticket) -> bool:
+        is_valid = ticket.is_valid(time.monotonic_ns())
+        return is_valid and ticket.version >= self.security.tickets_from
 
     def client(
         self, service_type: Any, name: str, peer: Peer, *, first_contact: bool = False

@@ -22,6 +22,8 @@ _HEAD: Final = struct.Struct("<4sIIQ")
 _CDR: Final = b"\x00\x01\x00\x00"
 _PLAIN_BYTES: Final = LAYOUT.itemsize
 _SIZE: Final = _HEAD.size + _PLAIN_BYTES + OVERHEAD
+#: Seconds after a registration in which readings of a former run may still arrive.
+_RENEWAL: Final = 5.0
 
 
 class RegisteredSlave(NamedTuple):
@@ -31,16 +33,18 @@ class RegisteredSlave(NamedTuple):
         peer: the slave.
         run: of the slave, at its registration.
         open: opens its readings.
+        since: monotonic seconds of its registration.
     """
 
     peer: Peer
     run: bytes
     open: OpenMessage
+    since: float
 
     @classmethod
-    def of(cls, peer: Peer, run: bytes, channel: bytes) -> RegisteredSlave:
+    def of(cls, peer: Peer, run: bytes, channel: bytes, since: float) -> RegisteredSlave:
         """Return a slave whose registration was genuine; `channel` is that of the readings."""
-        return cls(peer, run, peer.link.opener(channel, run))
+        return cls(peer, run, peer.link.opener(channel, run), since)
 
 
 def reading_channel(topic: str) -> bytes:
@@ -56,9 +60,20 @@ def seal_reading(master: Peer, channel: bytes, reading: bytes) -> bytes:
     return (head + done.body).ljust(_SIZE, b"\0")  # without keys, a body has no tag
 
 
-def is_of_unknown_host(data: bytes, slave_of: Callable[[int], RegisteredSlave | None]) -> bool:
-    """Return True if a reading has the right size and names a host that has not registered."""
-    return len(data) == _SIZE and slave_of(_HEAD.unpack_from(data)[1]) is None
+def may_be_of_former_run(
+    data: bytes, slave_of: Callable[[int], RegisteredSlave | None], now: float
+) -> bool:
+    """Return True if a reading that does not open may be of, or for, a former run.
+
+    After a restart of the master, slaves send such readings until they notice the restart. And a
+    master that was stopped may take the last readings of a former slave after the registration of
+    the next one. So this is every reading of the right size that names a host that has not
+    registered, or has just registered.
+    """
+    if len(data) != _SIZE:
+        return False
+    slave = slave_of(_HEAD.unpack_from(data)[1])
+    return slave is None or now - slave.since < _RENEWAL
 
 
 def open_reading(

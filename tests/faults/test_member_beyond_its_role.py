@@ -177,19 +177,27 @@ def test_a_ticket_is_for_one_service_process_and_host(member, sues) -> None:
     assert ask(srv.ReadLog, names.READ_LOG, "sues", HOSTS[1]) is None
 
 
-def test_a_changed_or_late_ticket_opens_nothing(member, sues) -> None:
-    """Another process, service or bearer under the same key; and after its time, with its key."""
+def answer_to(member, sues, ticket, key: bytes) -> Any:
+    """Return the answer of the slave to a request for a log with a ticket; None: there is none."""
     sue, genuine = sues
-    ticket, run = ticket_of(genuine.ticket), bytes(genuine.run)
-    late = ticket._replace(until=1)
-    changed = [
-        (ticket._replace(process=WITNESS), bytes(genuine.key)),
-        (ticket._replace(until=2**62), bytes(genuine.key)),
-        (ticket._replace(bearer=principal_of(ME)), bytes(genuine.key)),
-        (late, late.key(key_of_host(HOSTS[0]).key)),
-    ]
-    for one, key in changed:
-        peer = sue.bearer(one.text(), key, run)
-        request = srv.ReadLog.Request(protocol_version=PROTOCOL_VERSION, process=one.process)
-        service_name = path.of_host(HOSTS[0], names.READ_LOG)
-        assert member.answer(member.ask(sue, service_name, peer, request)) is None, one
+    peer = sue.bearer(ticket.text(), key, bytes(genuine.run))
+    request = srv.ReadLog.Request(protocol_version=PROTOCOL_VERSION, process=ticket.process)
+    asked = member.ask(sue, path.of_host(HOSTS[0], names.READ_LOG), peer, request)
+    return member.answer(asked)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"process": WITNESS}, {"until": 2**62}, {"bearer": principal_of(ME)}]
+)
+def test_a_changed_ticket_opens_nothing(member, sues, changes) -> None:
+    """Another process, time or bearer under the same key."""
+    _, genuine = sues
+    ticket = ticket_of(genuine.ticket)._replace(**changes)
+    assert answer_to(member, sues, ticket, bytes(genuine.key)) is None
+
+
+def test_an_expired_ticket_reads_nothing(member, sues) -> None:
+    """Its bearer gets the reason, and can ask the master for another one."""
+    late = ticket_of(sues[1].ticket)._replace(until=1)
+    response = answer_to(member, sues, late, late.key(key_of_host(HOSTS[0]).key))
+    assert (response.answer.code, bytes(response.content)) == ("stale", b"")

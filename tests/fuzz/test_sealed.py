@@ -47,7 +47,7 @@ def test_a_changed_reading_does_not_open(change: bytes) -> None:
     sent = seal_reading(part.master, CHANNEL, _reading(3))
     changed = bytes(one ^ other for one, other in zip(sent, change, strict=False))
     changed += change[len(sent) :]
-    registered = RegisteredSlave.of(slave, part.run, CHANNEL)
+    registered = RegisteredSlave.of(slave, part.run, CHANNEL, since=0.0)
     opened = open_reading(changed, master.run, {3: registered}.get)
     assert opened in (None, _reading(3))
     assert opened is None or changed[4:] == sent[4:], "the first bytes are the header of CDR"

@@ -366,22 +366,30 @@ def test_replication_continues_after_a_restart_of_the_replicas_slave(make_cluste
 # --- encrypted --------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def patient(make_shared):
+    """Yield a cluster in which a slave may start again before its host is lost."""
+    hosts = [host(f"h{n}") for n in range(3)]
+    return make_shared(*hosts, liveness=LivenessSettings(suspect=3.0, lease=15.0))
+
+
 @pytest.mark.parametrize("fetched", [False, True], ids=["on the replica's host", "on a third host"])
-def test_a_successor_of_a_lost_host_decrypts_the_replica(three, fetched):
+def test_a_successor_of_a_lost_host_decrypts_the_replica(patient, fetched):
     """The host that stores the replica has neither the state nor the key.
 
     Master and slave of the source were restarted: the slave has the key on its disk, and the master
     derives it again from its secret.
     """
     name = f"secret_{'fetched' if fetched else 'kept'}"
-    process = Replicated(three, name, 1_000_000)
-    three.restart_master()
-    three.start_slave_again(process.source)
-    at = copies(three, name)[process.keeper]
-    wait_for_copy(three, name, at + 50)
-    stored = snapshot_directory(three, process.keeper, name)
+    process = Replicated(patient, name, 1_000_000)
+    patient.restart_master()
+    patient.wait_for_hosts()
+    patient.start_slave_again(process.source)
+    at = copies(patient, name)[process.keeper]
+    wait_for_copy(patient, name, at + 50)
+    stored = snapshot_directory(patient, process.keeper, name)
     assert [path.name for path in stored.iterdir() if path.name != "copy.new"] == ["copy"]
-    plain = snapshot_directory(three, process.source, name) / "state.0"
+    plain = snapshot_directory(patient, process.source, name) / "state.0"
     ballast = plain.read_bytes()[-1000:-100]
     assert ballast == bytes(900)
     assert ballast not in (stored / "copy").read_bytes()
@@ -389,18 +397,18 @@ def test_a_successor_of_a_lost_host_decrypts_the_replica(three, fetched):
     number, key = int.from_bytes(record[:8], "little"), record[8:]
     of_number = master_security("keys").snapshot_key
     assert key in {of_number(name, first) for first in range(1, number + 1)}
-    before = copies(three, name)[process.keeper]
+    before = copies(patient, name)[process.keeper]
     if fetched:
-        three.client.set_host_state(process.keeper, "cordon")
+        patient.client.set_host_state(process.keeper, "cordon")
     after = process.lose_host().host
     assert (after == process.keeper) is not fetched
-    assert wait_for_count(three, name, before)[0][0] > before
-    three.wait_for_log(name, f"continues from the snapshot of {name}#")
-    assert_no_key(three, key)
+    assert wait_for_count(patient, name, before)[0][0] > before
+    patient.wait_for_log(name, f"continues from the snapshot of {name}#")
+    assert_no_key(patient, key)
     if fetched:
-        three.client.set_host_state(process.keeper, "uncordon")
+        patient.client.set_host_state(process.keeper, "uncordon")
     process.end()
-    there = snapshot_directory(three, after, name)
+    there = snapshot_directory(patient, after, name)
     wait_until(lambda: not there.exists(), "the key is deleted with the snapshots")
 
 

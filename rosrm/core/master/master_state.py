@@ -465,6 +465,11 @@ class MasterState:
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
         self.neighbours.note_change(name)
 
+    def clear_left_behind(self, process: Process) -> None:
+        """Note that no instance of a process on a lost host counts as its own any more."""
+        process.left_behind = None
+        self.neighbours.note_change(process.name)
+
     def assignment(
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
         shadow: bool = False, restored: bool = False,

@@ -245,7 +245,8 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
 
 
 def _cancel(state: MasterState, process: Process, now: float, by: Requester) -> None:
-    process.wanted, process.left_behind = DesiredState.CANCEL, None
+    process.wanted = DesiredState.CANCEL
+    state.clear_left_behind(process)
     state.record(
         now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
         process=process.name, by=by,

@@ -69,7 +69,9 @@ class MasterEndpoint:
             participant, identity.name, identity.epoch, self.events.append, refuse,
             keys=security.handoff_keys(queries.host_of),
         )  # fmt: skip
-        self._subscriptions = SlaveSubscriptions(endpoints, self.links, self.events.append, refuse)
+        self._subscriptions = SlaveSubscriptions(
+            endpoints, self.links, self.events.append, refuse, strangers
+        )
         self.rivals = RivalWatch(
             endpoints, identity,
             lambda who, reason: refuse("master_beat", who, reason),

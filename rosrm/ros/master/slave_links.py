@@ -8,6 +8,7 @@ discovered the slave's service, because it would be lost otherwise.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -155,7 +156,7 @@ class HostLinks:
         """
         link = self._links.get(host_id)
         peer.run = run
-        slave = RegisteredSlave.of(peer, run, self._readings)
+        slave = RegisteredSlave.of(peer, run, self._readings, time.monotonic())
         if link is None or link.slave is None or link.slave.peer is not peer:
             link = self._new_link(host_id, description.name, slave)
             self._links[host_id] = link

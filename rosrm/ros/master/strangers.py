@@ -24,7 +24,7 @@ class _Count:
 
 
 class Strangers:
-    """Counts of messages of strangers, by the master's own topics and services.
+    """Counts of messages of strangers, by the master's own topics and services, and by host.
 
     Args:
         refuse: called for each record.
@@ -34,19 +34,19 @@ class Strangers:
         self._refuse = refuse
         self._counts: dict[str, _Count] = {}
 
-    def note(self, topic: str) -> None:
-        """Count one message on a topic or service."""
+    def note(self, topic: str, number: int = 1) -> None:
+        """Count messages on a topic or service, or on all topics of a host."""
         now = time.monotonic()
         count = self._counts.setdefault(topic, _Count())
-        count.total += 1
-        count.unrecorded += 1
+        count.total += number
+        count.unrecorded += number
         count.last = now
         if now - count.recorded_at >= _RECORD_PERIOD:
-            number, count.unrecorded, count.recorded_at = count.unrecorded, 0, now
+            messages = counted(count.unrecorded, "message", "messages")
+            count.unrecorded, count.recorded_at = 0, now
             self._refuse(
                 "stranger", f"a sender on {topic}",
-                f"{counted(number, 'message', 'messages')} without a valid key on {topic}; nothing "
-                f"was done",
+                f"{messages} without a valid key on {topic}; nothing was done",
             )  # fmt: skip
 
     def sentence(self) -> str:

@@ -15,10 +15,11 @@ from rosrm.ros import convert, names, qos
 from rosrm.ros.control import version_refusal
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLinks
+from rosrm.ros.master.strangers import Strangers
 from rosrm.ros.polling import polled_subscription, waiting
 from rosrm.ros.reading_codec import decode
 from rosrm.ros.sealed import SealedEndpoints
-from rosrm.ros.sealed_readings import is_of_unknown_host, open_reading
+from rosrm.ros.sealed_readings import may_be_of_former_run, open_reading
 from rosrm.wording import sanitized
 from rosrm_msgs import msg
 
@@ -32,13 +33,15 @@ class SlaveSubscriptions:
     Args:
         links: receives the ids of hosts whose readings arrived.
         refuse: receives refused peers, and reasons.
+        strangers: counts the messages without a valid key, also those that slaves report.
     """
 
     def __init__(
         self, endpoints: SealedEndpoints[Authority], links: HostLinks,
-        handle: Callable[[happened.Event], None], refuse: Refuse,
+        handle: Callable[[happened.Event], None], refuse: Refuse, strangers: Strangers,
     ) -> None:  # fmt: skip
         self._endpoints = endpoints
+        self._strangers = strangers
         self._links = links
         self._handle = handle
         self._refuse = refuse
@@ -74,8 +77,7 @@ class SlaveSubscriptions:
     def _opened(self, sealed: bytes) -> bytes | None:
         run, slave_of = self._endpoints.security.run, self._links.slave_of
         plain = open_reading(sealed, run, slave_of)
-        # After a restart of the master, slaves send readings until they notice the restart.
-        if plain is None and not is_of_unknown_host(sealed, slave_of):
+        if plain is None and not may_be_of_former_run(sealed, slave_of, time.monotonic()):
             self._endpoints.refused(self._topic)
         return plain
 
@@ -98,6 +100,10 @@ class SlaveSubscriptions:
         if fault:
             self._refuse("process_status", who, fault)
             return
+        slave = self._links.slave_of(message.host_id)
+        if message.strangers and slave is not None:
+            topics = f"the topics of {slave.peer.grant.principal}"
+            self._strangers.note(topics, message.strangers)
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
             devices = convert.devices_from_msg(message.devices)

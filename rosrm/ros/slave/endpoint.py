@@ -57,6 +57,9 @@ _MISSED_BEATS: Final = 10
 _MISSED_BY_ANOTHER: Final = 3
 #: Seconds after which the slave logs that the master receives none of its messages.
 _SILENCE_LOGGED: Final = 5.0
+#: Seconds between two reports of messages without a valid key, and the highest number in one.
+_STRANGERS_EVERY: Final = 10.0
+_MOST_STRANGERS: Final = 2**32 - 1
 #: Seconds between two beats that no master exceeds.
 _LONGEST_BEAT_PERIOD: Final = 3600.0
 
@@ -126,6 +129,9 @@ class SlaveEndpoint:
         self._poll_again = _FIRST_POLL_AGAIN
         self._status_sequence = 0
         self._silent_since = math.inf  # -inf: the silence is logged
+        self._strangers = 0
+        self._strangers_at = -math.inf
+        endpoints.refused = self._note_stranger
         participant = endpoints.participant
         self._control = ControlClient(participant, f"slave {description.name}")
         self._names = names.Names(participant.settings.namespace)
@@ -161,6 +167,11 @@ class SlaveEndpoint:
         )
         endpoints.follow(msg.MasterBeat, path(names.MASTER_BEAT), qos.BEAT_IN, self._take_beat)
 
+    def _note_stranger(self, topic: str) -> None:
+        """Count a message without a valid key for the next statuses."""
+        del topic
+        self._strangers = min(self._strangers + 1, _MOST_STRANGERS)
+
     # --- finding the master --------------------------------------------------------------
 
     def advance(self, now: float) -> None:
@@ -174,6 +185,10 @@ class SlaveEndpoint:
             silence = now - self._beat_at
             keep = "; processes keep running" if self._leaves is None else ""
             self._lose_master(f"the master has been silent for {silence:.1f} s{keep}")
+        is_due = self._strangers and now - self._strangers_at >= _STRANGERS_EVERY
+        if is_due and self.link is MasterLink.REGISTERED:
+            self._strangers_at = now
+            self.publish_statuses((), complete=False)
 
     def _greet(self, now: float) -> None:
         self.link = MasterLink.GREETING
@@ -410,7 +425,8 @@ class SlaveEndpoint:
             msg.ProcessStatusBatch(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                 incarnation=self._description.incarnation, sequence=self._status_sequence,
-                complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
+                complete=complete, strangers=self._strangers,
+                statuses=[convert.status_to_msg(one) for one in statuses],
                 failing=[
                     msg.PluginState(
                         kind=kind, name=name, state="failing",
@@ -421,6 +437,7 @@ class SlaveEndpoint:
                 devices=convert.devices_to_msg(self.devices),
             )
         )  # fmt: skip
+        self._strangers = 0
 
     def publish_usage(
         self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int],

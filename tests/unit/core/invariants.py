@@ -6,6 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
+from rosrm.core.master.assignment.neighbours import locate
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
@@ -64,3 +65,9 @@ def _devices_balance(state: MasterState, host: Host) -> None:
         migration = state.migrations.get(one.process)
         returns = migration is not None and migration.source_host is host
         assert one.number in host.instances or (returns and not migration.committed), one
+
+
+def known_places_are_current(state: MasterState) -> None:
+    """Check that the index of neighbours has the hosts on which the processes run or may run."""
+    for name, at in state.neighbours.located.items():
+        assert at == locate(state, name), name

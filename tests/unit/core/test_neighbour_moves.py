@@ -126,6 +126,7 @@ class Neighbours(RuleBasedStateMachine):
     def state_is_sound(self) -> None:
         invariants.no_process_is_lost(self.cluster.state)
         invariants.the_books_balance(self.cluster.state)
+        invariants.known_places_are_current(self.cluster.state)
 
     def live(self) -> list[str]:
         known = self.cluster.state.processes.values()

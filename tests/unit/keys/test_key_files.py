@@ -82,7 +82,7 @@ def test_a_directory_of_keys_that_cannot_be_used_is_refused(tmp_path: Path, faul
 
 
 def test_a_key_file_is_valid_until_its_grant_is_revoked(tmp_path: Path) -> None:
-    """A new key ends the former one; the generation of a revoked key is not used again."""
+    """A new key ends the former one."""
     secret = key_files.make_secret(tmp_path)
     first = key_files.add_grant(tmp_path, ROBOT, Role.HOST)
     path = tmp_path / "robot-1.key"
@@ -101,7 +101,21 @@ def test_a_key_file_is_valid_until_its_grant_is_revoked(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no key of host:robot-1"):
         key_files.revoke(tmp_path, [ROBOT])
     assert key_files.read_grants(tmp_path) == []
-    assert key_files.add_grant(tmp_path, ROBOT, Role.HOST).generation == second.generation + 1
+
+
+@pytest.mark.parametrize("fault", ["lost", "from a backup"])
+def test_a_revoked_key_stays_void_whatever_happens_to_the_grants(tmp_path: Path, fault) -> None:
+    """A new key differs from those that a lost, or a newer, file of the grants had revoked."""
+    grants = tmp_path / key_files.GRANTS_FILE
+    stolen = [key_files.add_grant(tmp_path, ROBOT, Role.HOST)]
+    backup = grants.read_bytes()
+    stolen.append(key_files.add_grant(tmp_path, ROBOT, Role.HOST))
+    key_files.revoke(tmp_path, [ROBOT])
+    grants.unlink()
+    if fault == "from a backup":
+        grants.touch(mode=0o600)
+        grants.write_bytes(backup)
+    assert key_files.add_grant(tmp_path, ROBOT, Role.HOST) not in stolen
 
 
 def test_a_process_finds_its_own_key(tmp_path: Path) -> None:

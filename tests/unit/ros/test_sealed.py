@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from array import array
 from types import SimpleNamespace
 
@@ -9,13 +10,22 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.errors import Refused
+from rosrm.keys.cluster import ClusterSecret, own_grant
+from rosrm.keys.links import SealedMessage
 from rosrm.keys.roles import Principal
-from rosrm.keys.security import NoSecurity, Peer
+from rosrm.keys.security import Member, MemberSecurity, NoSecurity, Peer
 from rosrm.keys.tickets import Ticket
 from rosrm.ros import qos
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.participant import Participant
-from rosrm.ros.sealed import SealedEndpoints, envelope_to_msg, request_channel, sealed
+from rosrm.ros.sealed import (
+    SealedEndpoints,
+    answer_channel,
+    envelope_from_msg,
+    envelope_to_msg,
+    request_channel,
+    sealed,
+)
 from rosrm_msgs import msg, srv
 
 SUBMIT, BEATS = "/rosrm/submit", "/rosrm/master_beat"
@@ -24,7 +34,7 @@ SUBMIT, BEATS = "/rosrm/submit", "/rosrm/master_beat"
 class Service:
     """A sealed service of a master without a ROS context."""
 
-    def __init__(self, kind, name: str, handle, security: NoSecurity | None = None) -> None:
+    def __init__(self, kind, name: str, handle, security: Member | None = None) -> None:
         made = Participant.__new__(Participant)
         made._executed, made.guard, made.node = 0, CallbackGuard(), self
         self.kind, self.name = kind, name
@@ -46,11 +56,16 @@ class Service:
         """Return the answers to a request, by default of a user."""
         sender = sender or NoSecurity(Principal("user", "ada")).master
         channel = request_channel(self.kind, self.name)
-        self.take(envelope_to_msg(sealed(sender, channel, request or self.kind.Request())))
-        return [
-            deserialize_message(bytes(response.message.body), self.kind.Response)
-            for response in self.sent
+        asked = sealed(sender, channel, request or self.kind.Request())
+        self.take(envelope_to_msg(asked))
+        reference = SealedMessage(asked.run, asked.counter, b"").reference
+        channel = answer_channel(self.kind, self.name)
+        answers = [envelope_from_msg(response.message) for response in self.sent]
+        plain = [
+            sender.link.open(channel, SealedMessage(one.run, one.counter, one.body), reference)
+            for one in answers
         ]
+        return [deserialize_message(one, self.kind.Response) for one in plain]
 
 
 @pytest.mark.parametrize(("kind", "name"), [(srv.Submit, SUBMIT), (srv.Handshake, "/handshake")])
@@ -118,19 +133,26 @@ def test_a_message_of_no_principal_is_counted_and_not_answered(fields) -> None:
     assert service.sent == []
 
 
-def test_a_ticket_from_before_a_revocation_is_refused() -> None:
-    """Its bearer may have lost its key; another bearer asks the master for a new ticket."""
+@pytest.mark.parametrize(
+    ("seconds", "version", "is_handled"),
+    [(59.0, 7, True), (59.0, 8, True), (59.0, 6, False), (-1.0, 7, False), (3600.0, 7, False)],
+    ids=["valid", "newer keys", "before a revocation", "expired", "before the host's boot"],
+)
+def test_only_a_ticket_in_force_is_accepted(seconds, version, is_handled) -> None:
+    """Its bearer may have lost its key; another bearer asks the master for a new ticket at once."""
     host, handled = Principal("host", "robot-1"), []
+    secret = ClusterSecret(bytes(32))
+    key = secret.key_of(own_grant(host))
     service = Service(
-        srv.ReadLog, "/read_log", lambda *_: handled.append("ticket"), NoSecurity(host)
+        srv.ReadLog, "/read_log", lambda *_: handled.append("ticket"), MemberSecurity(key)
     )
     service.security.tickets_from = 7
-    for version, code in ((6, "stale"), (7, None), (8, None)):
-        name = Ticket(1, version, "read_log", 0, "p", Principal("user", "ada")).text()
-        bearer = NoSecurity(host).bearer(name, b"", service.security.run)
-        answers = service.answers(sender=bearer)
-        assert code is None or answers[-1].answer.code == code
-    assert handled == ["ticket", "ticket"]
+    until = time.monotonic_ns() + int(seconds * 1e9)
+    ticket = Ticket(until, version, "read_log", 0, "p", Principal("user", "ada"))
+    bearer = MemberSecurity(key).bearer(ticket.text(), ticket.key(key.key), service.security.run)
+    codes = [response.answer.code for response in service.answers(sender=bearer)]
+    assert (handled, codes) == ((["ticket"], []) if is_handled else ([], ["stale"]))
+    assert service.refused == []
 
 
 class Follower:

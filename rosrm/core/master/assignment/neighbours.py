@@ -227,7 +227,8 @@ def _places_apart(state: MasterState, process: Process) -> _Places:
         for theirs, members in state.neighbours.groups.get(rule.group, _NO_MEMBERS).items():
             at = _instances_at(state, process, members)
             own.update(at)
-            found[theirs].update(at)
+            if found[theirs] is not own:
+                found[theirs].update(at)
     for other in state.neighbours.about.get(process.name, ()):
         for rule in _rules_about(state, other, process.name, "apart"):
             found[rule.by, rule.prefer].update(_instances_at(state, process, (other,)))
@@ -236,13 +237,22 @@ def _places_apart(state: MasterState, process: Process) -> _Places:
 
 def _instances_at(state: MasterState, process: Process, names: Iterable[str]) -> _At:
     """Return host and name of each instance of other processes that runs or may run."""
-    found: _At = {}
+    located, found = state.neighbours.located, list[tuple[str, str]]()
     for name in names:
-        other = state.processes.get(name)
-        if other is None or other is process:
-            continue
-        for number in sorted(other.instances):
-            found[state.instances[number].host.name, name] = None
-        if other.left_behind is not None:
-            found[other.left_behind.host, name] = None
-    return found
+        at = located.get(name)
+        if at is None:
+            at = located[name] = locate(state, name)
+        if at and name != process.name:
+            found += at
+    return dict.fromkeys(found)
+
+
+def locate(state: MasterState, name: str) -> tuple[tuple[str, str], ...]:
+    """Return host and name of each instance of a process that runs or may run."""
+    process = state.processes.get(name)
+    if process is None:
+        return ()
+    hosts = [state.instances[number].host.name for number in sorted(process.instances)]
+    if process.left_behind is not None:
+        hosts.append(process.left_behind.host)
+    return tuple((host, name) for host in hosts)

@@ -221,7 +221,7 @@ def leave_behind(state: MasterState, migration: Migration, step: Execute) -> boo
         return False
     process = state.processes[migration.process]
     if process.left_behind is not None and process.left_behind.host == step.host:
-        process.left_behind = None
+        state.clear_left_behind(process)
         state.save(process)
     return True
 

@@ -153,7 +153,7 @@ def _commit(state: MasterState, migration: Migration, step: Commit, now: float) 
     else:
         process.owner = migration.destination.number
         images.set_image(state, process, None)
-    process.left_behind = None  # a source on a lost host has a successor now
+    state.clear_left_behind(process)  # a source on a lost host has a successor now
     process.migrations += migration.aim is Aim.MOVE
     process.moved_at = now
     if process.wanted is DesiredState.REQUEUE:

@@ -56,7 +56,8 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     migration.started, migration.wall = now, state.wall
     migration.cause = f"{migration.source} has ended"
     process.wanted = DesiredState.RUN
-    process.left_behind, process.standby_reason = None, ""
+    state.clear_left_behind(process)
+    process.standby_reason = ""
     state.migrations[process.name] = migration
     why, host = migration.cause, migration.destination_host.name
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {why}")

@@ -21,6 +21,7 @@ class NeighbourRules:
         groups: group to label and strictness of its rules, to the processes with such a rule.
         version: counter of changes of the rules and of the hosts of the processes concerned.
         apart_of: process to the version and its resolved rules of the relation "apart".
+        located: process to host and name of each of its instances, where they are known.
         separated: process that runs apart from one near which it must run, to the reason and the
             time of the next attempt to move it there.
     """
@@ -31,6 +32,7 @@ class NeighbourRules:
         self.groups: dict[str, dict[tuple[str, bool], dict[str, None]]] = {}
         self.version = 0
         self.apart_of: dict[str, tuple[int, tuple[Neighbour, ...]]] = {}
+        self.located: dict[str, tuple[tuple[str, str], ...]] = {}
         self.separated: dict[str, tuple[str, float]] = {}
 
     def add(self, spec: ProcessSpec) -> None:
@@ -59,7 +61,8 @@ class NeighbourRules:
                 del self.groups[group]
 
     def note_change(self, name: str) -> None:
-        """Note that an instance of a process was added or has ended."""
+        """Note that an instance of a process was added, has ended, or no longer counts."""
+        self.located.pop(name, None)
         if self.concern(name):
             self.version += 1
 

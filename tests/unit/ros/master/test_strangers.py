@@ -37,6 +37,16 @@ def test_messages_of_strangers_are_recorded_once_for_each_topic(clock) -> None:
     assert "5000 messages without a valid key" in recorded[-1][2]
 
 
+def test_the_messages_that_a_slave_reports_are_added(clock) -> None:
+    """Its host is named in place of a topic."""
+    recorded: list[tuple[str, ...]] = []
+    seen = Strangers(lambda *one: recorded.append(one))
+    seen.note("/rosrm/submit")
+    seen.note("the topics of host:robot-1", 40)
+    assert recorded[-1][2].startswith("40 messages without a valid key on the topics of host:robot")
+    assert seen.sentence().startswith("41 messages without a valid key refused, the last")
+
+
 def test_the_status_has_the_newest_of_the_last_hour(clock) -> None:
     seen = Strangers(lambda *_: None)
     assert seen.sentence() == ""

@@ -432,6 +432,23 @@ def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch, ca
     monkeypatch.undo()
 
 
+def test_messages_without_a_valid_key_are_reported_at_a_bounded_rate(slave) -> None:
+    """The first at once, further ones every ten seconds, none twice."""
+    published: list[msg.ProcessStatusBatch] = []
+    slave.endpoint._statuses.publish = published.append
+    master = Master(slave, 11)
+    slave.wire.refused("/rosrm/host/h0/control")
+    slave.join(master)
+    slave.pass_time(1.0, master)
+    assert [one.strangers for one in published] == [1]
+    for _ in range(5000):
+        slave.wire.refused("/rosrm/host/h0/control")
+    slave.pass_time(5.0, master)
+    assert len(published) == 1
+    slave.pass_time(30.0, master)
+    assert [one.strangers for one in published] == [1, 5000]
+
+
 def test_a_slave_that_the_master_does_not_receive_says_so_once(slave, caplog) -> None:
     """For example after its key was revoked; the beats of the master still arrive."""
     master = Master(slave, 11)
