@@ -34,7 +34,7 @@ _INT32: Final = st.integers(-(2**31), 2**31 - 1)
 _UNITS: Final = st.lists(PROPER_NAMES, max_size=3, unique=True).map(tuple)
 _SHARES: Final = st.floats(0.0, 1.0, exclude_min=True)
 _ASKED: Final = st.one_of(
-    st.builds(DeviceNeed, PROPER_NAMES, _SHARES | st.integers(1, 256).map(float)),
+    st.builds(DeviceNeed, PROPER_NAMES, st.floats(0.001, 1.0) | st.integers(1, 256).map(float)),
     st.builds(
         lambda kind, units: DeviceNeed(kind, float(len(units) or 1), units), PROPER_NAMES, _UNITS
     ),

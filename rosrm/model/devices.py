@@ -9,8 +9,9 @@ from typing import Final
 
 #: Highest number of devices of a host, and of units that a process may ask for.
 MOST_DEVICES: Final = 256
-#: Highest number of processes to which one unit may be given.
+#: Highest number of processes to which one unit may be given, and its smallest share.
 MOST_SHARING: Final = 1000
+_SMALLEST: Final = 1.0 / MOST_SHARING
 #: Kind of the devices that CUDA knows by their index.
 GPU: Final = "gpu"
 
@@ -99,8 +100,8 @@ def need_fault(needs: Iterable[DeviceNeed]) -> str:
             return f"{need.kind}: a unit is given twice: {', '.join(need.units)}"
         if need.units and need.amount != len(need.units):
             return f"{need.kind}: {need.amount:g} of {len(need.units)} named units are required"
-        if not 0.0 < need.amount <= MOST_DEVICES:  # also where it is NaN
-            return f"{need.kind}: {need.amount} is not above 0 and at most {MOST_DEVICES}"
+        if not _SMALLEST <= need.amount <= MOST_DEVICES:  # also where it is NaN
+            return f"{need.kind}: {need.amount} is not within {_SMALLEST:g}..{MOST_DEVICES}"
         if need.amount > 1.0 and need.amount != int(need.amount):
             return (
                 f"{need.kind}: {need.amount:g} is neither a whole number of units nor a share of "

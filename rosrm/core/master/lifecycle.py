@@ -133,7 +133,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
     before = instance.state
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
     _note_load(state, instance, before, now)
-    state.set_devices(instance, status.devices)
+    state.note_held(instance, status.devices)
     if status.state.ended:
         _ended(state, instance, status, before, now)
     review_slots(state, host, now)
@@ -212,7 +212,7 @@ def _handle_unknown_instance(
         process=status.instance.process, host=host.name,
     )  # fmt: skip
     unknown = adopt_to_stop(state, status.instance, host, now)
-    state.set_devices(unknown, status.devices)
+    state.note_held(unknown, status.devices)
     unknown.state, unknown.pid = status.state, status.pid
     unknown.at_once = followed
     stop_instance(state, unknown, now)

@@ -423,7 +423,7 @@ class MasterState:
         need = ranking.need[:, host.column]
         self.add_instance(instance, host, now, demand, need, devices=devices)
 
-    def set_devices(self, instance: Instance, devices: tuple[HeldDevice, ...]) -> None:
+    def note_held(self, instance: Instance, devices: tuple[HeldDevice, ...]) -> None:
         """Note the devices that an instance holds by the report of its slave.
 
         A slave releases no device of a running instance, so an empty report means "unknown".

@@ -69,12 +69,13 @@ def test_devices_of_a_process(file, section, expected):
 @pytest.mark.parametrize(
     ("section", "said"),
     [
-        ("{gpu: 0}", "devices: gpu: 0.0 is not above 0 and at most 256"),
-        ("{gpu: -1}", "devices: gpu: -1.0 is not above 0"),
+        ("{gpu: 0}", "devices: gpu: 0.0 is not within 0.001..256"),
+        ("{gpu: -1}", "devices: gpu: -1.0 is not within"),
+        ("{gpu: 0.0005}", "devices: gpu: 0.0005 is not within 0.001..256"),
         ("{gpu: 1.5}", "gpu: 1.5 is neither a whole number of units nor a share of one unit"),
-        ("{gpu: 1e9}", "is not above 0 and at most 256"),
-        ("{gpu: .nan}", "devices: gpu: nan is not above 0 and at most 256"),
-        ("{gpu: .inf}", "devices: gpu: inf is not above 0"),
+        ("{gpu: 1e9}", "is not within 0.001..256"),
+        ("{gpu: .nan}", "devices: gpu: nan is not within 0.001..256"),
+        ("{gpu: .inf}", "devices: gpu: inf is not within"),
         ("{gpu: true}", "devices.gpu: True: a number such as 1 or 0.5, the name of a unit"),
         ("{gpu: []}", "devices.gpu: []: a number such as 1 or 0.5, the name of a unit"),
         ("{camera: [a, a]}", "camera: a unit is given twice: a, a"),

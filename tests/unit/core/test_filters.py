@@ -169,6 +169,25 @@ def test_a_refreshed_ranking_equals_a_new_one(
         assert ranking.value.tolist() == ranked(table, demand).value.tolist()
 
 
+@given(tables(), st.lists(device_needs, min_size=1, max_size=3), st.data())
+def test_counts_of_devices_follow_every_change(
+    table: HostTable, needs: list[tuple[DeviceNeed, ...]], data: st.DataObject
+) -> None:
+    """They are cached by needs, and equal to those of a new table."""
+    for number in range(data.draw(st.integers(0, 4))):
+        host = table.hosts[data.draw(st.integers(0, len(table) - 1))]
+        wanted = data.draw(st.sampled_from(needs))
+        before = table.devices.counts(wanted)[host.column]
+        held = table.devices[host.column].choose(wanted)
+        assert (held is not None) == (before > 0)
+        table.hold(host, InstanceId("p", number), held or ())
+        for one in needs:
+            inventories = table.devices.at(slice(0, len(table)))
+            assert table.devices.counts(one).tolist() == [it.count(one) for it in inventories]
+            empty = [it.emptied().count(one) for it in inventories]
+            assert table.devices.counts(one, empty=True).tolist() == empty
+
+
 @given(tables(most=3), demands())
 def test_no_process_is_set_aside_if_a_host_takes_it_now(table: HostTable, demand: Demand) -> None:
     """The reason of a process that is set aside names each host."""

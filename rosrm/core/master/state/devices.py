@@ -24,8 +24,9 @@ DeviceNeeds = tuple[DeviceNeed, ...]
 COUNTED: Final = 8
 #: Tolerance in comparisons of sums of shares.
 _CLOSE: Final = 1e-9
-#: Highest number of different needs whose counts are cached.
+#: Bounds of the cache: different needs, and changes of inventories that it has not seen.
 _MOST_CACHED: Final = 256
+_MOST_CHANGES: Final = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +99,8 @@ class Inventory:
             if device.kind != need.kind or (need.units and device.unit not in need.units):
                 continue
             share = need.amount if need.amount < 1.0 else 1.0 / device.shareable
-            left = free.get((device.kind, device.unit), 0.0)
-            if left + _CLOSE >= share:
+            left = free.get((device.kind, device.unit))
+            if left is not None and left + _CLOSE >= share:
                 order = left if need.amount < 1.0 else -left
                 fitting.append((order, HeldDevice(device.kind, device.unit, share)))
         many = max(1, int(need.amount))
@@ -159,28 +160,45 @@ def _asked(need: DeviceNeed) -> str:
 _NONE: Final = Inventory()
 
 
+@dataclass(slots=True)
+class _Counts:
+    """Cached counts.
+
+    Attributes:
+        of: (H,) number of processes for which each host has devices.
+        seen: number of changes of inventories that the counts include.
+    """
+
+    of: IntArray
+    seen: int
+
+
 class DeviceTable:
     """Inventories of all hosts by column, with cached counts for the needs in use."""
 
     def __init__(self) -> None:
         self._inventories: list[Inventory] = []
-        self._counts: dict[tuple[DeviceNeeds, bool], IntArray] = {}
+        self._counts: dict[tuple[DeviceNeeds, bool], _Counts] = {}
+        self._changed: list[int] = []
 
     def add_column(self) -> None:
         """Add a host without devices."""
         self._inventories.append(_NONE)
+        self._forget()
+
+    def _forget(self) -> None:
         self._counts.clear()
+        self._changed.clear()
 
     def __getitem__(self, column: int) -> Inventory:
         return self._inventories[column]
 
     def __setitem__(self, column: int, inventory: Inventory) -> None:
         """Replace the inventory of a host."""
-        before, self._inventories[column] = self._inventories[column], inventory
-        offered = before.devices != inventory.devices
-        for (needs, empty), counts in self._counts.items():
-            if offered or not empty:
-                counts[column] = _count(inventory, needs, empty=empty)
+        self._inventories[column] = inventory
+        self._changed.append(column)
+        if len(self._changed) > _MOST_CHANGES:
+            self._forget()
 
     def counts(self, needs: DeviceNeeds, *, empty: bool = False) -> IntArray:
         """Return for how many processes with these needs each host has devices, (H,).
@@ -190,9 +208,14 @@ class DeviceTable:
         known = self._counts.get((needs, empty))
         if known is None:
             if len(self._counts) >= _MOST_CACHED:
-                self._counts.clear()
-            known = self._counts[needs, empty] = self._count_all(needs, empty=empty)
-        return known
+                self._forget()
+            counts = self._count_all(needs, empty=empty)
+            known = self._counts[needs, empty] = _Counts(counts, len(self._changed))
+        for column in set(self._changed[known.seen :]):
+            inventory = self._inventories[column]
+            known.of[column] = (inventory.emptied() if empty else inventory).count(needs)
+        known.seen = len(self._changed)
+        return known.of
 
     def _count_all(self, needs: DeviceNeeds, *, empty: bool) -> IntArray:
         alike: dict[tuple[Device, ...], int] = {}  # most hosts of a cluster have equal devices
@@ -215,7 +238,3 @@ class DeviceTable:
     def kinds(self) -> list[str]:
         """Return the kinds of devices that any host offers."""
         return sorted({one.kind for inventory in self._inventories for one in inventory.devices})
-
-
-def _count(inventory: Inventory, needs: DeviceNeeds, *, empty: bool) -> int:
-    return (inventory.emptied() if empty else inventory).count(needs)
