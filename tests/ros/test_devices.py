@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+import pytest
 
 from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.rows import DeviceRow
@@ -16,6 +19,45 @@ SHOW = (
     "sh", "-c",
     'echo "$0 $ROSRM_DEVICE_CAMERA gpus:$CUDA_VISIBLE_DEVICES:"; exec sleep 1000',
 )  # fmt: skip
+
+
+#: A plugin whose probe finds a device for each file in a folder, and labels its host.
+FINDER = """
+from pathlib import Path
+from rosrm import Device, ProbeOffer, Reading, ResourceDescription, hookimpl
+
+HERE = Path(__file__).parent
+
+class Finder:
+    resources = [ResourceDescription("bays", "1", 2.0)]
+    labels = {"bay.model": "X", "rack": "of the probe"}
+    def __init__(self, options, context): pass
+    def read(self): return [Reading("bays", 0.0)]
+    def devices(self):
+        there = {one.name for one in HERE.glob("bay*")}
+        return [
+            Device("bay", unit, missing="" if f"bay{unit}" in there else "empty") for unit in "01"
+        ]
+    def close(self): pass
+
+@hookimpl
+def register_probes():
+    return [ProbeOffer("bays", Finder)]
+"""
+
+
+@pytest.fixture
+def bays(tmp_path, monkeypatch):
+    """Install the plugin, and return its folder."""
+    (tmp_path / "finder.py").write_text(FINDER)
+    info = tmp_path / "finder-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: finder\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[rosrm]\nfinder = finder\n")
+    before = os.environ.get("PYTHONPATH", "")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [before])]))
+    monkeypatch.syspath_prepend(tmp_path)  # the starting process finds the plugin
+    return tmp_path
 
 
 def camera(directory: Path, unit: str) -> Device:
@@ -110,3 +152,24 @@ def test_a_process_that_moves_gets_the_device_of_its_new_host(make_cluster, tmp_
         lambda: devices_of(cluster, first)[before.title].free == 1.0, "the source's camera is free",
         pause=cluster.client.spin,
     )  # fmt: skip
+
+
+def test_a_probe_adds_devices_and_labels_to_its_host(make_cluster, bays) -> None:
+    """Labels of the settings win; a device that the probe misses fails the process on it."""
+    (bays / "bay0").touch()
+    probes = {"memory": {}, "cpu": {}, "bays": {}}
+    cluster = make_cluster(host("a", probes=probes, labels={"rack": "1"}), liveness=STEADY)
+    wanted = {"bay.model": "X", "rack": "1"}
+    bay = (DeviceNeed("bay"),)
+    cluster.submit(service("first", devices=bay, required_labels=wanted))
+    cluster.wait("first", "running")
+    cluster.submit(service("second", devices=bay, restart=RestartPolicy("never")))
+    (bays / "bay1").touch()
+    cluster.wait("second", "running")
+    assert {one.title: one.holders[0][:-1] for one in devices_of(cluster).values()} == {
+        "bay 0": "first#", "bay 1": "second#",
+    }  # fmt: skip
+    (bays / "bay1").unlink()
+    row = cluster.wait("second", "failed")
+    assert row.reason.startswith("unhealthy: bay 1 is missing: empty")
+    assert cluster.wait("first", "running").restarts == 0

@@ -164,6 +164,25 @@ def test_a_resource_that_no_message_can_carry_is_refused(context, described, sai
     assert f"Probe ({__file__}:{inspect.getsourcelines(Probe)[1]}) {said}" in failed(result)["a"]
 
 
+@pytest.mark.parametrize(
+    ("labels", "said"),
+    [
+        (["gpu"], "has `labels` of type list; a mapping is required"),
+        ({"gpu": 3}, "has the label 3; printable text is required"),
+        ({"gpu": "\x1b"}, "printable text is required"),
+    ],
+)
+def test_labels_that_no_host_can_have_are_refused(context, labels, said):
+    """The probe fails with its class and place; other labels are those of the host."""
+    probe = Probe("a")
+    probe.labels = labels
+    registry = registry_of(offered("a", lambda options, context: probe))
+    assert said in failed(registry.probes({"a": {}}, context))["a"]
+    probe.labels = {"gpu": "a model"}
+    (made,) = registry.probes({"a": {}}, context).made
+    assert made.labels == {"gpu": "a model"}
+
+
 def test_a_probe_reads_only_what_its_offer_declares(context):
     """Names of resources in a file can thus be checked before any probe is made."""
     registry = registry_of(offered("fds", lambda options, context: Probe("files")))
