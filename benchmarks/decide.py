@@ -36,6 +36,7 @@ from rosrm.core.master.commands import Assign
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.placement import PlacementPlugins, ScoringLink
 from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -73,8 +74,9 @@ class Bench:
         self._sequence = 0
         self._hosts = hosts
         self._random = np.random.default_rng(hosts)
-        weighted = Weighted(WeightedOptions())
-        self.state = MasterState(CoreSettings(), "weighted", weighted, {}, epoch=1)
+        policy = ScoringLink("weighted", Weighted(WeightedOptions()))
+        placement = PlacementPlugins((policy,))
+        self.state = MasterState(CoreSettings(), placement, {}, epoch=1)
         described = tuple(
             ResourceDescription(name, unit, capacity)
             for name, unit, capacity in (

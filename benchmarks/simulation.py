@@ -21,6 +21,7 @@ from benchmarks.machine import parser, print_report, say
 from benchmarks.stopping import run
 from rosrm.core.master.events import ReadingsReceived
 from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.placement import PlacementPlugins, ScoringLink
 from rosrm.master.recorder import Recorder
 from rosrm.model.values import RESOURCE_SLOTS, Kind, ProcessSpec, ResourceDescription
 from rosrm.recording.reader import Header
@@ -61,8 +62,8 @@ def fleet(seed: int) -> Workload:
 
 def simulated(seed: int) -> tuple[float, int]:
     """Return the seconds of CPU and the events of one run."""
-    policy = ("weighted", Weighted(WeightedOptions()))
-    simulation = Simulation(fleet(seed), CoreSettings(), policy, {})
+    placement = PlacementPlugins((ScoringLink("weighted", Weighted(WeightedOptions())),))
+    simulation = Simulation(fleet(seed), CoreSettings(), placement, {})
     began = time.process_time()
     outcome = simulation.run()
     took = time.process_time() - began

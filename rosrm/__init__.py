@@ -24,11 +24,14 @@ The public names, by purpose:
 Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
                 HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
-                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed
+                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
+                ReschedulePolicy
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
                 Sessions, ResourceDescription, Accounting, Reading, Device
-  scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
+  scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, LinkView, FlowView,
+                FloatArray, BoolArray
+  filters       FilterOffer, PlacementFilter
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
   launchers     LauncherOffer, Launcher, LauncherContext, Launch, ProcessTreeLauncher,
@@ -75,6 +78,7 @@ if TYPE_CHECKING:
         CheckpointPolicy,
         CheckpointView,
         DeviceFinding,
+        FilterOffer,
         FloatArray,
         GraphDepartureLauncher,
         HostChecking,
@@ -92,6 +96,7 @@ if TYPE_CHECKING:
         MigrationStrategy,
         NoOptions,
         PeriodicImaging,
+        PlacementFilter,
         Probe,
         ProbeContext,
         ProbeOffer,
@@ -105,6 +110,7 @@ if TYPE_CHECKING:
         SpecChecking,
     )
     from rosrm.extensions.hookspecs import hookimpl
+    from rosrm.extensions.link_views import FlowView, LinkView
     from rosrm.extensions.options import options_of
     from rosrm.extensions.units import (
         Amount,
@@ -154,6 +160,7 @@ if TYPE_CHECKING:
         ProcessSpec,
         Readiness,
         Reading,
+        ReschedulePolicy,
         ResourceDescription,
         RestartPolicy,
         StandbyPolicy,
@@ -166,17 +173,18 @@ __all__ = [
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
-    "EventRow", "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher",
-    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLabelling", "HostLossPolicy",
+    "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
+    "GraphDepartureLauncher", "HandoffPhase", "Health", "HostChecking", "HostDescription",
+    "HostLabelling", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
-    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
+    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "LinkView", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
     "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
-    "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
-    "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
-    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
-    "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError",
-    "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
+    "PlacementFilter", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
+    "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
+    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
+    "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
+    "RosrmError", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
     "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
     "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
@@ -190,13 +198,14 @@ _NAMES: Final = {
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
     "extensions.contracts": (
         "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
-        "DeviceFinding FloatArray GraphDepartureLauncher HostChecking HostLabelling HostView "
-        "ImageLauncher Imaging Launch Launcher LauncherContext LauncherOffer MemoryPacing "
-        "MemoryView MigrationOffer MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext "
-        "ProbeOffer ProcessMeasuring ProcessTreeLauncher ProcessView Scores ScoringOffer "
-        "ScoringPolicy Sessions SpecChecking"
+        "DeviceFinding FilterOffer FloatArray GraphDepartureLauncher HostChecking HostLabelling "
+        "HostView ImageLauncher Imaging Launch Launcher LauncherContext LauncherOffer "
+        "MemoryPacing MemoryView MigrationOffer MigrationStrategy NoOptions PeriodicImaging "
+        "PlacementFilter Probe ProbeContext ProbeOffer ProcessMeasuring ProcessTreeLauncher "
+        "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
+    "extensions.link_views": "FlowView LinkView",
     "extensions.options": "options_of",
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
@@ -210,8 +219,8 @@ _NAMES: Final = {
     "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
-        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ResourceDescription "
-        "RestartPolicy StandbyPolicy StopPolicy"
+        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
+        "ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {

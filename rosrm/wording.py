@@ -186,3 +186,15 @@ def duration(seconds: float) -> str:
         return f"{minutes} min"
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d"
+
+
+def reload_summary(changed: Sequence[str], kept: Sequence[str]) -> str:
+    """Return a predicate on a reload: the changed settings, and those that need a restart."""
+    done = f"reloaded {listed(changed)}" if changed else "no setting to reload has changed"
+    need = "needs" if len(kept) == 1 else "need"
+    return f"{done}; {listed(kept)} {need} a restart, and stay as before" if kept else done
+
+
+def weighted(name: str, weight: float) -> str:
+    """Return a term of a weighted sum: `0.5 x network`; without a weight of 1."""
+    return name if weight == 1.0 else f"{weight:g} x {name}"

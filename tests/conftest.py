@@ -15,6 +15,9 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from rosrm.runtime import cgroups
+from rosrm.supervisor.group_trees import PREFIX
+from rosrm.supervisor.instance_groups import remove_empty
 from tests.criu_kit import criu, theatre  # noqa: F401 - fixtures of several layers
 
 HERE = Path(__file__).parent
@@ -68,6 +71,17 @@ def pytest_report_header() -> list[str]:
     return [
         f"not here: {what}; skipped: {tests}" for what, (lacks, tests) in lacking.items() if lacks
     ]
+
+
+def pytest_sessionfinish() -> None:
+    """Remove the control groups of supervisors that tests have killed.
+
+    Those with processes stay. A supervisor whose empty group is removed makes it again.
+    """
+    for mount in cgroups.mounts():
+        own = cgroups.own_group(mount)
+        for top in Path(own).glob(f"{PREFIX}*") if own else ():
+            remove_empty(str(top))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
-from rosrm.model.values import NeighbourRule, ProcessSpec
+from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
+from rosrm.model.values import Enforcement, Limits, NeighbourRule, ProcessSpec, Realtime
 
 Drawn = st.SearchStrategy[Any]
 
@@ -60,6 +61,7 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "name": PROPER_NAMES,
     "process": PROPER_NAMES,
     "namespace": _NAMESPACES,
+    "talks_to": st.dictionaries(PROPER_NAMES.map("to-{}".format), st.floats(0.0, 1e15), max_size=3),
     "needs": st.dictionaries(PROPER_NAMES, st.floats(0.0, 1e18), max_size=3),
     "message": PRINTABLE,
     "priority": _INT32,
@@ -69,6 +71,15 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "factor": st.floats(1.0, 100.0),
     "capacity": st.floats(1e-3, 1e18),
     "period": st.floats(1e-3, 10.0),
+    "limits": st.builds(
+        Limits,
+        memory=st.just(0.0) | st.floats(1e9, 2.0**53),
+        memory_high=st.just(0.0) | st.floats(LEAST_MEMORY, 1e9),
+        cpu=st.just(0.0) | st.floats(LEAST_CPU, 1e4),
+        enforce=st.sampled_from(get_args(Enforcement)),
+    ),
+    "cpus": st.lists(st.integers(0, LARGEST_CPU_NUMBER), max_size=3, unique=True).map(tuple),
+    "nice": st.integers(-20, 19),
     "rate": st.floats(0.0, 1e6),
     **{
         name: st.floats(0.0, LONGEST)
@@ -117,9 +128,20 @@ _NEIGHBOURS: Final = st.one_of(
     ),
     drawn(NeighbourRule, group=NAMES, processes=st.just(())),
 )  # fmt: skip
+
+
+def _scheduling(spec: ProcessSpec) -> dict[str, Any]:
+    """Return the real-time scheduling of a spec without the settings that contradict it."""
+    if not spec.realtime.policy:
+        return {"realtime": Realtime()}
+    priority = spec.realtime.priority % 99 + 1
+    limits = replace(spec.limits, cpu=0.0)
+    return {"realtime": replace(spec.realtime, priority=priority), "limits": limits, "nice": 0}
+
+
 #: Specs with one program, as a master accepts them.
 SPECS: Final = st.builds(
-    lambda spec, program: replace(spec, **{**_NO_PROGRAM, **program}),
+    lambda spec, program: replace(spec, **{**_NO_PROGRAM, **program, **_scheduling(spec)}),
     drawn(ProcessSpec, neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple)),
     _PROGRAMS,
 )

@@ -75,6 +75,9 @@ PYTHON: Final = "docs/reference/python.md"
 NOT_RUN: Final[Mapping[str, str]] = {
     "docs/tutorials/your-own-scoring-plugin.md": "tests/integration/plugins/test_tutorial.py does",
     "docs/tutorials/your-own-migration-strategy.md": "tests/integration/plugins/test_tutorial.py",
+    "docs/tutorials/your-own-filter.md": "tests/integration/plugins/test_tutorial.py",
+    "docs/tutorials/your-own-probe.md": "tests/integration/plugins/test_tutorial.py",
+    "docs/tutorials/your-own-checkpoint-policy.md": "tests/integration/plugins/test_tutorial.py",
     "docs/how-to/criu.md": "CRIU and what it needs come from the network; tests/integration/criu",
     "docs/how-to/two-machines.md": "two machines",
     "docs/how-to/wireguard.md": "two machines",

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from rosrm.extensions.contracts import (
     CheckpointOffer,
+    FilterOffer,
     LauncherOffer,
     MigrationOffer,
     ProbeOffer,
@@ -17,6 +18,7 @@ from rosrm.extensions.registry import Registry
 
 HOOKS: Final = {
     CheckpointOffer: "register_checkpoint_policies",
+    FilterOffer: "register_filters",
     LauncherOffer: "register_launchers",
     MigrationOffer: "register_migration_strategies",
     ProbeOffer: "register_probes",

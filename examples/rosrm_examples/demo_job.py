@@ -93,7 +93,7 @@ def cluster_config(pace: float) -> ClusterConfig:
     """Return the master's settings: Eq. 1 over memory, and prompt but few migrations."""
     return ClusterConfig(
         name="demo",
-        scoring=ScoringChoice(options={"weights": {"memory": 1.0, "cpu": 0.1}}),
+        scoring=(ScoringChoice(options={"weights": {"memory": 1.0, "cpu": 0.1}}),),
         migration=MigrationSettings(
             hysteresis=1.0 / pace, cooldown=5.0 / pace, headroom=0.02, max_in_flight=1
         ),

@@ -80,7 +80,7 @@ def cluster_config() -> ClusterConfig:
     """Return the master's settings: stateful processes migrate by handoff."""
     return ClusterConfig(
         name="migration-demo",
-        scoring=ScoringChoice(options={"weights": {"memory": 1.0}}),
+        scoring=(ScoringChoice(options={"weights": {"memory": 1.0}}),),
         migration=MigrationSettings(
             strategies={"handoff": {}}, hysteresis=0.5, cooldown=120.0, headroom=0.02,
             max_in_flight=1,

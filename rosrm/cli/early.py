@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 #: Commands that send requests to the master.
 ASKING: Final = frozenset({
-    "submit", "cancel", "restart", "migrate", "checkpoint", "restore", "prune",
-    "cordon", "uncordon", "drain", "status", "ps", "hosts", "plugins", "explain",
+    "submit", "cancel", "restart", "migrate", "checkpoint", "restore", "prune", "cordon",
+    "uncordon", "drain", "rebalance", "reload", "status", "ps", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip
 #: Options with which a command joins ROS with other settings or not at all.

@@ -136,6 +136,22 @@ class Client:
         """
         return self._master.prune(_list(processes), _list(hosts))
 
+    def rebalance(self, *, plan_only: bool = False) -> str:
+        """Begin one round of moves that even out the load of the hosts; return its moves.
+
+        Args:
+            plan_only: True: return the moves, and begin none.
+        """
+        return self._master.rebalance(plan_only=plan_only)
+
+    def reload(self) -> str:
+        """Let the master and its slaves read their files again; return a line for each.
+
+        Raises:
+            Refused: a file is invalid, and has changed nothing where it belongs; or no operator.
+        """
+        return self._master.reload()
+
     # --- listings ------------------------------------------------------------------------
 
     def list(

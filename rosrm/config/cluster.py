@@ -12,7 +12,7 @@ from rosrm.config.documents import Node, Problems, parse, read
 from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
-from rosrm.config.settings import ClusterConfig
+from rosrm.config.settings import ClusterConfig, ScoringChoice
 from rosrm.config.work import checked_defaults
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
@@ -63,6 +63,7 @@ def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -
     check_name(root.get("name"), "cluster", problems)
     check_amounts(root.get("defaults", "needs"), "defaults.needs", problems)
     _check_users(root.get("quotas"), problems)
+    _check_chain(root.get("scoring"), problems)
     if config is not None:
         _check_times(root, config, problems)
     options = root.get("checkpoint", "options")
@@ -104,7 +105,6 @@ def _check_times(root: Node, config: ClusterConfig, problems: Problems) -> None:
 
 def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> ClusterConfig:
     """Return the settings with checked options of plugins, including plugins chosen by default."""
-    scoring = _given(root, "scoring") or config.scoring.policy
     checkpoint = _checkpoint(root, config, plugins)
     named = root.get("migration", "strategies")
     if named is None:
@@ -118,7 +118,8 @@ def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> Cl
         strategies = plugins.by_name("migration", named)
     return replace(
         config,
-        scoring=replace(config.scoring, options=_options(root, "scoring", scoring, plugins)),
+        scoring=_scoring(root, config, plugins),
+        filters=plugins.by_name("filter", root.get("filters")),
         checkpoint=replace(
             config.checkpoint,
             policy=checkpoint,
@@ -144,6 +145,34 @@ def _with_process(
     return replace(config, defaults=replace(config.defaults, process=process))
 
 
+def _scoring(root: Node, config: ClusterConfig, plugins: PluginCheck) -> tuple[ScoringChoice, ...]:
+    """Return the chain of scoring policies with checked options."""
+    section = root.get("scoring") or Node({}, root.place)
+    links = section.value if isinstance(section.value, tuple) else (section,)
+    known = config.scoring if len(config.scoring) == len(links) else (ScoringChoice(),) * len(links)
+    return tuple(_link(*pair, plugins) for pair in zip(links, known, strict=True))
+
+
+def _link(node: Node, choice: ScoringChoice, plugins: PluginCheck) -> ScoringChoice:
+    name = _policy_in(node) or choice.policy
+    options = plugins.choice("scoring", name, node.get("policy") or node, node.get("options"))
+    return replace(choice, options=options)
+
+
+def _check_chain(section: Node | None, problems: Problems) -> None:
+    """Add a problem for an empty chain of scoring policies, and for each repeated policy."""
+    if section is None or not isinstance(section.value, tuple):
+        return
+    if not section.value:
+        problems.add(section.place, "scoring: at least one policy is required; or omit the key")
+    names = [_policy_in(link) or ScoringChoice().policy for link in section.value]
+    for at, link in enumerate(section.value):
+        if names[at] in names[:at]:
+            place = (link.get("policy") or link).place
+            text = f"scoring: {names[at]!r} is in the chain already; give it once, with one weight"
+            problems.add(place, text)
+
+
 def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> str | None:
     """Return the given policy, or the default one if it is installed or its options are given."""
     policy, options = config.checkpoint.policy, root.get("checkpoint", "options")
@@ -153,8 +182,8 @@ def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> str 
     return policy if wanted or plugins.has("checkpoint", policy) else None
 
 
-def _given(root: Node, section: str) -> str | None:
-    node = root.get(section, "policy")
+def _policy_in(link: Node) -> str | None:
+    node = link.get("policy")
     return node.value if node is not None and isinstance(node.value, str) else None
 
 

@@ -50,6 +50,33 @@ class OptionsByName:
 
 
 @dataclass(frozen=True)
+class OneOrMore:
+    """Annotation of a list of mappings, of which a file may give a single one without a list.
+
+    Attributes:
+        item: type of one mapping.
+    """
+
+    item: type[Any]
+
+    def in_file(self) -> Any:
+        """Return the type of the value as written in a file."""
+        return self.item | tuple[self.item, ...]  # type: ignore[name-defined]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Return the schema that converts a single mapping into a list of one."""
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
+
+        one = core_schema.no_info_after_validator_function(
+            lambda item: (item,), handler.generate_schema(self.item)
+        )
+        return core_schema.tagged_union_schema(
+            {"one": one, "many": handler(source)},
+            discriminator=lambda given: "many" if isinstance(given, (list, tuple)) else "one",
+        )
+
+
+@dataclass(frozen=True)
 class RosSection:
     """Annotation of the section `ros`, which is nested in a file and flat as a value."""
 

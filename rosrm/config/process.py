@@ -11,22 +11,27 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
-from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
+from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.values import (
     EMPTY,
+    Enforcement,
     Health,
     HostLossAction,
     HostLossPolicy,
     IsolationAction,
     IsolationPolicy,
     Kind,
+    Limits,
     MigrationPolicy,
     NeighbourRule,
     ProcessSpec,
     Readiness,
     ReadinessKind,
+    Realtime,
+    ReschedulePolicy,
     RestartCondition,
     RestartPolicy,
     StandbyPolicy,
@@ -42,6 +47,7 @@ Text = Annotated[str, PlainWord()]
 Labels = Annotated[Mapping[str, Text], NullIsEmpty()]
 _Value = TypeVar("_Value")
 ListOfWords = Annotated[tuple[Text, ...], Words()]
+_CpuNumber = Annotated[int, Quantity(high=LARGEST_CPU_NUMBER, whole=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +60,14 @@ class RestartInFile:
     factor: Annotated[float, Quantity(low=1.0, high=100.0)] = _RESTART.factor
     attempts: Count = _RESTART.attempts
     window: PositiveSeconds = _RESTART.window
+
+
+@dataclass(frozen=True, slots=True)
+class RescheduleInFile:
+    """Starts on other hosts after the restart policy has given up."""
+
+    attempts: Count = 0
+    delay: Seconds = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +157,24 @@ class SpreadInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class LimitsInFile:
+    """Limits that the host of a process enforces."""
+
+    memory: Annotated[float, Quantity("size")] = 0.0
+    memory_high: Annotated[float, Quantity("size")] = 0.0
+    cpu: Annotated[float, Quantity("cores")] = 0.0
+    enforce: Enforcement = "preferred"
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeInFile:
+    """Real-time scheduling of a process."""
+
+    policy: Literal["fifo", "rr"]
+    priority: Annotated[int, Quantity(low=1, high=99, whole=True)]
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessInFile:
     """One process, with the keys of ROS 2 launch; shorthands are in long form."""
 
@@ -173,6 +205,16 @@ class ProcessInFile:
     near: tuple[NeighboursInFile, ...] = ()
     apart: tuple[NeighboursInFile, ...] = ()
     spread: SpreadInFile | None = None
+    talks_to: Annotated[Mapping[str, ByteRate], NullIsEmpty()] = field(
+        default_factory=lambda: EMPTY
+    )
+    reschedule: RescheduleInFile = field(default_factory=RescheduleInFile)
+    protect: bool = False
+    time_limit: Seconds = 0.0
+    limits: LimitsInFile = field(default_factory=LimitsInFile)
+    cpus: tuple[_CpuNumber, ...] = ()
+    realtime: RealtimeInFile | None = None
+    nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
     devices: AskedByKind = field(default_factory=lambda: EMPTY)
 
     def spec(self) -> ProcessSpec:
@@ -199,6 +241,9 @@ class ProcessInFile:
             standby=_same(StandbyPolicy, self.standby),
             health=Health() if self.health is None else _same(Health, self.health),
             neighbours=tuple(self._neighbour_rules()),
+            reschedule=_same(ReschedulePolicy, self.reschedule),
+            limits=_same(Limits, self.limits),
+            realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
             given=(),
         )
@@ -267,6 +312,14 @@ def _about_restarts(spec: ProcessSpec) -> Iterator[Complaint]:
         yield Complaint(("restart", "max_delay"), text)
 
 
+def _about_ends(spec: ProcessSpec) -> Iterator[Complaint]:
+    if spec.time_limit and spec.kind != "job":
+        yield Complaint(("time_limit",), "time_limit: only a job has one; a service runs on")
+    if spec.reschedule.delay and not spec.reschedule.attempts:
+        text = "reschedule.delay requires `attempts`, the number of other hosts to try"
+        yield Complaint(("reschedule", "delay"), text)
+
+
 def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
     standby = spec.standby
     if standby.wanted and spec.kind == "job":
@@ -306,6 +359,21 @@ def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
                 f"{key}: {{device.{kind}}} needs a device of the kind {kind!r}, which the process "
                 f"does not ask for; its `devices:` are {listed(kinds)}",
             )
+
+
+def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name in spec.talks_to:
+        fault = name_fault(name, "process")
+        if name == spec.name:
+            fault = f"{name} names itself; only other processes are allowed"
+        if fault:
+            yield Complaint(("talks_to", name), f"talks_to: {fault}")
+
+
+def _about_limits(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = limits_fault(spec)
+    if fault:
+        yield Complaint((fault.partition(".")[0].partition(":")[0],), fault)
 
 
 def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -397,8 +465,11 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
     (_about_surroundings, ("working_directory", "environment")),
     (_about_restarts, ("restart",)),
+    (_about_ends, ("time_limit", "kind", "reschedule")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_devices, ("devices", "arguments", "parameters")),
+    (_about_flows, ("name", "talks_to")),
+    (_about_limits, ("limits", "cpus", "realtime", "needs")),
 )

@@ -18,17 +18,19 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 from rosrm.config.device_forms import OfferedByKind, with_kinds
 from rosrm.config.markers import (
     NullIsEmpty,
+    OneOrMore,
     OptionsByName,
     PlainWord,
     ProcessSection,
     RosSection,
 )
-from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings
+from rosrm.core.master.settings import DEFAULT_QUOTA, CoreSettings, Preemption
 from rosrm.errors import ConfigError
 from rosrm.extensions.units import (
     Amount,
     Count,
     Fraction,
+    PositiveByteRate,
     PositiveCount,
     PositiveSeconds,
     Quantity,
@@ -38,6 +40,7 @@ from rosrm.keys.roles import SecurityMode
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import EMPTY, ProcessSpec
+from rosrm.wording import weighted
 
 #: Default upper limits: memory as in the paper, CPU and disk with a reserve.
 DEFAULT_LIMITS: Final[Mapping[str, float]] = {"memory": 0.8, "cpu": 0.9, "disk": 0.9}
@@ -88,9 +91,16 @@ def _word_in(variable: str, words: Mapping[str, Word], default: Word) -> Word:
 
 @dataclass(frozen=True, slots=True)
 class ScoringChoice:
-    """Name and options of the scoring policy, which orders the hosts that fit."""
+    """A scoring policy, alone or as a link of a chain.
+
+    Attributes:
+        policy: its name.
+        weight: factor of its scores in the sum of the chain; 0: only its vetoes count.
+        options: its options.
+    """
 
     policy: str = "weighted"
+    weight: Annotated[float, Quantity(high=1e6)] = 1.0
     options: Options = field(default_factory=lambda: EMPTY)
 
 
@@ -137,10 +147,32 @@ class QueueSettings:
     Attributes:
         backfill: True: processes may be placed before an earlier one that waits for room.
         max_processes: most processes that have not ended; more are refused.
+        preemption: "move": processes of lower priorities move to make room for a process that fits
+            nowhere; "requeue": those that cannot move wait in the queue again; False: neither.
     """
 
     backfill: bool = _CORE.backfill
+    preemption: Preemption = _CORE.preemption
     max_processes: PositiveCount = _CORE.max_processes
+
+
+@dataclass(frozen=True, slots=True)
+class RebalanceSettings:
+    """Moves that even out the load of the hosts.
+
+    Attributes:
+        automatic: True: the master begins them itself; False: only `rosrm rebalance` does.
+        spread: difference between the loads of two hosts, as fractions of their limits, from which
+            on the master begins a round.
+        after: seconds for which the difference must last, and between two rounds; a host that joins
+            does not wait for it.
+        max_moves: most processes that move in one round.
+    """
+
+    automatic: bool = _CORE.rebalance
+    spread: Fraction = _CORE.rebalance_spread
+    after: Seconds = _CORE.rebalance_after
+    max_moves: PositiveCount = _CORE.rebalance_moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +239,19 @@ class ControlSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class NetworkSettings:
+    """Measurement of links between hosts, and of flows between processes.
+
+    Attributes:
+        period: seconds between two measurements of the links of a host; 0: no measurements.
+        learn: True: slaves measure the flows that processes receive, each at most 1 % of a core.
+    """
+
+    period: Seconds = _CORE.link_period
+    learn: bool = _CORE.learn_flows
+
+
+@dataclass(frozen=True, slots=True)
 class JournalSettings:
     """Durable journal of events and intents.
 
@@ -247,14 +292,17 @@ class ClusterConfig:
         ros: domain, discovery and transports.
         security: "keys": the master accepts only messages of principals with a key; "none": all.
         state: state directory of the master; by default under XDG_STATE_HOME.
-        scoring: policy that orders the hosts that fit.
+        scoring: policies that order the hosts that fit by the weighted sum of their scores.
+        filters: names of placement filters of plugins, with their options.
         migration: strategies and limits of migrations.
         queue: order of the queue.
+        rebalance: moves that even out the load of the hosts.
         quotas: limits by name of a user; "default" applies to users without an entry, and to
             limits that an entry does not give.
         defaults: default needs of processes.
         liveness: time limits for silent hosts.
         control: times of messages.
+        network: measurement of links and flows.
         journal: journal of events and intents.
         record: recording of all events that the master receives, for replay.
         checkpoint: policy that places replicas of snapshots on other hosts, if any.
@@ -266,13 +314,20 @@ class ClusterConfig:
     ros: Ros = field(default_factory=RosSettings)
     security: SecurityMode = field(default_factory=default_security)
     state: Path = Path()
-    scoring: ScoringChoice = field(default_factory=ScoringChoice)
+    scoring: Annotated[tuple[ScoringChoice, ...], OneOrMore(ScoringChoice)] = field(
+        default_factory=lambda: (ScoringChoice(),)
+    )
+    filters: Annotated[Mapping[str, Options], OptionsByName()] = field(
+        default_factory=lambda: EMPTY
+    )
     migration: MigrationSettings = field(default_factory=MigrationSettings)
     queue: QueueSettings = field(default_factory=QueueSettings)
+    rebalance: RebalanceSettings = field(default_factory=RebalanceSettings)
     quotas: Mapping[str, Quota] = field(default_factory=lambda: EMPTY)
     defaults: ProcessDefaults = field(default_factory=ProcessDefaults)
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
     control: ControlSettings = field(default_factory=ControlSettings)
+    network: NetworkSettings = field(default_factory=NetworkSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
     checkpoint: CheckpointPolicySettings = field(default_factory=CheckpointPolicySettings)
@@ -283,6 +338,11 @@ class ClusterConfig:
         """Set the default of the state directory, which depends on the name."""
         if self.state == Path():
             object.__setattr__(self, "state", default_state(self.name, "master"))
+
+    @property
+    def chain(self) -> str:
+        """Return the scoring policies as text: "weighted + 0.5 x network"."""
+        return " + ".join(weighted(one.policy, one.weight) for one in self.scoring)
 
     def core(self) -> CoreSettings:
         """Return the part of the settings that the master's core uses."""
@@ -300,6 +360,13 @@ class ClusterConfig:
             need=self.migration.need,
             max_migrations=self.migration.max_in_flight,
             automatic=self.migration.automatic,
+            link_period=self.network.period,
+            learn_flows=self.network.learn,
+            preemption=self.queue.preemption,
+            rebalance=self.rebalance.automatic,
+            rebalance_spread=self.rebalance.spread,
+            rebalance_after=self.rebalance.after,
+            rebalance_moves=self.rebalance.max_moves,
             order_retry=self.control.order_retry,
             keep_ended=self.journal.keep_ended,
             max_hosts=self.max_hosts,
@@ -355,6 +422,23 @@ class KeepSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """Links of this host to other hosts.
+
+    Attributes:
+        rate: bytes a second that each link can carry; None: the speed of its network interface.
+        rates: bytes a second by name of the other host, for links with another rate.
+        limit: fraction of these rates that flows of processes may use.
+        port: UDP port for the packets that measure round trips; 0: any free one.
+    """
+
+    rate: PositiveByteRate | None = None
+    rates: Mapping[str, PositiveByteRate] = field(default_factory=lambda: EMPTY)
+    limit: Fraction = 1.0
+    port: Annotated[int, Quantity(high=65535, whole=True)] = 0
+
+
+@dataclass(frozen=True, slots=True)
 class HostControlSettings:
     """Times of the requests to a slave.
 
@@ -390,6 +474,7 @@ class HostConfig:
             not here, those that the probes find.
         control: times of requests.
         keep: snapshots and replicas.
+        links: links to other hosts.
         on_stop: "stop": a slave that is stopped stops its processes; "keep": it leaves them running
             under the supervisor.
     """
@@ -412,6 +497,7 @@ class HostConfig:
     logs: LogSettings = field(default_factory=LogSettings)
     control: HostControlSettings = field(default_factory=HostControlSettings)
     keep: KeepSettings = field(default_factory=KeepSettings)
+    links: LinkSettings = field(default_factory=LinkSettings)
     on_stop: Literal["stop", "keep"] = "stop"
     devices: OfferedByKind = field(default_factory=lambda: EMPTY)
 

@@ -1,7 +1,7 @@
 """Plugins: contracts, hooks, and the registry of installed plugins.
 
 hookspecs.py         every hook, in one list
-contracts.py         protocols of probes, policies, strategies and launchers, and their offers
+contracts.py         protocols of probes, policies, filters, strategies, launchers; their offers
 options.py           options of a process, merged over those of the cluster
 units.py             numbers with units in options
 installed.py         addresses of the installed plugins (entry points)
@@ -9,6 +9,7 @@ discovery.py         import of the installed plugins, call of their hooks
 registry.py          selection of plugins by name, creation of their objects
 made.py              created objects, and checks of them
 declared_fields.py   fields of a spec that an offer declares to read
+placement.py         selected policies and filters, for the core
 plugin_calls.py      guard of every call of a plugin
 time_limit.py        time-out of a call
 """

@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.extensions.link_views import NO_FLOWS, NO_LINKS, FlowView, LinkView
 from rosrm.model.devices import Device
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
@@ -82,11 +83,14 @@ class DeviceFinding(Protocol):
 
 
 class HostLabelling(Protocol):
-    """A probe that also adds labels to its host."""
+    """A probe that also labels its host."""
 
     @property
     def labels(self) -> Mapping[str, str]:
-        """Return labels such as "gpu.model"; fixed. A label in the settings takes precedence."""
+        """Return labels of the host, as `{"gpu.model": "A100"}`; read once, after `create`.
+
+        A label of the same key in host.yaml replaces that of the probe.
+        """
 
 
 class Sessions(Protocol):
@@ -161,9 +165,14 @@ class HostView:
         limit: (N, R) upper limits, fractions; 1 where a host has none.
         capacity: (N, R) base units at usage 1.0; NaN as in `usage`.
         processes: (N,) number of processes on the host or reserved for it.
-        labels: (N,) mappings, the labels of each host.
+        labels: (N,) read-only mappings, the labels of each host, those of its probes included.
+        links: links between the hosts and all hosts of the cluster.
+        tenants: (N,) read-only mappings, for each host: name to spec of each process with an
+            instance there, assigned ones included. A spec is as at the start of the instance.
         devices: (N,) mappings, the number of free units of each kind of devices; shares of units
             count. A kind that the host lacks is absent.
+
+    Arrays are read-only, too. `labels` and `tenants` are made when they are read, host by host.
     """
 
     names: Sequence[str]
@@ -173,7 +182,13 @@ class HostView:
     capacity: FloatArray
     processes: npt.NDArray[np.int64]
     labels: Sequence[Mapping[str, str]] = ()
+    links: LinkView = NO_LINKS
+    tenants: Sequence[Mapping[str, ProcessSpec]] = ()
     devices: Sequence[Mapping[str, float]] = ()
+
+    def labelled(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (N,), of the hosts with a label of this value, as a new array."""
+        return np.array([labels.get(key) == value for labels in self.labels], np.bool_)
 
     def column(self, resource: str, missing: float = 0.0) -> FloatArray:
         """Return the usage of one resource, (N,), as a new array without NaN.
@@ -193,17 +208,21 @@ class HostView:
 
 @dataclass(frozen=True)
 class ProcessView:
-    """The process to place, for a scoring policy.
+    """The process to place, for a scoring policy or a filter.
 
     Attributes:
-        spec: as submitted. A policy gets the standard fields (program, `namespace`, `kind`,
+        spec: as submitted. A plugin gets the standard fields (program, `namespace`, `kind`,
             `priority`, `needs`, `devices` and labels) and those that its offer declares in
             `reads`; any other field raises `UndeclaredField`.
-        need: (N, R) demand of the process on each host, fractions of that host's capacity.
+        need: (N, R) demand of the process on each host, fractions of that host's capacity; inf
+            where a host lacks a needed resource, never NaN.
+        flows: flows between the process and others, declared and learned ones; empty unless the
+            offer declares `talks_to` in `reads`.
     """
 
     spec: ProcessSpec
     need: FloatArray
+    flows: FlowView = NO_FLOWS
 
 
 @dataclass(frozen=True)
@@ -247,6 +266,40 @@ class ScoringOffer:
     options: type[Any] = NoOptions
     summary: str = ""
     reads: tuple[str, ...] = ()
+
+
+# --- filters (master, pure) -------------------------------------------------------------------
+
+
+class PlacementFilter(Protocol):
+    """A placement rule of a plugin: which hosts may take a process. Pure, as a scoring policy."""
+
+    def mask(self, hosts: HostView, process: ProcessView) -> BoolArray:
+        """Return (N,) booleans, True: the host may take the process.
+
+        No row may depend on another row. The core calls this once for all hosts, and again for
+        single rows that have changed.
+        """
+
+    def reason(self, hosts: HostView, process: ProcessView, row: int) -> str:
+        """Return why the host of a row fails, as a predicate: "it has no label floor"."""
+
+
+@dataclass(frozen=True)
+class FilterOffer:
+    """Registers a placement filter; the fields are as in `ScoringOffer`.
+
+    Attributes:
+        permanent: True: a host that fails without any process on it fails until it registers again.
+            A process that every host fails for good is set aside, and does not block the queue.
+    """
+
+    name: str
+    create: Callable[[Any], PlacementFilter]
+    options: type[Any] = NoOptions
+    summary: str = ""
+    reads: tuple[str, ...] = ()
+    permanent: bool = False
 
 
 # --- migration (master, pure; executors on the slaves) ----------------------------------------

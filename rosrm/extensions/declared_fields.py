@@ -1,13 +1,14 @@
-"""Declarations of the selected plugins' offers, and the view of a spec for a scoring policy.
+"""Declarations of the selected plugins' offers, and the view of a spec for a policy or filter.
 
-Processes with equal demands share one ranking. So a scoring policy may read only the fields by
-which demands are compared: the standard ones, and those that its offer declares.
+Processes with equal demands share one ranking. So a scoring policy or a filter may read only the
+fields by which demands are compared: the standard ones, and those that its offer declares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from types import MappingProxyType
 from typing import Any, Final, cast
 
 from rosrm.extensions.contracts import Capabilities
@@ -17,21 +18,24 @@ from rosrm.wording import listed
 #: Fields of a spec that every policy may read, because `Demand.key` includes them.
 STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
-    "required_labels", "preferred_labels", "avoided_labels", "devices",
+    "required_labels", "preferred_labels", "avoided_labels", "limits", "cpus", "realtime", "nice",
+    "devices",
 )  # fmt: skip
+#: Field that gives the policy the flows of the process, also the learned ones.
+FLOWS_FIELD: Final = "talks_to"
 #: All fields of a spec, which an offer may declare; `given` is of use at the submission only.
 SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec) if f.name != "given")
 
 
 class UndeclaredField(LookupError):
-    """A policy reads a field of a spec that its offer does not declare.
+    """A policy or filter reads a field of a spec that its offer does not declare.
 
     Not an AttributeError, because `getattr` with a default would silently return a wrong value.
     """
 
 
 class DeclaredSpec:
-    """A spec that gives a policy the standard fields and the declared ones, and no others."""
+    """A read-only spec that gives a plugin the standard fields and the declared ones, no others."""
 
     __slots__ = ("_reads", "_spec")
 
@@ -41,11 +45,12 @@ class DeclaredSpec:
 
     def __getattr__(self, name: str) -> Any:
         if name in STANDARD_FIELDS or name in self._reads:
-            return getattr(self._spec, name)
+            value = getattr(self._spec, name)
+            return MappingProxyType(value) if isinstance(value, dict) else value
         if name in SPEC_FIELDS:
             raise UndeclaredField(
-                f"the policy reads {name!r} of the spec, which its offer does not declare: "
-                f"write ScoringOffer(..., reads={(*self._reads, name)!r})"
+                f"the plugin reads {name!r} of the spec, which its offer does not declare: "
+                f"add reads={(*self._reads, name)!r} to the offer"
             )
         derived = getattr(ProcessSpec, name, None)
         if isinstance(derived, property) and derived.fget is not None:
@@ -58,7 +63,7 @@ class DeclaredSpec:
 
 
 def declared_spec(spec: ProcessSpec, reads: tuple[str, ...]) -> ProcessSpec:
-    """Return the view of a spec for a policy that declares these fields."""
+    """Return the view of a spec for a plugin that declares these fields."""
     return cast(ProcessSpec, DeclaredSpec(spec, reads))
 
 
@@ -85,7 +90,6 @@ class Declared:
     """Declarations of the selected plugins' offers.
 
     Attributes:
-        reads: fields of a spec that scoring policies read beyond the standard ones.
         options_of: returns the options of a strategy for a spec, merged and parsed; raises
             `ValueError` for an option that the strategy does not accept.
         executors: strategy to the names of its executors, for known offers.
@@ -95,7 +99,6 @@ class Declared:
             of the cluster.
     """
 
-    reads: tuple[str, ...] = ()
     options_of: Callable[[str, ProcessSpec], Any] = no_options
     executors: Mapping[str, frozenset[str]] = field(default_factory=lambda: EMPTY)
     brought_by: Mapping[str, str] = field(default_factory=lambda: EMPTY)

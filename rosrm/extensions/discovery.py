@@ -23,6 +23,7 @@ from rosrm.extensions import hookspecs
 from rosrm.extensions.contracts import (
     Capabilities,
     CheckpointOffer,
+    FilterOffer,
     LauncherOffer,
     MigrationOffer,
     ProbeOffer,
@@ -36,13 +37,16 @@ from rosrm.wording import get_close_matches
 
 T = TypeVar("T")
 #: Offers that the configuration chooses by name, with options.
-ChosenOffer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
+ChosenOffer: TypeAlias = (
+    "ProbeOffer | ScoringOffer | FilterOffer | MigrationOffer | CheckpointOffer"
+)
 Offer: TypeAlias = "ChosenOffer | LauncherOffer"
 
 #: Hook to the kind and the type of its offers.
 HOOKS: Final[Mapping[str, tuple[PluginKind, type[Any]]]] = {
     "register_probes": ("probe", ProbeOffer),
     "register_scoring_policies": ("scoring", ScoringOffer),
+    "register_filters": ("filter", FilterOffer),
     "register_migration_strategies": ("migration", MigrationOffer),
     "register_checkpoint_policies": ("checkpoint", CheckpointOffer),
     "register_launchers": ("launcher", LauncherOffer),
@@ -239,7 +243,7 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     ]
     if bare:
         return f"{name!r}: option {bare[0]!r} has no default"
-    fault = _fault_of_reads(offer) if isinstance(offer, ScoringOffer) else ""
+    fault = _fault_of_reads(offer) if isinstance(offer, (ScoringOffer, FilterOffer)) else ""
     if isinstance(offer, MigrationOffer):
         fault = _fault_of_executors(offer) or _fault_of_capabilities(offer)
     return f"{name!r}: {fault}" if fault else ""
@@ -269,8 +273,8 @@ def _fault_of_capabilities(offer: MigrationOffer) -> str:
     return ""
 
 
-def _fault_of_reads(offer: ScoringOffer) -> str:
-    """Return the fault of the fields that a scoring policy declares to read; "": none."""
+def _fault_of_reads(offer: ScoringOffer | FilterOffer) -> str:
+    """Return the fault of the fields that a policy or filter declares to read; "": none."""
     reads: object = offer.reads
     if isinstance(reads, str) or not isinstance(reads, Sequence):
         return f'`reads` is {reads!r}; a tuple of field names is required, as ("name",)'

@@ -19,6 +19,7 @@ import pluggy
 
 from rosrm.extensions.contracts import (
     CheckpointOffer,
+    FilterOffer,
     LauncherOffer,
     MigrationOffer,
     ProbeOffer,
@@ -39,6 +40,11 @@ def register_probes() -> Sequence[ProbeOffer]:  # type: ignore[empty-body]  # a 
 @hookspec
 def register_scoring_policies() -> Sequence[ScoringOffer]:  # type: ignore[empty-body]
     """Offer scoring policies, which order the hosts that fit a process (loaded by the master)."""
+
+
+@hookspec
+def register_filters() -> Sequence[FilterOffer]:  # type: ignore[empty-body]
+    """Offer filters, the rules by which hosts may take a process (loaded by the master)."""
 
 
 @hookspec

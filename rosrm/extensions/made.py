@@ -24,11 +24,15 @@ from rosrm.wording import get_close_matches
 _METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
     "probe": ("resources", "read", "close"),
     "scoring": ("score",),
+    "filter": ("mask", "reason"),
     "migration": ("propose",),
     "checkpoint": ("choose",),
     "launcher": ("prepare",),
 }
 
+#: Most labels from all probes of a host; a registration with more than 256 would be refused.
+_MOST_LABELS: Final = 128
+_LONGEST_LABEL: Final = 200
 #: Seconds between two reads of a `FailedProbe`.
 _FAILED_PERIOD: Final = 10.0
 
@@ -38,7 +42,7 @@ class MadeProbe:
     """A probe on this host; period and deadline, in seconds, are those of its offer.
 
     Attributes:
-        labels: labels that it adds to the host.
+        labels: labels that the probe gives to the host.
     """
 
     name: str
@@ -60,6 +64,11 @@ class Probes:
 
     made: tuple[MadeProbe, ...]
     absent: Mapping[str, str]
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Return the labels of the host from all its probes."""
+        return {key: value for one in self.made for key, value in one.labels.items()}
 
 
 class FailedProbe:
@@ -175,6 +184,28 @@ def fault_of_resources(
     return ""
 
 
+def fault_of_labels(labels: object, before: Sequence[MadeProbe]) -> str:
+    """Return why a host cannot have these labels of a probe, as a predicate; "": it can."""
+    if not isinstance(labels, Mapping):
+        return f'has the labels {labels!r:.100}; a mapping is required, as {{"key": "value"}}'
+    for key, value in labels.items():
+        if not (key and _is_text(key) and _is_text(value)):
+            return (
+                f"has the label {key!r:.100}: {value!r:.100}; printable text of at most "
+                f"{_LONGEST_LABEL} letters is required"
+            )
+        others = [one.name for one in before if one.labels.get(key, value) != value]
+        if others:
+            return f"gives the label {key!r} another value than {others[0]!r}"
+    if len(labels) + sum(len(one.labels) for one in before) > _MOST_LABELS:
+        return f"exceeds the {_MOST_LABELS} labels that the probes of a host may give"
+    return ""
+
+
+def _is_text(word: object) -> bool:
+    return isinstance(word, str) and word.isprintable() and len(word) <= _LONGEST_LABEL
+
+
 def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:
     """Return the fault of a probe that does not measure an attributed resource; "" for none."""
     if hasattr(probe, "by_process"):
@@ -190,15 +221,6 @@ def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:
         f"gives {attributed[0]!r} the accounting 'attributed', and has no `by_process` that "
         "measures it"
     )
-
-
-def fault_of_labels(labels: object) -> str:
-    """Return why a probe cannot add these labels, as a predicate; "" if it can."""
-    if not isinstance(labels, Mapping):
-        return f"has `labels` of type {type(labels).__name__}; a mapping is required"
-    texts = [text for item in labels.items() for text in item]
-    wrong = [text for text in texts if not (isinstance(text, str) and text.isprintable())]
-    return f"has the label {wrong[0]!r:.100}; printable text is required" if wrong else ""
 
 
 def close_quietly(probe: Probe) -> None:

@@ -34,6 +34,7 @@ Limit = Callable[[Plugin, Callable[[], Any]], Any]
 TITLES: Final[Mapping[PluginKind, str]] = {
     "probe": "probe",
     "scoring": "scoring policy",
+    "filter": "filter",
     "migration": "migration strategy",
     "checkpoint": "checkpoint policy",
     "launcher": "launcher",

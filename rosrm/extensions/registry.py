@@ -15,12 +15,15 @@ from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, d
 from rosrm.extensions.contracts import (
     Capabilities,
     CheckpointPolicy,
+    FilterOffer,
     HostChecking,
+    HostLabelling,
     LauncherContext,
     LauncherOffer,
     MigrationOffer,
     MigrationStrategy,
     PeriodicImaging,
+    PlacementFilter,
     ProbeContext,
     ProbeOffer,
     ScoringOffer,
@@ -54,6 +57,7 @@ from rosrm.extensions.made import (
     unmeasured,
 )
 from rosrm.extensions.options import merged_options
+from rosrm.extensions.placement import ScoringLink, SelectedFilter
 from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import from_plain, to_plain
@@ -173,6 +177,20 @@ class Registry:
         """Create a scoring policy; raises `ConfigError` or `PluginError`."""
         return cast(ScoringPolicy, self._required("scoring", name, options))
 
+    def link(self, name: str, options: Mapping[str, Any], weight: float = 1.0) -> ScoringLink:
+        """Create a scoring policy as a link of a chain; raises as `scoring` does."""
+        offer = cast(ScoringOffer, self.offer("scoring", name))
+        return ScoringLink(name, self.scoring(name, options), weight, tuple(offer.reads))
+
+    def filters(self, chosen: NameToOptions) -> tuple[SelectedFilter, ...]:
+        """Create placement filters, in this order; raises as `scoring` does."""
+        return tuple(self._filter(name, options) for name, options in chosen.items())
+
+    def _filter(self, name: str, options: Mapping[str, Any]) -> SelectedFilter:
+        offer = cast(FilterOffer, self.offer("filter", name))
+        made = cast(PlacementFilter, self._required("filter", name, options))
+        return SelectedFilter(name, made, offer.permanent, tuple(offer.reads))
+
     def checkpoint(
         self, name: str | None, options: Mapping[str, Any] = EMPTY
     ) -> CheckpointPolicy | None:
@@ -206,10 +224,9 @@ class Registry:
             if fault:
                 raise self._fault("migration", name, fault)
 
-    def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
-        """Return the declarations in the offers of a scoring policy and of migration strategies."""
+    def declared(self, chosen: NameToOptions) -> Declared:
+        """Return the declarations in the offers of migration strategies."""
         return Declared(
-            reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),
             options_of=self._options(chosen),
             capabilities_of=self.capabilities_of(chosen),
             capabilities=self.capabilities(chosen),
@@ -358,12 +375,16 @@ class Registry:
         probe = self._make("probe", name, options, context)
         try:
             resources = tuple(probe.resources)
-            fault = fault_of_resources(resources, offer, before) or unmeasured(probe, resources)
-            labels = getattr(probe, "labels", EMPTY)
-            fault = fault or fault_of_labels(labels)
+            labels = probe.labels if implements(probe, HostLabelling) else EMPTY
+            fault = (
+                fault_of_resources(resources, offer, before)
+                or unmeasured(probe, resources)
+                or fault_of_labels(labels, before)
+            )
             fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
         except FAULTS as raised:
-            fault = f"its description raised {describe_plugin_fault(raised)}"
+            resources, labels = (), EMPTY
+            fault = f"its `resources` or `labels` raised {describe_plugin_fault(raised)}"
         if fault:
             close_quietly(probe)
             raise self._fault("probe", name, fault)

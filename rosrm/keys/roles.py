@@ -109,6 +109,8 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "checkpoint": _SUBMITTERS,
     "restore": _SUBMITTERS,
     "prune": _OPERATORS,
+    "rebalance": _OPERATORS,
+    "reload": _OPERATORS,
     "set_host_state": _OPERATORS,
     "register_host": _HOSTS,
     "leave": _HOSTS,

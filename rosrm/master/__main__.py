@@ -11,11 +11,15 @@ import signal
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import sys
+from dataclasses import replace
+from functools import partial
 
+from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
 from rosrm.extensions.registry import Registry
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
+from rosrm.master.settings_reload import SettingsReload
 from rosrm.runtime.bootstrap import Handover, run
 
 
@@ -23,15 +27,15 @@ def serve(handover: Handover) -> int:
     """Create the configured plugins and run the master; return the exit code."""
     config = ClusterConfig.from_json(handover.settings)
     registry = Registry.load(handover.plugins)
-    name = config.scoring.policy
-    policy = registry.scoring(name, config.scoring.options)
+    placement = placement_of(config, registry)
     strategies = registry.migrations(config.migration.strategies)
     checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)
-    rows = registry.rows("scoring", "migration", "checkpoint")
-    fallback = fallback_of(registry, name)
-    declared = registry.declared(name, config.migration.strategies)
+    rows = registry.rows("scoring", "filter", "migration", "checkpoint")
+    placement = replace(placement, fallback=fallback_of(registry, config))
+    declared = registry.declared(config.migration.strategies)
+    reload = SettingsReload(config, handover.source, partial(chain_of, registry))
     return MasterRuntime(
-        config, policy, strategies, rows, fallback, checkpoint, declared=declared
+        config, placement, strategies, rows, checkpoint, declared=declared, reload=reload
     ).run()
 
 

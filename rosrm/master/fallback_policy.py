@@ -1,24 +1,25 @@
-"""Fallback scoring policy, used if the configured one raises, hangs or returns invalid scores."""
+"""Fallback scoring policy, used if each configured one raises, hangs or returns invalid scores."""
 
 from __future__ import annotations
 
 import logging
 
-from rosrm.config.settings import ScoringChoice
+from rosrm.config.settings import ClusterConfig, ScoringChoice
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
-from rosrm.extensions.contracts import ScoringPolicy
+from rosrm.extensions.placement import ScoringLink
 from rosrm.extensions.registry import Registry
 
 _log = logging.getLogger("rosrm.master")
 
 
-def fallback_of(registry: Registry, chosen: str) -> tuple[str, ScoringPolicy] | None:
-    """Return the default policy with its name; None if it is the chosen one, missing or broken."""
+def fallback_of(registry: Registry, config: ClusterConfig) -> ScoringLink | None:
+    """Return the default policy; None if it is configured, missing or broken."""
     name = ScoringChoice().policy
-    if name == chosen or name not in registry.names("scoring"):
+    configured = [one.policy for one in config.scoring]
+    if name in configured or name not in registry.names("scoring"):
         return None
     try:
-        return name, registry.scoring(name, {})
+        return registry.link(name, {})
     except (ConfigError, PluginError, SkipPlugin) as fault:
-        _log.warning("scoring %r cannot replace %r: %s", name, chosen, fault)
+        _log.warning("scoring %r cannot replace %s: %s", name, " and ".join(configured), fault)
         return None

@@ -20,6 +20,7 @@ from rosrm.core.master.commands import (
     Assign,
     Command,
     PublishStateConfig,
+    ReadSettings,
     Redeliver,
     Reply,
     SendOrder,
@@ -31,8 +32,9 @@ from rosrm.core.master.reducer import step
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Instance
 from rosrm.errors import JournalBlocked, Refused
-from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy, ScoringPolicy
+from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.placement import PlacementPlugins
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys.finding import master_security
@@ -42,6 +44,7 @@ from rosrm.master.journal_stall import JournalStall
 from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
+from rosrm.master.settings_reload import SettingsReload
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.model.rows import PluginRow
@@ -51,7 +54,7 @@ from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.master_connection import find_master
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
-from rosrm.runtime.bootstrap import handle_stop_signals
+from rosrm.runtime.bootstrap import handle_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.version import __version__
 from rosrm.wording import counted, listed, one_line
@@ -94,10 +97,9 @@ class MasterRuntime:
 
     Args:
         config: checked settings.
-        policy: the configured scoring policy.
+        placement: the configured scoring policies and filters.
         strategies: the configured migration strategies.
         plugins: rows of `rosrm plugins` for the master's own plugins.
-        fallback: name and scoring policy to use if `policy` fails.
         checkpoint: the policy that places replicas; None: snapshots stay on their own hosts.
         declared: declarations of the offers of these plugins.
 
@@ -110,16 +112,16 @@ class MasterRuntime:
     def __init__(
         self,
         config: ClusterConfig,
-        policy: ScoringPolicy,
+        placement: PlacementPlugins,
         strategies: dict[str, MigrationStrategy],
         plugins: Sequence[PluginRow],
-        fallback: tuple[str, ScoringPolicy] | None,
         checkpoint: CheckpointPolicy | None,
         *,
         declared: Declared,
+        reload: SettingsReload,
     ) -> None:
         self._config = config
-        self._fallback = fallback
+        self._reload = reload
         self._checkpoint = checkpoint
         self._declared = declared
         self._plugins = list(plugins)
@@ -141,7 +143,8 @@ class MasterRuntime:
             )  # fmt: skip
             opened.callback(self._journal.close)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
-            handle_stop_signals(self._stop)
+            handle_signals(self._stop, self._reload.hang_up)
+            opened.callback(self._reload.close)
             security = master_security(config.security)
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
@@ -149,7 +152,7 @@ class MasterRuntime:
             self._grants = GrantsWatch(security)
             self._refuse_second()
             opened.callback(self._end_record)
-            self._state = self._restored(policy, strategies)
+            self._state = self._restored(placement, strategies)
             self._endpoint = self._new_endpoint()
             self._closing = opened.pop_all()
 
@@ -167,15 +170,15 @@ class MasterRuntime:
             )
 
     def _restored(
-        self, policy: ScoringPolicy, strategies: dict[str, MigrationStrategy]
+        self, placement: PlacementPlugins, strategies: dict[str, MigrationStrategy]
     ) -> MasterState:
         last = self._last_run()
         epoch = last.epoch + 1
         state = MasterState(
-            self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
-            self._fallback, declared=self._declared,
-        )  # fmt: skip
+            self._config.core(), placement, strategies, epoch, declared=self._declared
+        )
         state.plugins.limit = self._deadlines
+        state.chain_of = self._reload.chain_of
         state.wall = time.time()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""
@@ -244,7 +247,7 @@ class MasterRuntime:
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
-        """Serve until SIGINT, SIGTERM or SIGHUP; returns the exit code."""
+        """Serve until a signal to stop; returns the exit code."""
         # Exclude all objects of the start from garbage collection, because they stay.
         gc.collect()
         gc.freeze()
@@ -281,6 +284,7 @@ class MasterRuntime:
         self._stopping = self._stopping or signal.Signals(number).name
 
     def _tick(self, now: float) -> None:
+        self._endpoint.events += self._reload.poll()
         if self._grants.has_changed(now):
             self._endpoint.shut_revoked()
         self._endpoint.poll_readings()
@@ -403,6 +407,8 @@ class MasterRuntime:
                 links.withdraw(command, now)
             elif isinstance(command, Redeliver):
                 links.redeliver(command, now)
+            elif isinstance(command, ReadSettings):
+                self._reload.start(command.request)
 
     def _write(self, commands: Sequence[Command]) -> Sequence[StoredRecord]:
         """Write the records and intents among the commands as one group."""

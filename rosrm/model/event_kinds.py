@@ -37,6 +37,8 @@ class EventKind(str, Enum):
     JOURNAL_BEHIND = "journal_behind", "the newest records of the journal are missing"
     PEER_REFUSED = "peer_refused", "a message was refused: another protocol version, or malformed"
     PRUNED = "pruned", "ended processes were removed from the listings"
+    SETTINGS_RELOADED = "settings_reloaded", "the settings of a file apply without a restart"
+    RELOAD_REFUSED = "reload_refused", "a file with settings is not valid, and changes nothing"
 
     # --- processes -----------------------------------------------------------------------
 
@@ -55,6 +57,7 @@ class EventKind(str, Enum):
     FAILED = "failed", "the process ended and is not started again"
     CANCEL_REQUESTED = "cancel_requested", "a client cancels the process"
     CANCELLED = "cancelled", "the process ended because it was cancelled"
+    OVERDUE = "overdue", "the time limit of the job has passed: it is stopped, and has failed"
     RESTART_REQUESTED = "restart_requested", "a client restarts the process"
     INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
     UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
@@ -62,10 +65,12 @@ class EventKind(str, Enum):
     GIVEN_UP = "given_up", "the host of the instance is lost, and the instance is given up"
     READOPTED = "readopted", "the lost host rejoined, and its instance owns the name again"
     SEPARATED = "separated", "the process no longer runs near another one, with the reason"
+    PREEMPTED = "preempted", "the process makes room for one of a higher priority; facts: for, host"
 
     # --- hosts ---------------------------------------------------------------------------
 
     HOST_REGISTERED = "host_registered", "a host registered; facts: labels, resources and devices"
+    HOST_CHANGED = "host_changed", "the slave reports other labels of the host; facts: labels"
     HOST_REFUSED = "host_refused", "a host was not registered, with the reason"
     HOST_SUSPECT = "host_suspect", "the host is silent and gets no new work"
     HOST_BACK = "host_back", "a silent host reports again"
@@ -83,6 +88,7 @@ class EventKind(str, Enum):
     NOTHING_MOVES = "nothing_moves", "no process can leave the host, with the reasons"
     DEVICE_MISSING = "device_missing", "a device of the host is missing, with the reason"
     DEVICE_FOUND = "device_found", "a device that was missing is there again"
+    REBALANCING = "rebalancing", "processes move to even out the load of the hosts; facts: moves"
 
     # --- migration -----------------------------------------------------------------------
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
+from rosrm.model.links import MEASURE_SECONDS, LinkPeer
 from rosrm.model.values import EMPTY, Assignment, InstanceId, RestartPolicy
 
 
@@ -56,6 +57,11 @@ class ReportInstances:
 
 
 @dataclass(frozen=True, slots=True)
+class ReloadSettings:
+    """Read the settings of the host from its file again; the answer says what has changed."""
+
+
+@dataclass(frozen=True, slots=True)
 class RunExecutor:
     """Run an executor of a plugin.
 
@@ -89,6 +95,19 @@ class DropReplica:
     instance: InstanceId
 
 
+@dataclass(frozen=True, slots=True)
+class MeasureLinks:
+    """Measure the links to other hosts; the answer has a `LinkReport`.
+
+    Attributes:
+        peers: the other hosts; (): report addresses, interfaces and flows only.
+        learn: measure the flows to the instances of this host from now on.
+    """
+
+    peers: tuple[LinkPeer, ...] = ()
+    learn: bool = False
+
+
 #: Orders to the slave's core.
 InstanceOrder = (
     StartInstance
@@ -98,9 +117,18 @@ InstanceOrder = (
     | SetRestartPolicy
     | ReportInstances
 )
-Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica
+Order = (
+    InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica | ReloadSettings | MeasureLinks
+)
+
+#: Seconds that the check of a settings file may take.
+CHECK_TIMEOUT: Final = 20.0
 
 
 def seconds_of(order: Order) -> float:
     """Return the seconds for which a slave may execute an order before it answers."""
+    if isinstance(order, MeasureLinks):
+        return MEASURE_SECONDS
+    if isinstance(order, ReloadSettings):
+        return CHECK_TIMEOUT
     return order.timeout if isinstance(order, RunExecutor) else 0.0

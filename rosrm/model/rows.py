@@ -10,7 +10,7 @@ from rosrm.model.devices import Device
 from rosrm.model.values import EMPTY, HostDescription
 
 #: Kinds of offers; "plugin": a plugin that failed before its offers were known.
-PluginKind = Literal["probe", "scoring", "migration", "checkpoint", "launcher", "plugin"]
+PluginKind = Literal["probe", "scoring", "filter", "migration", "checkpoint", "launcher", "plugin"]
 PluginState = Literal["selected", "available", "absent", "broken", "failing"]
 
 
@@ -90,6 +90,8 @@ class ProcessRow:
         reason: why it waits, failed, ...
         stale: `cpu` and `memory` are old, because its host is silent or lost.
         owner: principal that submitted it, "user:ada"; "": unknown.
+        cpu_limit: cores that its host enforces; 0: no limit holds.
+        memory_limit: bytes that its host enforces; 0: no limit holds.
     """
 
     name: str
@@ -109,6 +111,8 @@ class ProcessRow:
     reason: str
     stale: bool = False
     owner: str = ""
+    cpu_limit: float = 0.0
+    memory_limit: int = 0
 
 
 @dataclass(frozen=True, slots=True)

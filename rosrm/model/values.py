@@ -24,6 +24,8 @@ MOST_USED: Final[Mapping[str, float]] = MappingProxyType({"cpu": 65_536.0, "memo
 MOST_USED_OF_OTHERS: Final = 2.0**53
 #: Instance numbers and journal records grow one by one, and so never get as large as this.
 LARGEST_NUMBER: Final = 2**53
+#: Greatest rate of a flow or a link, in B/s.
+LARGEST_RATE: Final = 1e15
 
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 
@@ -33,6 +35,9 @@ HostLossAction = Literal["wait", "elsewhere", "stop"]
 IsolationAction = Literal["keep", "stop"]
 Accounting = Literal["attributed", "shared", "countable"]
 Relation = Literal["near", "apart"]
+Enforcement = Literal["preferred", "required"]
+#: "": the default scheduling of the operating system.
+RealtimePolicy = Literal["", "fifo", "rr"]
 
 
 class Kind(str, Enum):
@@ -60,6 +65,20 @@ class RestartPolicy:
     factor: float = 2.0
     attempts: int = 5
     window: float = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReschedulePolicy:
+    """Starts of a failed process on other hosts, once its restart policy has given up.
+
+    Attributes:
+        attempts: highest number of other hosts; 0: the process has failed. A process that ran for
+            `restart.window` counts from zero again.
+        delay: seconds before each attempt.
+    """
+
+    attempts: int = 0
+    delay: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +199,37 @@ class NeighbourRule:
 
 
 @dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of a process that its host enforces; 0: no limit.
+
+    Attributes:
+        memory: bytes above which the kernel kills the process.
+        memory_high: bytes above which the kernel slows the process and reclaims its memory.
+        cpu: cores; above them the process waits.
+        enforce: "required": a host that cannot enforce limits and scheduling does not run the
+            process; "preferred": such a host runs it without.
+    """
+
+    memory: float = 0.0
+    memory_high: float = 0.0
+    cpu: float = 0.0
+    enforce: Enforcement = "preferred"
+
+
+@dataclass(frozen=True, slots=True)
+class Realtime:
+    """Real-time scheduling of a process.
+
+    Attributes:
+        policy: "": none.
+        priority: 1..99; 0: no policy is given.
+    """
+
+    policy: RealtimePolicy = ""
+    priority: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Health:
     """Health checks of a running process; an unhealthy process has failed.
 
@@ -215,6 +265,12 @@ class ProcessSpec:
         avoided_labels: a host with any of these labels is chosen only if no other host fits.
         priority: processes with a higher number are placed first.
         neighbours: rules on its hosts, relative to other processes.
+        talks_to: name of another process to the bytes a second that flow between both.
+        protect: True: it is neither moved nor stopped to make room for others.
+        time_limit: seconds from the first start of a job on a host until the job has failed, with
+            restarts and moves; its return to the queue begins them again. 0: no limit.
+        cpus: numbers of the CPUs that it may use; (): all.
+        nice: its niceness, -20..19.
         devices: devices that it holds while it runs, each kind once.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
@@ -247,6 +303,14 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
     neighbours: tuple[NeighbourRule, ...] = ()
+    talks_to: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    reschedule: ReschedulePolicy = ReschedulePolicy()
+    protect: bool = False
+    time_limit: float = 0.0
+    limits: Limits = Limits()
+    cpus: tuple[int, ...] = ()
+    realtime: Realtime = Realtime()
+    nice: int = 0
     devices: tuple[DeviceNeed, ...] = ()
     given: tuple[str, ...] = field(default=(), compare=False)
 
@@ -254,6 +318,15 @@ class ProcessSpec:
         """Set the default of `ros`, which depends on `package`."""
         if self.ros is None:
             object.__setattr__(self, "ros", self.package is not None)
+
+    @property
+    def enforcement(self) -> tuple[str, ...]:
+        """Return the names of its limits and scheduling settings for which a host needs rights."""
+        settings = {
+            "limits.memory": self.limits.memory, "limits.memory_high": self.limits.memory_high,
+            "limits.cpu": self.limits.cpu, "realtime": self.realtime.policy, "nice": self.nice < 0,
+        }  # fmt: skip
+        return tuple(name for name, value in settings.items() if value)
 
     @property
     def program(self) -> str:
@@ -386,7 +459,8 @@ class InstanceStatus:
         peak_memory: peak memory of the last run in bytes; 0: unknown.
         cpu_time: CPU time of the last run in seconds.
         run_time: seconds from start to end of the last run.
-        message: text on why it failed or was refused.
+        message: text on why it failed or was refused, or runs without its limits.
+        enforced: names of the limits and scheduling settings that hold in this run.
         devices: devices of its host that it holds.
     """
 
@@ -400,6 +474,7 @@ class InstanceStatus:
     cpu_time: float = 0.0
     run_time: float = 0.0
     message: str = ""
+    enforced: tuple[str, ...] = ()
     devices: tuple[HeldDevice, ...] = ()
 
     @property
@@ -483,6 +558,9 @@ class HostDescription:
         period: seconds between two `resource_info` messages.
         executors: names of executors that plugins offer for `Execute` steps.
         absent: probe name to the reason why the probe is absent on this host.
+        unenforced: name of a limit or scheduling setting (`ProcessSpec.enforcement`) to the reason
+            why this host cannot enforce it.
+        cpus: numbers of the CPUs that processes may use; (): unknown.
         devices: devices that the host gives to its processes.
     """
 
@@ -497,6 +575,8 @@ class HostDescription:
     period: float = 0.1
     executors: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    unenforced: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    cpus: tuple[int, ...] = ()
     devices: tuple[Device, ...] = ()
 
     def accounted(self, accounting: Accounting) -> frozenset[str]:

@@ -28,6 +28,7 @@ from rosrm.model.devices import (
     need_fault,
 )
 from rosrm.model.durations import LONGEST
+from rosrm.model.limits import limits_fault
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
 from rosrm.wording import sanitized, sendable
@@ -92,6 +93,7 @@ _FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
     float: (float, float),
     str | None: (lambda text: text or "", lambda text: text or None),
     tuple[str, ...]: (list, tuple),
+    tuple[int, ...]: (list, lambda numbers: tuple(map(int, numbers))),
     Mapping[str, str]: (pairs, mapping),
     values.Kind: (attrgetter("value"), values.Kind),
     values.InstanceState: (attrgetter("value"), values.InstanceState),
@@ -165,6 +167,9 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
         migration=_to_msg(
             msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
         ),
+        talks_to=[
+            msg.ProcessFlow(process=name, rate=float(rate)) for name, rate in spec.talks_to.items()
+        ],
     )  # fmt: skip
 
 
@@ -173,7 +178,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     fault = _spec_fault(message)
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
-    return _from_msg(
+    spec = _from_msg(
         values.ProcessSpec, message,
         parameters={
             pair.key: _json_value(pair.value, f"parameter {pair.key}")
@@ -184,7 +189,12 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
             values.MigrationPolicy, message.migration,
             options=json_object(message.migration.options, "migration options"),
         ),
+        talks_to={flow.process: flow.rate for flow in message.talks_to},
     )  # fmt: skip
+    fault = limits_fault(spec)
+    if fault:
+        raise Refused(f"process {message.name!r:.60}: {fault}")
+    return spec
 
 
 def _spec_fault(message: msg.ProcessSpec) -> str:
@@ -203,6 +213,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _times_fault(message)
         or _neighbours_fault(message)
         or _devices_fault(message)
+        or _flows_fault(message)
     )
 
 
@@ -255,6 +266,19 @@ def _held(message: msg.Assignment | msg.ProcessStatus) -> tuple[HeldDevice, ...]
     return held
 
 
+def _flows_fault(message: msg.ProcessSpec) -> str:
+    for flow in message.talks_to:
+        fault = name_fault(flow.process, "process")
+        if not fault and flow.process == message.name:
+            fault = f"{message.name} names itself; only other processes are allowed"
+        if not fault and not 0.0 <= flow.rate <= values.LARGEST_RATE:
+            allowed = f"0 to {values.LARGEST_RATE:g}"
+            fault = f"{flow.rate} B/s with {flow.process}; allowed: {allowed}"
+        if fault:
+            return f"talks_to: {fault}"
+    return ""
+
+
 def _word_fault(message: msg.ProcessSpec) -> str:
     words = (
         ("kind", message.kind, tuple(kind.value for kind in values.Kind)),
@@ -280,6 +304,8 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "host_loss.delay": message.host_loss.delay,
         "isolation.after": message.isolation.after,
         "health.timeout": message.health.timeout,
+        "reschedule.delay": message.reschedule.delay,
+        "time_limit": message.time_limit,
     }
     for name, seconds in times.items():
         if not 0.0 <= seconds <= LONGEST:
@@ -374,8 +400,11 @@ def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
     if [resource.slot for resource in resources] != list(range(len(resources))):
         raise Refused(f"host {message.name!r:.250}: its resources do not fill the slots 0, 1, 2, …")
     described = _description(message, resources)
-    absent = {probe: sanitized(reason) for probe, reason in described.absent.items()}
-    description = replace(described, absent=absent)
+    absent, unenforced = (
+        {name: sanitized(reason) for name, reason in reasons.items()}
+        for reasons in (described.absent, described.unenforced)
+    )
+    description = replace(described, absent=absent, unenforced=unenforced)
     fault = description_fault(description)
     if fault:
         raise Refused(fault)
@@ -493,7 +522,10 @@ def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
 def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
     """Return the inverse of `process_row_to_msg`."""
     exit_code = message.exit_code if message.exit_code_known else None
-    return _from_msg(ProcessRow, message, cpu=_fraction(message.cpu), exit_code=exit_code)
+    return _from_msg(
+        ProcessRow, message, cpu=_fraction(message.cpu), cpu_limit=_fraction(message.cpu_limit),
+        exit_code=exit_code,
+    )  # fmt: skip
 
 
 def plugin_row_to_msg(row: PluginRow) -> msg.PluginState:

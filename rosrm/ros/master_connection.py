@@ -14,6 +14,7 @@ from rosrm.errors import NoMaster, Refused
 from rosrm.keys.finding import user_security
 from rosrm.keys.roles import SecurityMode
 from rosrm.keys.security import Member
+from rosrm.model.orders import CHECK_TIMEOUT
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import Listing, LogPart
 from rosrm.model.values import ProcessSpec
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 _LOOK: Final = 0.005
 #: Least seconds that a discovered master has for a request.
 _REQUEST: Final = 10.0
+#: Seconds for a reload, in which master and slaves check their files one after the other.
+_RELOAD: Final = 2 * CHECK_TIMEOUT + _REQUEST
 #: Seconds after which a request without an answer is sent again.
 _AGAIN: Final = 2.0
 #: The same for a handshake, which costs the master nothing.
@@ -269,6 +272,14 @@ class MasterClient:
         """Remove ended processes and departed hosts from the listings; without names: all."""
         return self._ask(srv.Prune, names.PRUNE, processes=list(processes), hosts=list(hosts))
 
+    def rebalance(self, *, plan_only: bool = False) -> str:
+        """Begin one round of moves that even out the load of the hosts, or return its plan."""
+        return self._ask(srv.Rebalance, names.REBALANCE, plan_only=plan_only)
+
+    def reload(self) -> str:
+        """Let master and slaves read their files again; return a line for each."""
+        return self._ask(srv.Reload, names.RELOAD, patience=_RELOAD)
+
     # --- listings and logs ---------------------------------------------------------------
 
     def list(
@@ -337,13 +348,16 @@ class MasterClient:
             self._master, self._last_contact = hello, time.monotonic()
         return self._control.envelope(self._master.beat, self._master.epoch)
 
-    def _ask(self, kind: Any, name: str, **fields: Any) -> str:
-        """Send a request that acts, and return the master's message."""
+    def _ask(self, kind: Any, name: str, *, patience: float = 0.0, **fields: Any) -> str:
+        """Send a request that acts, and return the master's message.
+
+        `patience`: seconds for the answer, if more than for other requests.
+        """
         request = kind.Request(**fields)
         for is_repeated in (False, True):
             request.envelope = self._envelope()
             try:
-                return str(self._call(kind, name, request).answer.message)
+                return str(self._call(kind, name, request, patience).answer.message)
             except Refused as refusal:
                 if is_repeated or refusal.code != "stale":
                     raise
@@ -414,11 +428,11 @@ class MasterClient:
         known.client.peer, known.until = slave, until
         return known
 
-    def _call(self, kind: Any, name: str, request: Any) -> Any:
+    def _call(self, kind: Any, name: str, request: Any, patience: float = 0.0) -> Any:
         """Send a request to the master until it is answered."""
         client = self._client(kind, name)
         try:
-            return self._answered(client, kind, request, _MASTER)
+            return self._answered(client, kind, request, _MASTER, patience)
         except Refused as refusal:
             if refusal.code != "stale" or hasattr(request, "envelope"):
                 raise
@@ -426,14 +440,16 @@ class MasterClient:
             # be repeated.
             return self._answered(client, kind, request, _MASTER)
 
-    def _answered(self, client: SealedClient, kind: Any, request: Any, who: str) -> Any:
+    def _answered(
+        self, client: SealedClient, kind: Any, request: Any, who: str, patience: float = 0.0
+    ) -> Any:
         """Send a request until an answer comes; the receiver repeats a lost answer.
 
         Every request may be repeated: it only reads, or carries an id by which it is recognised.
         One that exceeds its bounds is not sent: `Refused` names the field.
         """
         check_bounds(request)
-        deadline = time.monotonic() + self._timeout
+        deadline = time.monotonic() + max(self._timeout, patience)
         answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
         response = answers.answer
         acts = hasattr(request, "envelope")  # read-only requests have none

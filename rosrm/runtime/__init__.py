@@ -4,7 +4,9 @@ bootstrap.py       settings and plugins, passed from the command to the runtime
 state_lock.py      one runtime for one state directory
 private_files.py   owner, mode and links of directories and files
 atomic_file.py     replacement of a whole file, or of nothing
+cgroups.py         control groups: mounts, the own group, delegation
 disk_space.py      free space on the disk of a directory
+settings_check.py  check of a settings file, in a process of its own
 oom_score.py       protection of an agent from the OOM killer
 ros_wheels.py      the environment of ROS 2 from wheels
 """

@@ -12,13 +12,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from types import FrameType
 from typing import Final
 
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.runtime import private_files
+from rosrm.runtime.settings_check import SettingsSource
 from rosrm.wording import printable
 
 _OPTION: Final = "--settings-fd"
@@ -31,21 +32,25 @@ class Handover:
     Attributes:
         settings: JSON of `ClusterConfig` or `HostConfig`.
         plugins: every installed plugin.
+        source: origin of the settings, for a reload.
     """
 
     settings: str
     plugins: tuple[PluginAddress, ...]
+    source: SettingsSource
 
 
-def hand_over(settings: str) -> int:
+def hand_over(settings: str, source: SettingsSource) -> int:
     """Write the input of a runtime; return the file descriptor that the runtime is to inherit.
 
     Args:
         settings: JSON of the checked settings.
+        source: origin of the settings.
     """
     plugins = [[one.name, one.target, one.distribution] for one in installed_plugins()]
     descriptor = os.memfd_create("rosrm-settings", 0)
-    os.write(descriptor, json.dumps({"settings": settings, "plugins": plugins}).encode())
+    handed = {"settings": settings, "plugins": plugins, "source": astuple(source)}
+    os.write(descriptor, json.dumps(handed).encode())
     os.lseek(descriptor, 0, os.SEEK_SET)
     return descriptor
 
@@ -75,17 +80,37 @@ def take_over(command_line: Sequence[str]) -> Handover:
     with os.fdopen(int(command_line[1])) as source:
         handed = json.load(source)
     plugins = tuple(PluginAddress(*address) for address in handed["plugins"])
-    return Handover(handed["settings"], plugins)
+    return Handover(handed["settings"], plugins, SettingsSource(*handed["source"]))
 
 
-def handle_stop_signals(handler: Callable[[int, FrameType | None], None]) -> None:
-    """Install one handler for SIGINT, SIGTERM and SIGHUP (the terminal was closed).
+_Handler = Callable[[int, FrameType | None], None]
 
-    A SIGHUP that is ignored, as by `nohup`, stays ignored.
+
+def handle_signals(stop: _Handler, reload: _Handler | None = None) -> None:
+    """Install the handlers of SIGINT and SIGTERM, which stop, and of SIGHUP.
+
+    SIGHUP means that the terminal was closed, and stops, where the process has a controlling
+    terminal. Elsewhere it reloads the settings. A SIGHUP that is ignored, as by `nohup`, stays
+    ignored.
+
+    Args:
+        stop: called for each signal to stop.
+        reload: called for a SIGHUP without a terminal; None: `stop` is.
     """
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        # At the start, because a closed terminal is no controlling terminal any more.
+        signal.signal(signal.SIGHUP, stop if reload is None or has_terminal() else reload)
+
+
+def has_terminal() -> bool:
+    """Return True if this process has a controlling terminal."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 class LogFormatter(logging.Formatter):

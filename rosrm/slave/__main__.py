@@ -15,7 +15,7 @@ import sys
 
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import Registry
-from rosrm.runtime import oom_score
+from rosrm.runtime import cgroups, oom_score
 from rosrm.runtime.bootstrap import Handover, run
 from rosrm.slave.own_key import wait_for_security
 from rosrm.slave.runtime import SlaveRuntime
@@ -34,7 +34,8 @@ def serve(handover: Handover) -> int:
             "CAP_SYS_RESOURCE or with `OOMScoreAdjust=%d` of systemd they are",
             fault, oom_score.PROTECTED,
         )  # fmt: skip
-    return SlaveRuntime(config, registry, wait_for_security(config)).run()
+    cgroups.delegate()  # first, because the supervisor inherits the group
+    return SlaveRuntime(config, registry, wait_for_security(config), handover.source).run()
 
 
 if __name__ == "__main__":

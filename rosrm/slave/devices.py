@@ -27,13 +27,14 @@ class DeviceWatch:
         configured: devices by kind; for these kinds they replace what the probes find.
 
     Attributes:
+        configured: as the argument; a reload replaces them.
         devices: all devices, as at the last look.
         lost: kind and unit of each device that was missing in the last two looks, to the reason;
             a device may be missing for a moment, such as while its driver starts again.
     """
 
     def __init__(self, configured: Mapping[str, tuple[Device, ...]]) -> None:
-        self._configured = configured
+        self.configured = configured
         self.devices: tuple[Device, ...] = ()
         self.lost: Mapping[tuple[str, str], str] = {}
 
@@ -58,10 +59,10 @@ class DeviceWatch:
         for devices in found.values():
             for device in devices:
                 by_kind.setdefault(device.kind, {}).setdefault(device.unit, device)
-        for kind, configured in self._configured.items():
+        for kind, configured in self.configured.items():
             yield from _checked(_joined(one, by_kind.get(kind)) for one in configured)
         for kind, units in by_kind.items():
-            if kind not in self._configured:
+            if kind not in self.configured:
                 yield from _checked(units.values())
 
 

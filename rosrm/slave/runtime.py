@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from rosrm.config.reloading import OF_HOST, reloaded
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
 from rosrm.core.slave.events import DevicesMissed, Event, Registered, TimePassed
@@ -27,7 +28,8 @@ from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
-from rosrm.model.orders import RunExecutor, SetRestartPolicy
+from rosrm.model.links import LinkReport
+from rosrm.model.orders import MeasureLinks, RunExecutor, SetRestartPolicy
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -41,19 +43,23 @@ from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
+from rosrm.ros.slave.flows import FlowSampler
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
-from rosrm.runtime.bootstrap import handle_stop_signals
+from rosrm.runtime.bootstrap import handle_signals
+from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.devices import LOOK_PERIOD as LOOK_AT_DEVICES
 from rosrm.slave.devices import DeviceWatch
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
+from rosrm.slave.interfaces import own_address
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
+from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sampler import ProbeReport, Sampler
@@ -62,7 +68,7 @@ from rosrm.slave.shutdown import STOP_ALL, Shutdown
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.usage import UsageWatch
 from rosrm.version import __version__
-from rosrm.wording import counted
+from rosrm.wording import by_reason, counted, reload_summary
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -87,18 +93,24 @@ class SlaveRuntime:
 
     Args:
         security: of the slave, with its key.
+        source: origin of the settings.
 
     Raises:
         Refused: another slave runs on this state directory.
         SupervisorError: the supervisor cannot be started or reached.
     """
 
-    def __init__(self, config: HostConfig, registry: Registry, security: Member) -> None:
+    def __init__(
+        self, config: HostConfig, registry: Registry, security: Member, source: SettingsSource
+    ) -> None:
         self._config = config
+        self._settings_check = SettingsCheck(source)
+        self._hung_up = False
         self._security = security
         self._incarnation = _random_number()
         self._stopping = ""
         self._accepting = False
+        self._learns = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
         self._state = SlaveState(
             max_processes=config.max_processes, max_starting=config.max_starting, max_age=max_age
@@ -122,18 +134,26 @@ class SlaveRuntime:
             )
             launchers = Launchers.of(offered, registry.capabilities_of())
             sessions = SessionTable(launchers=launchers)
-            self._usage = UsageWatch(sessions)
-            absent = self._open_probes(registry, sessions, opened)
+            self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
+            self._absent = self._open_probes(registry, sessions, opened)
             first = self._sampler.first().reports
             self._devices = DeviceWatch(config.devices)
             self._devices.look(self._sampler.devices)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
-            handle_stop_signals(self._stop)
+            handle_signals(self._stop, self._hang_up)
+            opened.callback(self._settings_check.close)
             self._open_supervisor(opened)
-            graph = self._join_ros(absent, opened)
+            graph = self._join_ros(opened)
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._note_probes(first)
             self._note_broken(offered.broken)
+            name = f"{self._participant.node.get_name()}_flows"
+            self._flows = FlowSampler(lambda: self._participant.unwatched_node(name))
+            self._links = LinkProber(
+                config.links, key_of=security.link_key, own_id=lambda: self._endpoint.host_id,
+                only=own_address(config.ros), flows=self._flows.rates,
+            )  # fmt: skip
+            opened.callback(self._links.close)
             self._serve_master(max_age)
             self._starter = Starter(
                 config, self._snapshots, self._state, self._supervisor, self._endpoint,
@@ -158,9 +178,8 @@ class SlaveRuntime:
         probes = registry.probes(config.probes, context)
         self._sampler = Sampler(probes.made)
         opened.callback(self._sampler.close)
+        self._probe_labels = probes.labels
         self._limit = self._limits()
-        added = {name: text for made in probes.made for name, text in made.labels.items()}
-        self._labels = {**added, **config.labels}
         return probes.absent
 
     def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
@@ -170,8 +189,11 @@ class SlaveRuntime:
             ended=lambda fault: self._ending.note_supervisor_left(fault),  # noqa: PLW0108 - made later
         )  # fmt: skip
         opened.callback(self._supervisor.close)
+        if self._supervisor.unenforced:
+            missing = by_reason((name, why) for name, why in self._supervisor.unenforced.items())
+            _log.info("limits and scheduling that are not enforced here: %s", missing)
 
-    def _join_ros(self, absent: Mapping[str, str], opened: contextlib.ExitStack) -> GraphWatch:
+    def _join_ros(self, opened: contextlib.ExitStack) -> GraphWatch:
         """Create participant and endpoint; return the view of the ROS graph."""
         config = self._config
         self._participant = Participant(
@@ -180,7 +202,7 @@ class SlaveRuntime:
         opened.callback(self._participant.close)
         self._endpoints = SealedEndpoints(self._participant, self._security)
         self._endpoint = SlaveEndpoint(
-            self._endpoints, self._description(absent), self._state, take=self._take,
+            self._endpoints, self._description(), self._state, take=self._take,
             snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
             seen=JournalWatermark(config.state / "journal_seen"),
         )  # fmt: skip
@@ -205,7 +227,7 @@ class SlaveRuntime:
         )  # fmt: skip
         duties = Duties(
             self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
-            self._execute, self._read_log,
+            self._execute, self._read_log, self._measure_links, self._reload,
         )  # fmt: skip
         SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
@@ -220,13 +242,15 @@ class SlaveRuntime:
             limit[slot] = self._config.limits.get(resource.name, 1.0)
         return limit
 
-    def _description(self, absent: Mapping[str, str]) -> HostDescription:
+    def _description(self) -> HostDescription:
         config = self._config
         return HostDescription(
             name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
-            pid=os.getpid(), software_version=__version__, labels=self._labels,
+            pid=os.getpid(), software_version=__version__,
+            labels={**self._probe_labels, **config.labels},
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
-            period=config.period, executors=self._executors.names, absent=absent,
+            period=config.period, executors=self._executors.names, absent=self._absent,
+            unenforced=self._supervisor.unenforced, cpus=tuple(sorted(os.sched_getaffinity(0))),
             devices=self._devices.devices,
         )  # fmt: skip
 
@@ -252,7 +276,7 @@ class SlaveRuntime:
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
-        """Serve until SIGINT, SIGTERM or SIGHUP; returns the exit code."""
+        """Serve until a signal to stop; returns the exit code."""
         self._supervisor.listen()
         with self._closing:
             self._serve(lambda: not self._stopping and not self._endpoint.failure)
@@ -309,6 +333,7 @@ class SlaveRuntime:
             if now >= next_devices:
                 next_devices = now + LOOK_AT_DEVICES
                 self._look_at_devices()
+            guard.call(self._links.turn, now)
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
                 guard.call(self._look_at_health, now)
@@ -328,8 +353,7 @@ class SlaveRuntime:
     def _look_at_devices(self) -> None:
         """Report changes of the devices to the master, and lost ones to the core."""
         if self._devices.look(self._sampler.devices):
-            self._endpoint.devices = self._devices.devices
-            self._endpoint.publish_statuses((), complete=False)
+            self._endpoint.set_devices(self._devices.devices)
         if self._devices.lost:
             self._take(DevicesMissed(self._devices.lost))
 
@@ -341,11 +365,46 @@ class SlaveRuntime:
             self._from_threads.append(lambda: self._ending.log_progress())  # noqa: PLW0108 - as above
         self._stopping = self._stopping or signal.Signals(number).name
 
+    def _hang_up(self, _number: int, _frame: Any) -> None:
+        self._hung_up = True
+
+    # --- reload --------------------------------------------------------------------------
+
+    def _reload(self, done: Checked) -> None:
+        """Read the file of this host again; call `done` with what has changed, or the fault."""
+
+        def checked(text: str, fault: str) -> None:
+            done("" if fault else self._apply(HostConfig.from_json(text)), fault)
+
+        self._settings_check.start(checked)
+
+    def _apply(self, new: HostConfig) -> str:
+        """Apply the settings that need no restart, and return a summary."""
+        read = reloaded(self._config, new, OF_HOST)
+        self._config = read.config
+        self._limit = self._limits()
+        self._devices.configured = read.config.devices
+        self._look_at_devices()
+        description = self._description()
+        if description != self._endpoint.description:
+            self._endpoint.describe_again(description)
+        return reload_summary(read.changed, read.kept)
+
+    def _review_reload(self) -> None:
+        if self._hung_up:
+            self._hung_up = False
+            self._reload(
+                lambda summary, fault: _log.info("SIGHUP: %s", summary or f"not reloaded: {fault}")
+            )
+        self._settings_check.poll()
+
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
+        self._review_reload()
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
+        self._look_at_flows()
         sample = self._sampler.latest(now)
         if sample.reports:
             self._note_probes(sample.reports)
@@ -390,6 +449,15 @@ class SlaveRuntime:
                 [one.memory for one in used],
                 {slot: [one.others[slot] for one in used] for slot in used[0].others},
             )
+
+    def _measure_links(self, order: MeasureLinks, done: Callable[[LinkReport], None]) -> None:
+        """Measure links, and learn flows from now on or no more."""
+        self._learns = order.learn
+        self._links.measure(order, done)
+
+    def _look_at_flows(self) -> None:
+        nodes = self._state.nodes() if self._learns else {}
+        self._participant.guard.call(self._flows.look, nodes)
 
     # --- core and supervisor -------------------------------------------------------------
 

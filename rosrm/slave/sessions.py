@@ -1,9 +1,10 @@
 """Sessions (process trees) of the slave's instances, and their usage.
 
-The slave adds the leader of each session. One walk a second finds the other processes by their
-session id: `getsid` for each process of the host, which takes a microsecond and reads no file. A
-process that begins a session of its own (a daemon) leaves the tree, as in job control. Where
-a launcher's program leads the session, the launcher knows the members.
+The slave adds the leader of each session, and the control group of its instance if there is one:
+the group has all processes and the exact usage. Without a group, one walk a second finds the other
+processes by their session id: `getsid` for each process of the host, which takes a microsecond and
+reads no file. A process that begins a session of its own (a daemon) then leaves the tree, as in job
+control. Where a launcher's program leads the session, the launcher knows the members.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.supervisor.procfs import inner_pid
 
@@ -34,7 +36,8 @@ class SessionUsage:
 
     Attributes:
         cpu: cores, mean since the previous walk.
-        memory: anonymous bytes and bytes of shared memory, summed over the processes.
+        memory: anonymous bytes and bytes of shared memory; without a control group summed over the
+            processes, so that shared bytes count in each.
         others: slot of another resource to the amount in its base unit, as probes measure it.
     """
 
@@ -62,6 +65,7 @@ class SessionTable:
         self._session_of = session_of
         self._launchers = launchers or Launchers()
         self._members: dict[int, tuple[int, ...]] = {}
+        self._groups: dict[int, InstanceGroup] = {}
         self._led: set[int] = set()  # leaders that are, or may become, a launcher's program
         self._pids: tuple[int, ...] = ()
         self._ended_cpu_time = 0.0
@@ -95,8 +99,10 @@ class SessionTable:
                 own.append(inner_pid(pid))
         return (*members, *own)
 
-    def add(self, leader: int) -> None:
+    def add(self, leader: int, group: InstanceGroup | None = None) -> None:
         """Add a session that has begun, by the pid of its leader, who counts at once."""
+        if group is not None and group.exists:
+            self._groups[leader] = group
         self._members[leader] = (leader,)
         if self._launchers.leads(leader) is not False:
             self._led.add(leader)
@@ -109,6 +115,7 @@ class SessionTable:
         reaped children, as reported by `wait4`.
         """
         self._members.pop(leader, None)
+        self._groups.pop(leader, None)
         self._led.discard(leader)
         self._usage.pop(leader, None)
         self._cpu_time.pop(leader, None)
@@ -126,7 +133,7 @@ class SessionTable:
         """
         try:
             self._find_members()
-            read = {leader: self._read(members) for leader, members in self._members.items()}
+            read = {leader: self._usage_of(leader) for leader in self._members}
         except OSError:
             return
         elapsed = 0.0 if self._walked is None else now - self._walked
@@ -145,16 +152,10 @@ class SessionTable:
         if not self._members:
             return
         found: dict[int, list[int]] = {leader: [leader] for leader in self._members}
-        for entry in os.listdir(self._proc):  # noqa: PTH208 - a Path for each process costs 2 us
-            if not entry.isdigit():
-                continue
-            pid = int(entry)
-            try:
-                leader = self._session_of(pid)
-            except OSError:  # it has ended
-                continue
-            if leader != pid and leader in found:
-                found[leader].append(pid)
+        for leader, group in self._groups.items():
+            found[leader] += [pid for pid in group.pids() if pid != leader]
+        if len(self._groups) < len(self._members):
+            self._walk(found)
         for leader in tuple(self._led):
             leads = self._launchers.leads(leader)
             if leads:
@@ -164,8 +165,33 @@ class SessionTable:
         self._members = {leader: tuple(pids) for leader, pids in found.items()}
         self._collect_pids()
 
+    def _walk(self, found: Mapping[int, list[int]]) -> None:
+        """Add the processes of sessions without a control group."""
+        for entry in os.listdir(self._proc):  # noqa: PTH208 - a Path for each process costs 2 us
+            if not entry.isdigit():
+                continue
+            pid = int(entry)
+            try:
+                leader = self._session_of(pid)
+            except OSError:  # it has ended
+                continue
+            if leader != pid and leader in found and leader not in self._groups:
+                found[leader].append(pid)
+
     def _collect_pids(self) -> None:
         self._pids = tuple(pid for pids in self._members.values() for pid in pids)
+
+    def _usage_of(self, leader: int) -> tuple[float, int]:
+        """Return the CPU seconds and used bytes of a session. Raises OSError as `_read`."""
+        group = self._groups.get(leader)
+        cpu_time = memory = None
+        if group is not None:
+            cpu_time, memory = group.cpu_time(), group.memory()
+        if cpu_time is None or memory is None:
+            by_process = self._read(self._members[leader])
+            cpu_time = by_process[0] if cpu_time is None else cpu_time
+            memory = by_process[1] if memory is None else memory
+        return cpu_time, memory
 
     def _read(self, members: tuple[int, ...]) -> tuple[float, int]:
         """Return the CPU seconds (with those of reaped children) and used bytes of pids.

@@ -29,7 +29,8 @@ def serve(handover: Handover) -> int:
     ending = replace(config, on_stop="stop", probes={})
     host = config.host
     security = host_security(config.security, host) or security_without_key(host)
-    return SlaveRuntime(ending, Registry.load(handover.plugins), security).stop_all()
+    registry = Registry.load(handover.plugins)
+    return SlaveRuntime(ending, registry, security, handover.source).stop_all()
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -15,6 +15,7 @@ from rosrm.core.slave import commands, events
 from rosrm.core.supervisor import events as orders
 from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
+from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
 from rosrm.supervisor import messages
@@ -87,6 +88,15 @@ class SupervisorLink:
     def pid(self) -> int:
         """Return the pid of the supervisor."""
         return self._client.pid
+
+    @property
+    def unenforced(self) -> Mapping[str, str]:
+        """Return limits and scheduling settings to the reasons why they cannot be enforced."""
+        return self._client.unenforced
+
+    def group_of(self, instance: InstanceId) -> InstanceGroup:
+        """Return the control group of an instance."""
+        return InstanceGroup(self._client.groups, instance)
 
     # --- orders --------------------------------------------------------------------------
 

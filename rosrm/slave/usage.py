@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final
 
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
+from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.sessions import SessionTable, SessionUsage
 
 #: Readings that are published between the measurement of the usage and its publication. So the
@@ -20,10 +21,14 @@ class UsageWatch:
 
     Args:
         sessions: the table that the probes use too.
+        group_of: returns the control group of an instance.
     """
 
-    def __init__(self, sessions: SessionTable) -> None:
+    def __init__(
+        self, sessions: SessionTable, group_of: Callable[[InstanceId], InstanceGroup]
+    ) -> None:
         self._sessions = sessions
+        self._group_of = group_of
         self._leaders: dict[InstanceId, int] = {}
         self._starting: set[InstanceId] = set()
         self._seen: Mapping[int, SessionUsage] = {}
@@ -45,7 +50,7 @@ class UsageWatch:
         else:
             self._starting.discard(status.instance)
         if runs and status.instance not in self._leaders:
-            self._sessions.add(status.pid)
+            self._sessions.add(status.pid, self._group_of(status.instance))
             self._leaders[status.instance] = status.pid
 
     def look(self, now: float, by_process: Mapping[int, Mapping[int, float]]) -> None:

@@ -6,6 +6,10 @@
     endpoint.py           both ends of the socket, and one supervisor for one host
     connection.py         the supervisor's side of a connection, with send_buffer.py
     spawn.py              spawning of one process
+    spawn_into.py         the same into a control group of version 2
+    confinement.py        start of an instance within its limits
+    group_trees.py        where control groups may be made
+    instance_groups.py    the control groups of the instances
     descriptors.py        limit of open descriptors
     process_tree.py       process trees of the instances: signals, reaping
     procfs.py             lookup in /proc of the processes of an instance

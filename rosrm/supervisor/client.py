@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.errors import SupervisorError
@@ -34,6 +34,11 @@ if TYPE_CHECKING:
 
 DEFAULT_LOG_LIMITS: Final = LogLimits()
 _CHUNK: Final = 1 << 16
+#: Answer of a supervisor of an earlier version, which knows no limits.
+_NOTHING_ENFORCED: Final = dict.fromkeys(
+    ("limits.memory", "limits.memory_high", "limits.cpu", "realtime", "nice"),
+    "a supervisor of an earlier version runs; it ends when all its processes have ended",
+)
 
 
 class SupervisorGone(SupervisorError):
@@ -67,6 +72,8 @@ class SupervisorClient:
             final statuses included.
         memos: texts that an earlier client stored for instances that have not ended.
         fenced: instances that have a fence.
+        unenforced: limit or scheduling setting to the reason why it cannot be enforced here.
+        groups: version, directory and controllers of each tree of the instances' control groups.
         notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
@@ -85,6 +92,8 @@ class SupervisorClient:
         self.instances: tuple[InstanceStatus, ...] = ()
         self.memos: Mapping[InstanceId, str] = {}
         self.fenced: frozenset[InstanceId] = frozenset()
+        self.unenforced: Mapping[str, str] = {}
+        self.groups: tuple[tuple[int, str, tuple[str, ...]], ...] = ()
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -192,7 +201,7 @@ class SupervisorClient:
         return messages.Launch(
             key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
             restart_rule(order.restart), stop_rule(order.stop), order.memo,
-            fence_rule(order.fence), order.last_contact,
+            fence_rule(order.fence), order.last_contact, order.limits,
         )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
@@ -280,6 +289,9 @@ class SupervisorClient:
         self.notes = tuple(str(note) for note in notes)
         self.instances = tuple(status_from(value) for value in instances)
         self.fenced = frozenset(InstanceId(*messages.read_key(key)) for key in fenced)
+        self.unenforced = messages.read_texts(fields.get("unenforced", _NOTHING_ENFORCED))
+        groups: Any = fields.get("groups", ())
+        self.groups = tuple((version, top, tuple(names)) for version, top, names in groups)
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}
 
     def _fail(self, failure: SupervisorError) -> None:

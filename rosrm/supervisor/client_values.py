@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
+from rosrm.core.supervisor.rules import FenceRule, LimitRule, RestartRule, StopRule
 from rosrm.model.values import (
     Fence,
     InstanceId,
     InstanceState,
     InstanceStatus,
+    ProcessSpec,
     RestartPolicy,
     StopPolicy,
 )
@@ -27,6 +28,7 @@ class LaunchOrder:
         working_directory: None: the default one, below the state directory.
         memo: kept by the supervisor for a later run of the client; see `SupervisorClient.memos`.
         fence: rule by which the supervisor ends the instance without an order; None: never.
+        limits: limits and scheduling.
         last_contact: of the master with this host, monotonic; 0.0: now.
     """
 
@@ -39,6 +41,7 @@ class LaunchOrder:
     memo: str = ""
     fence: Fence | None = None
     last_contact: float = 0.0
+    limits: LimitRule = field(default_factory=LimitRule)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +74,15 @@ def restart_rule(restart: RestartPolicy) -> RestartRule:
 def stop_rule(stop: StopPolicy) -> StopRule:
     """Return a stop policy as the supervisor's rule."""
     return StopRule(*(getattr(stop, name) for name in StopRule._fields))
+
+
+def limit_rule(spec: ProcessSpec) -> LimitRule:
+    """Return the limits and the scheduling of a process as the supervisor's rule."""
+    limits, realtime = spec.limits, spec.realtime
+    return LimitRule(
+        limits.memory, limits.memory_high, limits.cpu, spec.cpus, realtime.policy,
+        realtime.priority, spec.nice, limits.enforce == "required",
+    )  # fmt: skip
 
 
 def status_from(value: object) -> InstanceStatus:

@@ -188,6 +188,7 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "stop_began": messages.read_time,
     "trail": messages.read_text,
     "fault": messages.read_text,
+    "enforced": lambda value: tuple(messages.read_text(name) for name in value),
     "heard": messages.read_time,
     "fenced": messages.read_text,
     "kill_by": _optional_time,
@@ -198,7 +199,7 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "message": messages.read_text,
 }
 #: Fields that may be missing in older records.
-_NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by", "withdrawn"})
+_NEW_FIELDS: Final = frozenset({"enforced", "fault", "fenced", "heard", "kill_by", "withdrawn"})
 
 
 class InstanceRecord:

@@ -9,13 +9,14 @@ The client sends orders; the key `do` names the order:
                  log_bytes                      `LogLimits`; log_bytes: the last one
     environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
-                 heard, memo
+                 heard, memo, limits
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
                                                 fence: null, or [after, grace, alive]: see
                                                 `heard`; heard: last contact; 0: now
                                                 memo: a text that is kept for the client
+                                                limits: the fields of `LimitRule`, in their order
     stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
                                                 refuse a `start` that arrives later
     fence        instance                       SIGKILL to the process tree; for an unknown
@@ -37,10 +38,14 @@ The client sends orders; the key `do` names the order:
 
 The supervisor sends messages; the key `tell` names the message:
 
-    welcome      protocol, pid, notes, instances, memos, fenced
+    welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
                                                    fenced: those that have a fence
+                                                   unenforced: limit or scheduling setting to the
+                                                   reason why it cannot be enforced
+                                                   groups: [version, directory, controllers] where
+                                                   the control groups of instances are
     status       status                            a change, or the answer to a repeated order
     amended      instance, restart                 the amendment is recorded; its status came before
     refused      message                           the supervisor closes the connection after it
@@ -58,7 +63,7 @@ from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import Instance
-from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
+from rosrm.core.supervisor.rules import FenceRule, Key, LimitRule, RestartRule, StopRule
 from rosrm.model.durations import LONGEST
 from rosrm.supervisor.json_lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
@@ -69,6 +74,8 @@ UNREADABLE: Final = (KeyError, TypeError, ValueError, AttributeError, OverflowEr
 
 #: Largest number in a message: that of an instance is an unsigned integer of 64 bits.
 _MOST_NUMBER: Final = 2**64 - 1
+#: Largest number of a CPU.
+_MOST_CPU: Final = 65_535
 #: Largest time or amount in a message, so that sums stay finite.
 _MOST_TIME: Final = 1e300
 
@@ -101,6 +108,7 @@ class Launch(NamedTuple):
     memo: str = ""
     fence: FenceRule | None = None
     heard: float = 0.0
+    limits: LimitRule = LimitRule()
 
     def amended(self, amendment: Amend) -> Launch:
         """Return this launch with the restart policy and environment changes of an amendment."""
@@ -157,6 +165,7 @@ class Status(NamedTuple):
     cpu_time: float
     run_time: float
     message: str
+    enforced: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, instance: Instance) -> Status:
@@ -238,6 +247,7 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         read_text(fields.get("memo", "")),  # records from before protocol 2 have no memo
         read_fence(fields.get("fence")),  # before protocol 3 neither of these
         read_time(fields.get("heard", 0.0)),
+        read_limits(fields.get("limits", ())),
     )
 
 
@@ -307,6 +317,19 @@ def read_fence(value: Sequence[Any] | None) -> FenceRule | None:
     return FenceRule(_wait(after), _wait(grace), bool(alive))
 
 
+def read_limits(value: Sequence[Any]) -> LimitRule:
+    """Return limits from their JSON list, which may have fewer fields."""
+    rule = LimitRule(*value)
+    cpus = tuple(read_whole(number, 0, _MOST_CPU) for number in rule.cpus)
+    if rule.policy not in ("", "fifo", "rr"):
+        raise ValueError(f"real-time policy {rule.policy!r}")
+    return LimitRule(
+        read_amount(rule.memory), read_amount(rule.memory_high), read_amount(rule.cpu), cpus,
+        rule.policy, read_whole(rule.priority, 0, 99), read_whole(rule.nice, -20, 19),
+        bool(rule.required),
+    )  # fmt: skip
+
+
 def read_text(value: Any) -> str:
     """Return a JSON value that must be a text. Raises TypeError."""
     if not isinstance(value, str):
@@ -370,12 +393,12 @@ def _changes(value: Any) -> dict[str, str | None]:
 
 def encode_welcome(
     pid: int, notes: Sequence[str], statuses: Sequence[Status], memos: Mapping[Key, str],
-    fenced: Sequence[Key],
+    fenced: Sequence[Key], *, unenforced: Mapping[str, str], groups: Sequence[Sequence[Any]],
 ) -> bytes:  # fmt: skip
     """Return the answer to `hello`."""
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
-    return line({**welcome, **known})
+    return line({**welcome, **known, "unenforced": dict(unenforced), "groups": groups})
 
 
 def encode_status(status: Status) -> bytes:
@@ -401,4 +424,5 @@ def encode_ended() -> bytes:
 def read_status(value: Sequence[Any]) -> Status:
     """Return a status from its JSON list."""
     status = Status(*value)
-    return status._replace(instance=read_key(status.instance))
+    enforced = tuple(read_text(name) for name in status.enforced)
+    return status._replace(instance=read_key(status.instance), enforced=enforced)

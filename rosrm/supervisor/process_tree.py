@@ -18,6 +18,7 @@ from rosrm.core.supervisor.events import Event, Exited, SessionEnded
 from rosrm.core.supervisor.instance import UNKNOWN_EXIT
 from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import descriptors, own_log, procfs
+from rosrm.supervisor.instance_groups import InstanceGroups
 from rosrm.supervisor.procfs import Stat
 
 #: In place of a pidfd: no descriptor was left, and `look` finds the end of the process.
@@ -33,11 +34,14 @@ class ProcessTrees:
         state: the state directory, which is also the supervisor's mark in environments.
         selector: watches the pidfds; the data of each is a function to call.
         happened: receives an event for each change of an instance.
+        groups: control groups of the instances, which have all their processes.
     """
 
     def __init__(
-        self, state: str, selector: selectors.BaseSelector, happened: Callable[[Event], None]
-    ) -> None:
+        self, state: str, selector: selectors.BaseSelector, happened: Callable[[Event], None],
+        groups: InstanceGroups,
+    ) -> None:  # fmt: skip
+        self._groups = groups
         self._state = state
         self._selector = selector
         self._happened = happened
@@ -108,9 +112,10 @@ class ProcessTrees:
         pidfd = self._taken_over.pop(pid)
         if pidfd != _NO_PIDFD:
             self._unwatch(pidfd)
-        left = procfs.find_members(pid, mark(key), self._state)
+        left = self._left(key, pid)
         self.watch_strays(key, left)
-        self._happened(Exited(key, UNKNOWN_EXIT, leftovers=bool(left)))
+        memory = self._groups.out_of_memory(key)
+        self._happened(Exited(key, UNKNOWN_EXIT, leftovers=bool(left), out_of_memory=memory))
 
     # --- reaping ------------------------------------------------------------------------------
 
@@ -134,8 +139,8 @@ class ProcessTrees:
                     max(-code, 0),
                     usage.ru_maxrss * 1024.0,
                     usage.ru_utime + usage.ru_stime,
-                    # Checked at once: the pid is not reused until its group is empty.
-                    procfs.group_is_alive(pid),
+                    self._has_others(key, pid),
+                    self._groups.out_of_memory(key),
                 )
                 ended.append((pid, exited))
         if ended:
@@ -148,9 +153,28 @@ class ProcessTrees:
         if not exited.leftovers and not adopted:
             self._happened(exited)
             return
-        left = procfs.find_members(pid, mark(exited.instance), self._state)
+        left = self._left(exited.instance, pid)
         self.watch_strays(exited.instance, left)
         self._happened(exited._replace(leftovers=bool(left)))
+
+    def _has_others(self, key: Key, leader: int) -> bool:
+        """Return True if an instance whose leader was just reaped may have other processes."""
+        members = self._groups.members(key)
+        # Checked at once: the pid is not reused until its process group is empty.
+        return procfs.group_is_alive(leader) if members is None else bool(members)
+
+    def _left(self, key: Key, leader: int) -> list[Stat]:
+        """Return the living processes of an instance whose leader has ended."""
+        found = self.in_group(key)
+        return procfs.find_members(leader, mark(key), self._state) if found is None else found
+
+    def in_group(self, key: Key) -> list[Stat] | None:
+        """Return the living processes in the group of an instance; None: it has no group."""
+        members = self._groups.members(key)
+        if members is None:
+            return None
+        stats = map(procfs.read_stat, members)
+        return [stat for stat in stats if stat is not None and stat.alive]
 
     def _look_at_adopted(self) -> None:
         """Find the instance of each adopted child; kill it if that has no leader."""
@@ -203,14 +227,17 @@ class ProcessTrees:
 
     def _find(self, key: Key) -> list[Stat]:
         session = self._sessions.get(key)
-        if session is None:  # the leader ended before this supervisor started
+        if session is None and self._groups.members(key) is None:
+            # The leader ended before this supervisor started.
             return procfs.find_marked(self._state).get(mark(key), [])
-        return procfs.find_members(session, mark(key), self._state)
+        return self._left(key, session or 0)
 
     # --- signals ------------------------------------------------------------------------------
 
     def signal(self, key: Key, number: int) -> None:
         """Send a signal to every process of the instance."""
+        if number == signal.SIGKILL:
+            self._groups.kill(key)  # also processes that left session and process group
         session = self._sessions.get(key, 0)
         if session in self._children or session in self._taken_over:
             _send(os.killpg, session, number, f"the group {session}")

@@ -33,6 +33,7 @@ from rosrm.supervisor import (
     spawn,
     takeover,
 )
+from rosrm.supervisor.confinement import Confined, Confinement
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.instance_record import InstanceRecord
 from rosrm.supervisor.json_lines import ProtocolError
@@ -68,7 +69,9 @@ class Server:
         self._files = files
         self._selector = selectors.DefaultSelector()
         self._core = SupervisorState()
-        self._trees = ProcessTrees(state, self._selector, self._happened)
+        self._confinement = Confinement(state)
+        self._groups = self._confinement.groups
+        self._trees = ProcessTrees(state, self._selector, self._happened, self._groups)
         self._record = InstanceRecord(state)
         self._last_contact = lease_file.LastContact(state)
         self._logs = LogKeeper(state, limits)
@@ -113,6 +116,7 @@ class Server:
         now = time.monotonic()
         self._logs.look(now)
         self._trees.look(now)
+        self._groups.look(now)
         self._spawn_some()
         if self._record.is_large():
             self._rewrite_record()
@@ -128,13 +132,15 @@ class Server:
     def _timeout(self) -> float | None:
         if self._spawns:
             return 0.0
-        deadlines = [self._core.deadline(), self._logs.deadline(), self._trees.deadline()]
+        parts = (self._core, self._logs, self._trees, self._groups)
+        deadlines = [part.deadline() for part in parts]
         if self._record.trouble:
             deadlines.append(time.monotonic() + RECORD_AGAIN)
         due = [deadline for deadline in deadlines if deadline is not None]
         return min(max(0.0, min(due) - time.monotonic()), LONGEST_WAIT) if due else None
 
     def _leave(self) -> None:
+        self._groups.close()
         with contextlib.suppress(FileNotFoundError):
             os.unlink(os.path.join(self._state, paths.SOCKET))
         if self._client is not None:
@@ -167,6 +173,7 @@ class Server:
             self._logs.release(key)
         if not instance.pid and instance.phase != STOPPING:
             self._trees.release(key)
+            self._groups.remove(key, time.monotonic())
         self._record.state(instance, self._trees.birth(key))
         self._unsent.append(messages.encode_status(messages.Status.of(instance)))
 
@@ -199,19 +206,19 @@ class Server:
     def _spawn(self, key: Key) -> None:
         birth = procfs.ticks_now()
         try:
-            pid = self._spawn_process(key)
+            pid, enforced, note = self._spawn_process(key)
         except spawn.SpawnError as error:
             self._spawn_failed(key, str(error), error.transient)
             return
         self._trees.add_child(key, pid, birth)
         self._logs.watch(key, time.monotonic(), pid)
-        self._happened(Spawned(key, pid))
+        self._happened(Spawned(key, pid, enforced, note.replace(self._state, "STATE")))
 
     def _spawn_failed(self, key: Key, reason: str, transient: bool) -> None:
         """Report a failure. All clients may read the reason, so STATE stands for the directory."""
         self._happened(SpawnFailed(key, reason.replace(self._state, "STATE"), transient))
 
-    def _spawn_process(self, key: Key) -> int:
+    def _spawn_process(self, key: Key) -> Confined:
         launch = self._launches.get(key)
         if launch is None:
             raise spawn.SpawnError("its order was lost with a part of the record")
@@ -223,8 +230,15 @@ class Server:
         try:
             directory = launch.directory or paths.work_directory(self._state)
             environment = self._environment(launch)
+
+            def start(group: int, scheduler: spawn.Scheduler | None) -> int:
+                return spawn.spawn(
+                    launch.argv, environment, directory, self._null, log, group=group,
+                    scheduler=scheduler,
+                )  # fmt: skip
+
             with score_of_children(), descriptors.limited(self._files):
-                return spawn.spawn(launch.argv, environment, directory, self._null, log)
+                return self._confinement.start(key, launch.limits, start)
         finally:
             os.close(log)
 
@@ -249,6 +263,9 @@ class Server:
 
     def _take_over(self) -> None:
         recorded = takeover.restore(self._state, self._core, self._trees)
+        self._groups.find_again(
+            key for key, instance in self._core.instances.items() if not instance.ended
+        )
         self._launches.update(recorded.launches)
         self._environments.update(recorded.environments)
         self._notes = recorded.notes
@@ -348,7 +365,12 @@ class Server:
         memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
         fenced = [one.key for one in self._core.instances.values() if one.fence is not None]
         self._record.flush()
-        connection.send(messages.encode_welcome(os.getpid(), self._notes, statuses, memos, fenced))
+        welcome = messages.encode_welcome(
+            os.getpid(), self._notes, statuses, memos, fenced,
+            unenforced=self._confinement.missing,
+            groups=[(tree.version, tree.top, tree.controllers) for tree in self._groups.trees],
+        )  # fmt: skip
+        connection.send(welcome)
 
     def _client_is_gone(self, client: Connection) -> bool:
         """Return True if the client is gone, also if it left in this very round."""

@@ -36,9 +36,18 @@ class SpawnError(Exception):
         self.transient = transient
 
 
+class ScheduleRefused(SpawnError):
+    """The process may not have the real-time scheduling."""
+
+
+#: Real-time policy and parameters of a process.
+Scheduler = tuple[int, os.sched_param]
+
+
 def spawn(
-    argv: tuple[str, ...], environment: Mapping[str, str], directory: str, null: int, log: int
-) -> int:
+    argv: tuple[str, ...], environment: Mapping[str, str], directory: str, null: int, log: int, *,
+    group: int = -1, scheduler: Scheduler | None = None,
+) -> int:  # fmt: skip
     """Start a process and return its pid. Raises SpawnError.
 
     Args:
@@ -46,10 +55,17 @@ def spawn(
         environment: the whole environment.
         null: descriptor that becomes its standard input.
         log: descriptor that becomes its standard output and error.
+        group: descriptor of its control group of version 2; -1: that of this process.
+        scheduler: None: that of this process.
     """
     _enter(directory)
     path = find_executable(argv[0], environment)
     try:
+        if group >= 0:
+            from rosrm.supervisor.spawn_into import spawn_into  # noqa: PLC0415 - loads 400 KiB
+
+            program = (path, argv, environment)
+            return spawn_into(group, program, null=null, log=log, scheduler=scheduler)
         return os.posix_spawn(
             path,
             argv,
@@ -62,8 +78,11 @@ def spawn(
             setsid=True,
             setsigmask=(),
             setsigdef=_EVERY_SIGNAL,
+            **({} if scheduler is None else {"scheduler": scheduler}),  # type: ignore[arg-type]
         )
     except OSError as error:
+        if scheduler is not None and error.errno == errno.EPERM:
+            raise ScheduleRefused(f"{path} may not have real-time scheduling here") from None
         transient = error.errno in _TRANSIENT
         raise SpawnError(_why(path, directory, error), transient=transient) from None
     except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name

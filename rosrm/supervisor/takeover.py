@@ -65,7 +65,8 @@ def what_happened(
     ]
     marked = procfs.find_marked(state) if waiting else {}
     for instance in waiting:
-        left = marked.get(mark(instance.key), [])
+        found = trees.in_group(instance.key)
+        left = marked.get(mark(instance.key), []) if found is None else found
         if instance.phase == STARTING:
             yield _start_of(instance, left, recorded, trees)
         elif instance.phase in (RUNNING, STOPPING):

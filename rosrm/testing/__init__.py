@@ -17,6 +17,7 @@ itself absent (`SkipPlugin`), its contract is skipped with that reason.
 
 from rosrm.extensions.registry import Registry
 from rosrm.testing.checkpoints import CheckpointContract
+from rosrm.testing.filters import FilterContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
 from rosrm.testing.launchers import LauncherContract
 from rosrm.testing.migrations import MigrationContract, before_commit, with_options
@@ -28,13 +29,21 @@ from rosrm.testing.probes import (
     made_probe,
     probe_context,
 )
-from rosrm.testing.scoring import ScoringContract, host_view, one_row, process_view, vetoes
+from rosrm.testing.scoring import (
+    ScoringContract,
+    flow_view,
+    host_view,
+    one_row,
+    process_view,
+    vetoes,
+)
 
 __all__ = [
     "CheckpointContract",
     "FakeClock",
     "FakeProbe",
     "FakeSessions",
+    "FilterContract",
     "JournalContract",
     "LauncherContract",
     "MemoryJournal",
@@ -43,6 +52,7 @@ __all__ = [
     "Registry",
     "ScoringContract",
     "before_commit",
+    "flow_view",
     "host_view",
     "made_probe",
     "one_row",

@@ -101,6 +101,8 @@ def made(kind: PluginKind, offer: ChosenOffer, options: Mapping[str, Any], *cont
         if kind == "probe":
             probes = [one.probe for one in registry.probes({name: plain}, *context).made]
             thing: Any = next((one for one in probes if not isinstance(one, FailedProbe)), None)
+        elif kind == "filter":
+            thing = registry.filters({name: plain})[0].filter
         elif kind == "migration":
             thing = registry.migrations({name: plain})[name]
         else:

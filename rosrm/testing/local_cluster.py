@@ -27,6 +27,7 @@ from rosrm.errors import NoMaster, RosrmError
 from rosrm.model.rows import HostRow, Listing, ProcessRow
 from rosrm.ros.master_connection import MasterClient
 from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
+from rosrm.runtime.settings_check import SettingsSource
 from rosrm.testing.loopback import settings_on_this_machine
 
 if TYPE_CHECKING:
@@ -93,12 +94,14 @@ class LocalCluster:
         cluster: the master's settings; this class replaces their `ros` and `state`.
         hosts: the slaves' settings; likewise.
         domain: ROS domain; None: a free one.
+        files: name of a part to the file from which it reloads its settings.
     """
 
     directory: Path
     cluster: ClusterConfig = field(default_factory=ClusterConfig)
     hosts: Sequence[HostConfig] = ()
     domain: int | None = None
+    files: dict[str, Path] = field(default_factory=dict)
     master: Part | None = None
     slaves: dict[str, Part] = field(default_factory=dict)
     _client: MasterClient | None = None
@@ -131,7 +134,8 @@ class LocalCluster:
     def _start(self, name: str, module: str, settings: str) -> Part:
         self.directory.mkdir(parents=True, exist_ok=True)
         log = self.directory / f"{name}.log"
-        holder = hand_over(settings)
+        role, path = module.removeprefix("rosrm."), str(self.files.get(name, ""))
+        holder = hand_over(settings, SettingsSource(role, path))
         try:
             with log.open("ab") as sink, interrupts_held():
                 process = subprocess.Popen(

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from rosrm.extensions.contracts import Probe, ProbeContext, ProbeOffer
+from rosrm.extensions.contracts import HostLabelling, Probe, ProbeContext, ProbeOffer
 from rosrm.extensions.made import MadeProbe, fault_of_labels, unmeasured
+from rosrm.extensions.plugin_calls import implements
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.values import EMPTY, Reading, ResourceDescription
 from rosrm.slave.probe_reads import read_devices, read_processes, read_values
@@ -150,6 +151,16 @@ class ProbeContract:
             f"ProbeOffer.resources is {self.offer.resources}, and it reads {names}"
         )
 
+    def test_labels_are_text(self) -> None:
+        """Labels, if the probe has any, map printable text to printable text, and do not change."""
+        probe: object = self.make()
+        if not implements(probe, HostLabelling):
+            return
+        labels = probe.labels
+        fault = fault_of_labels(labels, ())
+        assert not fault, f"the probe {fault}"
+        assert probe.labels == labels, f"labels were {labels}, and are {probe.labels}"
+
     def test_reads_each_resource_once(self) -> None:
         """Every read returns one valid reading of each resource, and no other reading."""
         probe = self.make()
@@ -157,11 +168,9 @@ class ProbeContract:
             self._read(probe)
         probe.close()
 
-    def test_devices_and_labels_are_well_described(self) -> None:
-        """Devices and labels, if the probe has any, are valid; no unit comes or goes."""
+    def test_devices_are_well_described(self) -> None:
+        """Devices, if the probe finds any, are valid; no unit comes or goes."""
         probe = self.make()
-        labels = getattr(probe, "labels", EMPTY)
-        assert not (fault := fault_of_labels(labels)), f"the probe {fault}"
         units = []
         for _ in range(3):
             self._read(probe)

@@ -1,4 +1,4 @@
-"""Hosts and processes for tests of scoring policies, and their contract with the master."""
+"""Hosts and processes for tests of policies and filters; the contract of scoring policies."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy.typing as npt
 from rosrm.core.master.scheduling.host_views import checked_scores
 from rosrm.extensions.contracts import (
     BoolArray,
-    FloatArray,
     HostView,
     ProcessView,
     Scores,
     ScoringOffer,
     ScoringPolicy,
 )
-from rosrm.extensions.declared_fields import SPEC_FIELDS, declared_spec
+from rosrm.extensions.declared_fields import FLOWS_FIELD, SPEC_FIELDS, declared_spec
+from rosrm.extensions.link_views import NO_FLOWS, FlowView
 from rosrm.extensions.plugin_calls import required
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.devices import DeviceNeed
@@ -36,6 +36,7 @@ def host_view(
     processes: Sequence[int] = (),
     labels: Sequence[Mapping[str, str]] = (),
     devices: Sequence[Mapping[str, float]] = (),
+    tenants: Sequence[Sequence[str]] = (),
 ) -> HostView:
     """Return hosts h0, h1, ... for a scoring policy.
 
@@ -46,6 +47,7 @@ def host_view(
         processes: number of processes by host; (): 0 on every host.
         labels: by host; (): no labels.
         devices: number of free units by kind, by host; (): no devices.
+        tenants: names of the processes by host; (): none.
     """
     # The core stores one row for each resource, and a policy gets the transpose, as here.
     table = np.array(list(usage.values()), np.float64).reshape(len(usage), -1)
@@ -60,6 +62,7 @@ def host_view(
         processes=np.array(processes or [0] * hosts, np.int64),
         labels=labels or [EMPTY] * hosts,
         devices=devices or [EMPTY] * hosts,
+        tenants=[{name: ProcessSpec(name) for name in names} for names in tenants or [()] * hosts],
     )
 
 
@@ -67,6 +70,7 @@ def process_view(
     hosts: HostView,
     needs: Mapping[str, float] = EMPTY,
     *,
+    flows: FlowView = NO_FLOWS,
     reads: tuple[str, ...] = SPEC_FIELDS,
     **spec: Any,
 ) -> ProcessView:
@@ -75,6 +79,7 @@ def process_view(
     Args:
         hosts: candidates for the placement.
         needs: base units by resource.
+        flows: with other processes, see `flow_view`.
         reads: fields of the spec that the policy's offer declares; the default is all of them.
         spec: fields of the spec, e.g. `name="camera_0"` or `environment={"GROUP": "camera"}`.
     """
@@ -83,8 +88,47 @@ def process_view(
     for name, amount in needs.items():
         if name in hosts.resources:
             row = hosts.resources.index(name)
-            need[row] = amount / hosts.capacity[:, row]
-    return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T)
+            part = amount / hosts.capacity[:, row]
+            need[row] = np.where(np.isnan(part), np.inf if amount > 0 else 0.0, part)
+    return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T, flows)
+
+
+def flow_view(
+    rates: Mapping[str, float],
+    *,
+    local: Sequence[Sequence[bool]],
+    link: Sequence[Sequence[float]],
+    load: Sequence[Sequence[float]] | None = None,
+    round_trip: Sequence[Sequence[float]] | None = None,
+    limit: float = 1.0,
+) -> FlowView:
+    """Return the flows of a process, for a scoring policy.
+
+    Args:
+        rates: by name of the other process, bytes a second.
+        local: by host and flow: the other process runs on the host.
+        link: by host and flow: bytes a second that the link can carry; NaN: not known.
+        load: by host and flow: bytes a second of others on the link; None: no load.
+        round_trip: by host and flow, seconds; NaN or None: not measured.
+        limit: fraction of each link that flows may use.
+    """
+    is_local = np.array(local, np.bool_).reshape(len(local), len(rates))
+    rate = np.array(list(rates.values()), np.float64)
+    carries = np.where(is_local, np.inf, np.reshape(link, is_local.shape))
+    used = np.zeros(is_local.shape) if load is None else np.reshape(load, is_local.shape)
+    trip = np.full(is_local.shape, np.nan) if round_trip is None else np.array(round_trip)
+    return FlowView(
+        processes=tuple(rates),
+        hosts=tuple(f"host of {name}" for name in rates),
+        rate=rate,
+        incoming=np.ones(len(rates), np.bool_),
+        is_local=is_local,
+        link_rate=carries,
+        link_limit=carries * limit,
+        link_load=np.where(is_local, 0.0, used),
+        added=np.where(is_local, 0.0, rate),
+        round_trip=np.where(is_local, 0.0, trip.reshape(is_local.shape)),
+    )
 
 
 #: Specs that a policy must be able to score, given by their differing fields.
@@ -99,6 +143,50 @@ _SPECS: Final[Sequence[Mapping[str, Any]]] = (
     {"name": "9.lives-", "command": (), "module": "pkg.main", "needs": {"gpu": 1.0}},
     {"command": (), "package": "demo", "executable": "talker", "devices": (DeviceNeed("gpu"),)},
 )  # fmt: skip
+
+
+def placements(reads: Sequence[str]) -> Sequence[tuple[HostView, ProcessView]]:
+    """Return hosts and processes of many kinds, the same in every run.
+
+    `reads`: fields of the spec that the offer declares; the specs have no others.
+    """
+    chance = np.random.default_rng(7)
+    cases = []
+    for count in (1, 2, 7, 100, 1000):
+        usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
+        usage["gpu"][chance.random(count) < 0.5] = np.nan
+        hosts = host_view(
+            {name: list(column) for name, column in usage.items()},
+            limit=0.9,
+            processes=[n % 3 for n in range(count)],
+            labels=[{"rack": str(n % 3)} if n % 4 else {} for n in range(count)],
+            tenants=[[f"q{n}_{k}" for k in range(n % 3)] for n in range(count)],
+            devices=[{"gpu": n / 2} if n % 3 else {} for n in range(count)],
+        )
+        cases += [(hosts, process_view(hosts, reads=tuple(reads), **spec)) for spec in _SPECS]
+    for resource in ("memory", "something"):
+        bare = host_view({resource: [0.2, 0.4]})
+        cases.append((bare, process_view(bare, reads=tuple(reads))))
+    if FLOWS_FIELD in reads:
+        cases += [_with_flows(chance, reads, *one) for one in ((1, 1), (7, 3), (1000, 12))]
+    return cases
+
+
+def _with_flows(
+    chance: np.random.Generator, reads: Sequence[str], hosts: int, flows: int
+) -> tuple[HostView, ProcessView]:
+    """Return hosts and a process with flows, of which some values were not measured."""
+    shape = (hosts, flows)
+    view = flow_view(
+        {f"p{flow}": 10.0 ** float(chance.integers(0, 9)) for flow in range(flows)},
+        local=(chance.random(shape) < 0.2).tolist(),
+        link=np.where(chance.random(shape) < 0.3, np.nan, 1e7 * chance.random(shape)).tolist(),
+        load=(1e7 * chance.random(shape)).tolist(),
+        round_trip=np.where(chance.random(shape) < 0.3, np.nan, chance.random(shape)).tolist(),
+        limit=0.8,
+    )
+    at = host_view({"memory": chance.random(hosts).tolist()})
+    return at, process_view(at, flows=view, reads=tuple(reads))
 
 
 class ScoringContract:
@@ -128,28 +216,8 @@ class ScoringContract:
         return call("score", CALL_LIMIT, ask)
 
     def cases(self) -> Sequence[tuple[HostView, ProcessView]]:
-        """Return hosts and processes of many kinds, the same in every run."""
-        chance = np.random.default_rng(7)
-        cases = []
-        for count in (1, 2, 7, 100, 1000):
-            usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
-            usage["gpu"][chance.random(count) < 0.5] = np.nan
-            hosts = host_view({name: list(column) for name, column in usage.items()}, limit=0.9)
-            labels = [{"rack": str(n % 3)} if n % 4 else {} for n in range(count)]
-            devices = [
-                {"gpu": n / 2, "camera": float(n % 2)} if n % 3 else {} for n in range(count)
-            ]
-            hosts = replace(hosts, labels=labels, devices=devices)
-            cases += [(hosts, self._process(hosts, **spec)) for spec in _SPECS]
-        lean = host_view({"memory": [0.2, 0.4]})
-        cases.append((lean, self._process(lean)))
-        bare = host_view({"something": [0.2, 0.4]})
-        cases.append((bare, self._process(bare)))
-        return cases
-
-    def _process(self, hosts: HostView, **spec: Any) -> ProcessView:
-        """Return a process whose spec has only the declared fields, as passed by the master."""
-        return process_view(hosts, reads=tuple(self.offer.reads), **spec)
+        """Return hosts and processes of many kinds, as passed by the master."""
+        return placements(self.offer.reads)
 
     def test_scores_every_host(self) -> None:
         """The policy returns one number for each host, finite without a veto and never NaN."""
@@ -204,7 +272,8 @@ class ScoringContract:
     def test_no_hosts(self) -> None:
         """The policy accepts an empty list of hosts."""
         hosts = host_view({"memory": [], "cpu": []})
-        self._scores(self.make(), hosts, self._process(hosts))
+        process = process_view(hosts, reads=tuple(self.offer.reads))
+        self._scores(self.make(), hosts, process)
 
 
 def _same(array: npt.ArrayLike, other: npt.ArrayLike) -> bool:
@@ -219,18 +288,21 @@ def vetoes(scores: Scores, count: int) -> BoolArray:
 def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, ProcessView]:
     """Return the arguments of `score` for one host alone."""
     one = slice(row, row + 1)
-
-    def part(array: FloatArray) -> FloatArray:
-        return array[one]
-
-    alone = HostView(
-        hosts.names[one],
-        hosts.resources,
-        part(hosts.usage),
-        part(hosts.limit),
-        part(hosts.capacity),
-        hosts.processes[one],
-        hosts.labels[one],
-        hosts.devices[one],
-    )
-    return alone, replace(process, need=part(process.need))
+    parts = {
+        name: getattr(hosts, name)[one]
+        for name in (
+            "names",
+            "usage",
+            "limit",
+            "capacity",
+            "processes",
+            "labels",
+            "tenants",
+            "devices",
+        )
+    }
+    flows = process.flows
+    if len(flows.rate):
+        names = ("is_local", "link_rate", "link_limit", "link_load", "added", "round_trip")
+        flows = replace(flows, **{name: getattr(flows, name)[one] for name in names})
+    return replace(hosts, **parts), replace(process, need=process.need[one], flows=flows)

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 from rosrm.extensions.registry import Registry
-from rosrm.testing import CheckpointContract, LauncherContract, ProbeContract
+from rosrm.testing import CheckpointContract, FilterContract, LauncherContract, ProbeContract
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/reference/plugins.md"
 
@@ -18,7 +18,7 @@ def _module(text: str) -> ModuleType:
     return module
 
 
-PROBE, LAUNCHER, POLICY = map(
+PROBE, FILTER, LAUNCHER, POLICY = map(
     _module,
     re.findall(
         r"<!-- plugin -->\n```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
@@ -28,6 +28,10 @@ PROBE, LAUNCHER, POLICY = map(
 
 class TestProbeThatIsShown(ProbeContract):
     offer = PROBE.register_probes()[0]
+
+
+class TestFilterThatIsShown(FilterContract):
+    offer = FILTER.register_filters()[0]
 
 
 class TestCheckpointPolicyThatIsShown(CheckpointContract):
@@ -40,8 +44,9 @@ class TestLauncherThatIsShown(LauncherContract):
 
 def test_all_are_found_by_their_hooks():
     """The plugins carry the hook marker and the function names that discovery needs."""
-    registry = Registry.of(probe=PROBE, launcher=LAUNCHER, policy=POLICY)
+    registry = Registry.of(probe=PROBE, filter=FILTER, launcher=LAUNCHER, policy=POLICY)
     assert not registry.broken
     assert registry.names("probe") == ("open_files",)
+    assert registry.names("filter") == ("one-each",)
     assert registry.names("launcher") == ("nice",)
     assert registry.names("checkpoint") == ("first-host",)

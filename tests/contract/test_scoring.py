@@ -28,6 +28,14 @@ class TestNarrowThreshold(TestThreshold):
     options: ClassVar = {"enter": 0.5, "leave": 0.4, "watch": ("gpu",), "weights": {}}
 
 
+class TestNetwork(ScoringContract):
+    offer = OFFERS["network"]
+
+
+class TestNetworkByLocality(TestNetwork):
+    options: ClassVar = {"load": 0.0, "latency": 0.0, "missing": "ignore"}
+
+
 def test_each_shipped_policy_is_here():
     """Each policy in the plugin must have a contract class in this file."""
     held = {contract.offer.name for contract in ScoringContract.__subclasses__()}
@@ -78,7 +86,7 @@ def test_an_undeclared_field_fails_the_contract_with_its_name():
     """The error shows the declaration that is missing from the offer."""
     contract = ScoringContract()
     contract.offer = ScoringOffer("named", lambda options: _ByName())
-    with pytest.raises(LookupError, match=r"'name'.*ScoringOffer\(\.\.\., reads=\('name',\)\)"):
+    with pytest.raises(LookupError, match=r"'name'.*add reads=\('name',\) to the offer"):
         contract.test_scores_every_host()
 
 

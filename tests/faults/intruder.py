@@ -32,6 +32,7 @@ MASTER_SERVICES: Final = {
     names.SUBMIT: srv.Submit, names.CANCEL: srv.Cancel, names.RESTART: srv.Restart,
     names.MIGRATE: srv.Migrate, names.CHECKPOINT: srv.Checkpoint, names.RESTORE: srv.Restore,
     names.SET_HOST_STATE: srv.SetHostState, names.PRUNE: srv.Prune, names.LIST: srv.List,
+    names.REBALANCE: srv.Rebalance, names.RELOAD: srv.Reload,
     names.EXPLAIN: srv.Explain, names.INTRODUCE: srv.Introduce, names.HANDSHAKE: srv.Handshake,
     names.REGISTER_HOST: srv.RegisterHost, names.LEAVE: srv.Leave,
     names.REQUEST_PROCESS: srv.RequestProcess,

@@ -145,6 +145,8 @@ class Scene:
         for action in ("drain", "cordon"):
             yield names.SET_HOST_STATE, srv.SetHostState.Request(host=HOSTS[0], action=action)
         yield names.PRUNE, srv.Prune.Request()
+        yield names.REBALANCE, srv.Rebalance.Request()
+        yield names.RELOAD, srv.Reload.Request()
         yield names.LIST, srv.List.Request(hosts=True, processes=True, events=True, **version)
         yield names.EXPLAIN, srv.Explain.Request(process=WITNESS, **version)
         for wanted in (names.READ_LOG, names.STORE_REPLICA, names.READ_SNAPSHOT):

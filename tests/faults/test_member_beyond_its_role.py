@@ -93,7 +93,7 @@ def test_a_submitter_changes_nothing_of_others(scene, member) -> None:
         ((_, message),) = denied[name]
         assert f"{WITNESS} belongs to {ME}; user:sam may act only on its own" in message
         assert "ask the owner or an operator" in message
-    for name in (names.PRUNE, names.SET_HOST_STATE, *OF_HOSTS):
+    for name in (names.PRUNE, names.SET_HOST_STATE, names.REBALANCE, names.RELOAD, *OF_HOSTS):
         assert all("operator" in message for _, message in denied[name])
     _, message = denied[names.INTRODUCE][0]
     assert f"the logs of '{WITNESS}' are for its owner and operators" in message

@@ -77,6 +77,7 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "migrate": (srv.Migrate.Request, lambda one: services._migrated(one, 1, SENDER)),
     "host state": (srv.SetHostState.Request, lambda one: services._host_set(one, 1, SENDER)),
     "prune": (srv.Prune.Request, lambda one: services._pruned(one, 1, SENDER)),
+    "rebalance": (srv.Rebalance.Request, lambda one: services._rebalanced(one, 1, SENDER)),
     "event row": (msg.Event, convert.event_from_msg),
     "plugin row": (msg.PluginState, convert.plugin_row_from_msg),
     "host row": (msg.HostState, convert.host_row_from_msg),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import time
 from collections import Counter
 from dataclasses import replace
@@ -199,10 +200,23 @@ def test_a_host_over_its_limit_takes_nothing(two) -> None:
     two.client.set_host_state("large", "uncordon")
 
 
+def test_a_chain_of_policies_decides_and_explains_each_part(make_cluster) -> None:
+    """The master adds the weighted scores, and the explanation has the part of each policy."""
+    chain = (ScoringChoice("weighted"), ScoringChoice("threshold", 0.5))
+    cluster = make_cluster(host("x"), host("y"), scoring=chain)
+    cluster.submit(service("placed", needs={"memory": 100.0 * MIB, "cpu": 0.1}))
+    cluster.wait("placed", "running")
+    decision = cluster.client.explain("placed")["decision"]
+    assert decision["policy"] == "weighted + 0.5 x threshold"
+    parts = r"weighted \d\.\d{3} \(.*\) \+ 0\.5 x threshold \d\.\d{3} \("
+    for row in decision["hosts"]:
+        assert re.match(parts, row["reason"])
+
+
 def test_another_policy_places_and_explains(make_cluster) -> None:
     """Under the policy that the cluster names, too, the explanation has every host."""
     cluster = make_cluster(
-        host("x"), host("y", memory=256 * MIB), scoring=ScoringChoice("threshold")
+        host("x"), host("y", memory=256 * MIB), scoring=(ScoringChoice("threshold"),)
     )
     cluster.submit(service("placed", needs={"memory": 100.0 * MIB, "cpu": 0.1}))
     assert cluster.wait("placed", "running").host in ("x", "y")

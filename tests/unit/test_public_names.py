@@ -26,7 +26,7 @@ MORE = {
 }
 PROGRAMS = [
     path
-    for folder in ("plugins", "examples", "tests/integration/plugins/packages")
+    for folder in ("plugins", "examples", "rosrm/cli/templates")
     for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 #: rosrm-criu also uses modules of the parts that it works in: slave, supervisor, node and command.
@@ -49,6 +49,9 @@ OF_CRIU = {
 PAGES = [
     "docs/tutorials/your-own-scoring-plugin.md",
     "docs/tutorials/your-own-migration-strategy.md",
+    "docs/tutorials/your-own-filter.md",
+    "docs/tutorials/your-own-probe.md",
+    "docs/tutorials/your-own-checkpoint-policy.md",
     "docs/reference/plugins.md",
     "docs/how-to/stateful-node.md",
     "docs/how-to/portable-node.md",

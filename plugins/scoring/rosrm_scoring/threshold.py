@@ -25,6 +25,8 @@ from annotated_types import Ge, Gt, Le
 from rosrm import FloatArray, HostView, ProcessView, ResourceName, Scores
 from rosrm_scoring.weighted import DEFAULT_WEIGHTS, Missing, Weight, WeightedSum
 
+#: Replaces the need of a resource that a host lacks, which is infinite.
+_WITHOUT: Final = 1e9
 #: Replaces a limit of 0, to avoid a division by zero.
 _SMALLEST_LIMIT: Final = 1e-9
 
@@ -101,7 +103,9 @@ class Threshold:
             fill /= np.maximum(hosts.limit[:, index], _SMALLEST_LIMIT)
             # `fmax` ignores NaN, because the core refuses hosts that lack a needed resource.
             nearest = fill if nearest is None else np.fmax(nearest, fill, out=nearest)
-        return np.zeros(len(hosts.usage)) if nearest is None else np.nan_to_num(nearest)
+        if nearest is None:
+            return np.zeros(len(hosts.usage))
+        return np.nan_to_num(nearest, posinf=_WITHOUT)
 
     def _watched(self, hosts: HostView, process: ProcessView) -> list[int]:
         """Return the columns that count for this process.
@@ -130,5 +134,5 @@ class Threshold:
         for index in self._watched(hosts, process):
             used = np.nan_to_num(hosts.usage[row, index]) + process.need[row, index]
             fill = used / max(hosts.limit[row, index], _SMALLEST_LIMIT)
-            fills.append((hosts.resources[index], float(np.nan_to_num(fill))))
+            fills.append((hosts.resources[index], float(np.nan_to_num(fill, posinf=_WITHOUT))))
         return max(fills, key=lambda named: named[1])

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rosrm.cli.commands import change, check, follow, inspect, key, runtimes
+from rosrm.cli.commands import change, check, follow, inspect, key, plugin, runtimes
 from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
 from rosrm.cli.installed_commands import find_commands, load_command
 from rosrm.cli.options import CommonOptions, Domain
@@ -118,3 +118,4 @@ for module in (runtimes, change, inspect, follow):
         app.command(cls=PlainCommand)(function)
 add_command(app, "config", check.config)
 add_command(app, "key", key.key)
+add_command(app, "plugin", plugin.plugin)

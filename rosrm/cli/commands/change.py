@@ -261,6 +261,30 @@ def prune(
         echo(client.prune(names or [], hosts or []))
 
 
+def rebalance(
+    ctx: typer.Context,
+    plan: Annotated[bool, typer.Option("--plan", help="Show the moves, and begin none.")] = False,
+    domain: Domain = None,
+) -> None:
+    """Move processes to even out the load of the hosts, once.
+
+    The bounds are those of the section `rebalance` of cluster.yaml.
+    """
+    with connection.master(ctx, domain) as client:
+        echo(client.rebalance(plan_only=plan))
+
+
+def reload(ctx: typer.Context, domain: Domain = None) -> None:
+    """Let the master and all slaves read their files again, without a restart.
+
+    Each file is checked as a whole first: an invalid one changes nothing. Settings that need a
+    restart are named, and stay as before.
+    """
+    with connection.master(ctx, domain) as client:
+        echo(client.reload())
+
+
 COMMANDS: Final = (
     submit, cancel, restart, migrate, checkpoint, restore, cordon, uncordon, drain, prune,
+    rebalance, reload,
 )  # fmt: skip

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -75,14 +76,16 @@ def check(
 def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
     """Create the plugins that a master would create; raises `ConfigError` with all failures."""
     wrong = []
-    for section, make in (
-        ("scoring", lambda: registry.scoring(cluster.scoring.policy, cluster.scoring.options)),
+    plugins: list[tuple[str, Callable[[], object]]] = [
+        *(("scoring", partial(registry.scoring, o.policy, o.options)) for o in cluster.scoring),
+        ("filters", lambda: registry.filters(cluster.filters)),
         ("migration", lambda: registry.migrations(cluster.migration.strategies)),
         (
             "checkpoint",
             lambda: registry.checkpoint(cluster.checkpoint.policy, cluster.checkpoint.options),
         ),
-    ):
+    ]
+    for section, make in plugins:
         try:
             make()
         except (ConfigError, PluginError) as error:
@@ -128,8 +131,9 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             cluster = checked_cluster(root, file, registry)
             _make(file, cluster, registry)
             strategies = ", ".join(cluster.migration.strategies) or "none"
+            filters = "".join(f"filter {name}, " for name in cluster.filters)
             return (
-                f"a cluster: scoring {cluster.scoring.policy}, migration {strategies}, "
+                f"a cluster: scoring {cluster.chain}, {filters}migration {strategies}, "
                 f"checkpoint {cluster.checkpoint.policy or 'none'}"
             )
         case "host":

@@ -20,6 +20,7 @@ import typer
 from rosrm.cli.options import CommonOptions, Domain
 from rosrm.cli.output.plain import echo
 from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
+from rosrm.runtime.settings_check import SettingsSource
 
 if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig, HostConfig
@@ -45,6 +46,7 @@ def master(
     """Start the master of a cluster.
 
     The master runs until Ctrl-C. Processes keep running, and a restarted master takes them over.
+    Without a terminal, SIGHUP reads its file again.
     """
     from rosrm.config.cluster import default_cluster, load_cluster
     from rosrm.extensions.registry import Registry
@@ -58,7 +60,7 @@ def master(
         echo(_recover(settings.state), err=True)
     with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
         echo(_master_summary(settings), err=True)
-    become("rosrm.master", settings.to_json())
+    become("rosrm.master", settings.to_json(), _source("master", file, ctx, domain))
 
 
 def slave(
@@ -81,7 +83,7 @@ def slave(
     """Start the slave of this host.
 
     The slave runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes
-    too, unless the file has `on_stop: keep`.
+    too, unless the file has `on_stop: keep`. Without a terminal, SIGHUP reads its file again.
     """
     from rosrm.config.host import load_host
     from rosrm.config.settings import HostConfig
@@ -97,19 +99,19 @@ def slave(
             return
         with only_one(settings.state, "slave", code="name_taken", remedy=""):
             pass  # fails if a slave runs, which must stop its processes itself
-        become("rosrm.slave.stop_all", settings.to_json())
+        become("rosrm.slave.stop_all", settings.to_json(), _source("slave", config, ctx, domain))
         return
     if settings.probes is None:
         registry.default_probes()  # raises if there is none
     remedy = "another `host:` and `state:`"
     with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
         echo(_slave_summary(settings), err=True)
-    become("rosrm.slave", settings.to_json())
+    become("rosrm.slave", settings.to_json(), _source("slave", config, ctx, domain))
 
 
-def become(module: str, settings: str) -> None:
+def become(module: str, settings: str, source: SettingsSource) -> None:
     """Replace this process by a runtime."""
-    descriptor = hand_over(settings)
+    descriptor = hand_over(settings, source)
     sys.stdout.flush()
     sys.stderr.flush()
     interpreter = [sys.executable, *_without_this_folder()]
@@ -128,10 +130,19 @@ def _without_this_folder() -> list[str]:
     return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
 
 
+def _source(role: str, file: Path | None, ctx: typer.Context, domain: int | None) -> SettingsSource:
+    path = "" if file is None else str(file.absolute())
+    return SettingsSource(role, path, _chosen_domain(ctx, domain))
+
+
+def _chosen_domain(ctx: typer.Context, domain: int | None) -> int | None:
+    return ctx.ensure_object(CommonOptions).domain if domain is None else domain
+
+
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
     from rosrm.ros.network_interface import check_interface
 
-    chosen = ctx.ensure_object(CommonOptions).domain if domain is None else domain
+    chosen = _chosen_domain(ctx, domain)
     settings = settings if chosen is None else replace(settings, domain=chosen)
     settings.check()
     if interface := settings.interface_in_force():
@@ -149,7 +160,7 @@ def _recover(state: Path) -> str:
 
 def _master_summary(settings: ClusterConfig) -> str:
     return (
-        f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.scoring.policy}; "
+        f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.chain}; "
         f"migration {', '.join(settings.migration.strategies) or 'none'}; state in {settings.state}"
     )
 

@@ -14,7 +14,17 @@ from rich.table import Table
 from rich.text import Text
 
 from rosrm.model.rows import DeviceRow, EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
-from rosrm.wording import counted, duration, listed, percent, printable, size, standing, words
+from rosrm.wording import (
+    amount,
+    counted,
+    duration,
+    listed,
+    percent,
+    printable,
+    size,
+    standing,
+    words,
+)
 
 #: Width of tables in a file or pipe, large enough that no line is cut or wrapped.
 _PIPE_WIDTH: Final = 100_000
@@ -96,10 +106,13 @@ def sentence(name: str, word: str) -> Text:
     return Text(f"{name} {verb} ").append(rest, STYLES.get(word, ""))
 
 
-def processes(rows: Iterable[ProcessRow]) -> Table:
-    """Return the table of `rosrm ps`."""
+def processes(rows: Sequence[ProcessRow]) -> Table:
+    """Return the table of `rosrm ps`, with a column of limits if any limit holds."""
     numbers = ("SINCE", "CPU", "MEMORY")
-    made = table("NAME", "STATE", "HOST", *numbers, "WHY", right=numbers)
+    limited = any(map(limits, rows))
+    made = table(
+        "NAME", "STATE", "HOST", *numbers, *(["LIMITS"] if limited else []), "WHY", right=numbers
+    )
     for row in rows:
         runs = row.pid != 0
         made.add_row(
@@ -109,9 +122,16 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
             duration(row.since),
             age(row, f"{row.cpu:.2f}") if runs else "",
             age(row, size(row.memory)) if runs else "",
+            *([limits(row)] if limited else []),
             Text(why(row)),
         )
     return made
+
+
+def limits(row: ProcessRow) -> str:
+    """Return the limits that hold for a process, e.g. `1.5 cores, 500 MB`."""
+    held = [amount(row.cpu_limit, "core")] if row.cpu_limit else []
+    return ", ".join([*held, *([size(row.memory_limit)] if row.memory_limit else [])])
 
 
 def age(row: ProcessRow, reading: str) -> Text:

@@ -6,13 +6,13 @@ master_state.py, state/   data and the rules that keep it consistent
 tick.py        periodic work
 requests.py    requests of clients; rights.py, quotas.py, contradictions.py, process_defaults.py,
                pruning.py, graph_names.py
-answers.py     answers of slaves to orders
-lifecycle.py   an instance from start to end
+answers.py     answers of slaves to orders; reloading.py
+lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
 scheduling/    choice of a host for a process: filter, score, pick
 assignment/    assignment of waiting processes, reservation of their load
 hosts/         registration, readings, loss, fencing, re-adoption
-migration/     plans, their steps, eviction, standbys, failover
+migration/     plans, their steps, eviction, preemption, rebalancing, standbys, failover
 checkpoint/    replicas of snapshots, checkpoint images
 recovery/      restart of the master
 """

@@ -91,6 +91,13 @@ class PublishStateConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ReadSettings:
+    """Read the file of the master again; `SettingsRead` follows with this request."""
+
+    request: int
+
+
+@dataclass(frozen=True, slots=True)
 class Reply:
     """Answer a request that came with an event; `code` is "" unless the request is refused."""
 
@@ -102,4 +109,14 @@ class Reply:
     host: str = ""
 
 
-Command = Assign | Withdraw | Redeliver | SendOrder | PublishStateConfig | Reply | Record | Intent
+Command = (
+    Assign
+    | Withdraw
+    | Redeliver
+    | SendOrder
+    | PublishStateConfig
+    | ReadSettings
+    | Reply
+    | Record
+    | Intent
+)

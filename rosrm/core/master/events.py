@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.commands import OrderId
+from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.placement import PolicySettings
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.devices import Device
 from rosrm.model.plan import ReportPhase
@@ -231,6 +233,48 @@ class HostStateRequested:
 
 
 @dataclass(frozen=True, slots=True)
+class RebalanceRequested:
+    """An operator evens out the load of the hosts.
+
+    Attributes:
+        plan_only: True: the reply has the moves, and none begins.
+    """
+
+    request: int
+    plan_only: bool = False
+    by: Requester = OPERATOR
+
+
+@dataclass(frozen=True, slots=True)
+class ReloadRequested:
+    """An operator reloads the settings of the master and of all slaves from their files."""
+
+    request: int
+    by: Requester = OPERATOR
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsRead:
+    """The file of the master was read again, as a whole.
+
+    Attributes:
+        request: number of the `ReloadRequested`; 0: the master received a signal.
+        fault: why the file cannot be used; "": it can.
+        settings: settings of the core from now on.
+        scoring: settings of the scoring policies from now on.
+        changed: paths of the changed settings.
+        kept: paths of settings that differ in the file, and need a restart.
+    """
+
+    request: int
+    fault: str = ""
+    settings: CoreSettings | None = None
+    scoring: tuple[PolicySettings, ...] = ()
+    changed: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class PruneRequested:
     """A client removes ended processes and departed hosts from the listings.
 
@@ -344,6 +388,8 @@ ClientRequest = (
     | CheckpointRequested
     | RestoreRequested
     | HostStateRequested
+    | RebalanceRequested
+    | ReloadRequested
     | PruneRequested
 )
 #: Events that are answered by a `Reply`.
@@ -360,5 +406,6 @@ Event = (
     | SourceStranded
     | PeerRefused
     | KeyRevoked
+    | SettingsRead
     | TimePassed
 )

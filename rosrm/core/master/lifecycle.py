@@ -14,6 +14,7 @@ from rosrm.core.master.hosts.devices import note_devices
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover
 from rosrm.core.master.plugin_failures import note_on_host
+from rosrm.core.master.rescheduling import next_attempt
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.learned_needs import NO_NEEDS
 from rosrm.core.master.state.migration import End, Migration
@@ -132,6 +133,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
         return
     before = instance.state
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
+    instance.enforced = status.enforced
     _note_load(state, instance, before, now)
     state.note_held(instance, status.devices)
     if status.state.ended:
@@ -146,6 +148,9 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
     process = state.owned_by(instance)
     if process is None:
         return
+    if status.state in _ALIVE and not process.began:
+        process.started_at, process.began = now, state.wall
+        state.save(process)
     if process.restarts != status.restarts:
         process.phase_before_loss = None  # restarted while its host was silent
     process.restarts = status.restarts
@@ -308,8 +313,9 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     status = end.status
     process.owner = 0
     process.exit_code = None if end.gone else status.known_exit
-    if process.wanted is DesiredState.CANCEL:
-        _finish(state, process, ProcessPhase.CANCELLED, host, now, "")
+    if process.wanted is DesiredState.CANCEL and not (process.overdue and end.completed):
+        phase, reason = cancelled_as(process)
+        _finish(state, process, phase, host, now, reason)
     elif end.gone:
         _requeue(state, process, host, now, status.message)
     elif end.ordered:
@@ -323,7 +329,20 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
         _finish(state, process, ProcessPhase.FINISHED, host, now, status.message)
     else:
         reason = status.message or f"exit code {status.exit_code}"
-        _finish(state, process, ProcessPhase.FAILED, host, now, reason)
+        unreachable = state.hosts.why_unreachable(host)  # then `host_loss` has decided
+        again = "" if unreachable else next_attempt(process, host, status, reason, now)
+        if again:
+            _requeue(state, process, host, now, again)
+        else:
+            _finish(state, process, ProcessPhase.FAILED, host, now, reason)
+
+
+def cancelled_as(process: Process) -> tuple[ProcessPhase, str]:
+    """Return the terminal phase of a process that is being cancelled, and the reason."""
+    if process.overdue:
+        why = f"it ran longer than its time limit of {process.spec.time_limit:g} s"
+        return ProcessPhase.FAILED, why
+    return ProcessPhase.CANCELLED, ""
 
 
 def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
@@ -396,8 +415,10 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
     if process.name in state.migrations:
         return False
     if process.wanted is DesiredState.CANCEL:
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(now, EventKind.CANCELLED, f"{process.name} cancelled", process=process.name)
+        phase, reason = cancelled_as(process)
+        state.set_phase(process, phase, now, reason)
+        message = f"{process.name} {phase.value}" + (f": {reason}" if reason else "")
+        state.record(now, _EVENT[phase], message, process=process.name)
     elif process.wanted is DesiredState.REQUEUE:
         state.enqueue(process, now)
     else:
@@ -445,7 +466,8 @@ def note_phase(state: MasterState, process: Process, owner: Instance, now: float
         ends = f", and ends when {host.name} returns" if unreachable else ""
         if state.hosts.condition_of(host) is HostCondition.DETACHED:
             where, ends = f": waits for {host.name}, whose slave was stopped", ""
-        state.set_phase(process, ProcessPhase.STOPPING, now, f"being cancelled{where}{ends}")
+        what = "being stopped after its time limit" if process.overdue else "being cancelled"
+        state.set_phase(process, ProcessPhase.STOPPING, now, f"{what}{where}{ends}")
     elif unreachable:
         lost = state.hosts.condition_of(host) is HostCondition.LOST
         reason = f"{host.name} {unreachable}{_what_follows(process) if lost else ''}"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 from typing import Any, Final
 
 from rosrm.core.master.assignment.assign import decide_now
+from rosrm.core.master.assignment.flows import described_flows
 from rosrm.core.master.assignment.neighbours import awaited_neighbour
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
@@ -14,8 +16,10 @@ from rosrm.core.master.process_defaults import defaulted_values
 from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
+from rosrm.model.limits import limits_in_words
 from rosrm.model.rows import DeviceRow, HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy, qualified_name
+from rosrm.wording import amount
 
 _CONDITION: Final = {
     HostCondition.UP: "up",
@@ -101,8 +105,15 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         exit_code=process.exit_code, priority=process.spec.priority,
         queue_position=state.queue.position(process.name), since=now - process.since,
         cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
+        cpu_limit=_limit(process, owner, "cpu"), memory_limit=int(_limit(process, owner, "memory")),
         stale=bool(silence), owner=process.principal,
     )  # fmt: skip
+
+
+def _limit(process: Process, owner: Instance | None, name: str) -> float:
+    """Return a limit that holds for the owning instance; 0: none does."""
+    holds = owner is not None and owner.pid and f"limits.{name}" in owner.enforced
+    return float(getattr(process.spec.limits, name)) if holds else 0.0
 
 
 def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
@@ -165,7 +176,9 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "process": name, "state": row.state, "host": row.host, "owner": row.owner,
         "reason": "; ".join(filter(None, reasons)),
         "decision": None if decision is None else {**decision, "elapsed": age},
+        "limits": _limits(state, process),
         "defaults": defaulted_values(process.spec, process.defaulted),
+        "flows": described_flows(state, process),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
         "history": [
@@ -173,6 +186,28 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
             for at, kind, message in process.history
         ],
     }  # fmt: skip
+
+
+def _limits(state: MasterState, process: Process) -> Mapping[str, Any]:
+    """Return limits and scheduling settings of a process with their values; {}: it has none.
+
+    If it runs: also whether each holds, and why not. For a limit below the usage of earlier runs of
+    the program: also this usage.
+    """
+    earlier = state.learned.estimate(process.spec, {}).amounts
+    owner = state.instances.get(process.owner)
+    runs = owner is not None and owner.is_running
+    found: dict[str, Any] = {}
+    for name, value in limits_in_words(process.spec).items():
+        found[name] = {"value": value}
+        used = earlier.get(name.removeprefix("limits."), 0.0)
+        if used > getattr(process.spec.limits, name.removeprefix("limits."), inf):
+            found[name]["used"] = amount(used, "core" if name == "limits.cpu" else "B")
+        if owner is not None and runs:
+            reason = owner.host.description.unenforced.get(name, "")
+            holds = name in owner.enforced
+            found[name] |= {"holds": holds, "reason": "" if holds else reason}
+    return found
 
 
 def _replicas(state: MasterState, process: Process, now: float) -> list[Mapping[str, Any]]:
@@ -194,9 +229,11 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         return state.neighbours.separated[process.name][0]
     if position and (awaited := awaited_neighbour(state, process)):
         return awaited
-    if process.phase is not ProcessPhase.QUEUED or position <= 1:
+    room = state.preemption.room_made.get(process.name)
+    if process.phase is not ProcessPhase.QUEUED or position <= 1 or room is not None:
         owner = state.instances.get(process.owner)
-        return reason_of(state, process) or _awaited_node(process, owner)
+        reason = reason_of(state, process) or _awaited_node(process, owner)
+        return f"{reason}; {room.reason}" if room and room.reason != reason else reason
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"
 

@@ -13,24 +13,28 @@ import numpy as np
 from rosrm.core.master.commands import Command, OrderId, SendOrder
 from rosrm.core.master.hosts.fencing import fence_of
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
-from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
+from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.flows import Flows
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
+from rosrm.core.master.state.link_queries import LinkQueries
 from rosrm.core.master.state.migration import Migration, migration_to_dict
+from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.state.queue import Queue
+from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
-from rosrm.extensions.contracts import MigrationStrategy, ScoringPolicy
-from rosrm.extensions.declared_fields import Declared
-from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.extensions.contracts import MigrationStrategy
+from rosrm.extensions.declared_fields import SPEC_FIELDS, Declared, declared_spec
+from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.model.codec import to_plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
@@ -80,7 +84,9 @@ class MasterState:
     """The state of the master's core, with the changes that all handlers share.
 
     Attributes:
+        placement: the policies and filters that judge hosts.
         declared: declarations in the offers of the selected plugins.
+        time_limited: names of the processes with a time limit that are not terminal.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
@@ -90,26 +96,23 @@ class MasterState:
         unowned_instances: name of a removed process to its instances that may still run.
         capability_answers: answers of hosts, by strategy and host, for each strategy that must
             check its hosts.
+        chain_of: creates the scoring policies with other settings; None: they stay.
+        reloads: requests to reload, and the answers to them.
         plugins: guards every call of a plugin.
     """
 
     def __init__(
         self,
         settings: CoreSettings,
-        policy_name: str,
-        policy: ScoringPolicy,
+        placement: PlacementPlugins,
         strategies: Mapping[str, MigrationStrategy],
         epoch: int,
-        fallback: tuple[str, ScoringPolicy] | None = None,
         *,
         declared: Declared | None = None,
     ) -> None:
         self.settings = settings
         self.declared = declared or Declared()
-        self.policy_name = policy_name
-        self.policies: tuple[NamedPolicy, ...] = ((policy_name, policy),)
-        if fallback is not None:
-            self.policies += (fallback,)
+        self.placement = placement
         self.strategies = dict(strategies)
         self.epoch = epoch
         self.hosts = HostTable()
@@ -123,12 +126,19 @@ class MasterState:
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
+        self.flows = Flows()
+        self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
+        self.time_limited: dict[str, None] = {}
+        self.preemption = Preemption()
+        self.rebalancing = Rebalancing()
+        self.reloads = Reloads()
+        self.chain_of: ChainOf | None = None
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
-        self.plugins = PluginCalls()
+        self.plugins = placement.calls
         self.replication = ReplicationState()
         self.capability_answers: dict[tuple[str, str], Answer] = {}
         self.images = Images()
@@ -291,14 +301,19 @@ class MasterState:
         """Update `terminal`, which stays in the order in which processes ended."""
         if not process.phase.is_terminal:
             self.terminal.pop(process.name, None)
+            if process.spec.time_limit:
+                self.time_limited.setdefault(process.name)
             if process.spec.standby.wanted:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
                 self.neighbours.add(process.spec)
+            self.flows.declare(process.name, process.spec.talks_to)
         else:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
+            self.time_limited.pop(process.name, None)
             self.neighbours.remove(process.name)
+            self.flows.remove(process.name)
 
     def collect_garbage(self) -> None:
         """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
@@ -336,9 +351,17 @@ class MasterState:
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place, given by its priority and order of submission."""
         process.owner, process.ended_on = 0, ""
-        process.wanted = DesiredState.RUN
+        process.wanted, process.overdue = DesiredState.RUN, False
+        process.started_at, process.began = inf, 0.0
+        self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
+        self.put_in_queue(process)
+
+    def put_in_queue(self, process: Process) -> None:
+        """Add a process whose phase is QUEUED to the queue."""
         self.queue.add(process.name, process.spec.priority, process.order)
+        if process.queue_delay:
+            self.queue.delayed.add(process.name)
 
     def unqueue(self, process: Process) -> None:
         """Remove the process from the queue and from the set-aside list."""
@@ -409,10 +432,12 @@ class MasterState:
         )
         self.hosts.hold(host, instance, devices)
         self.instances[instance.number] = added
-        host.instances.add(instance.number)
+        process = self.processes.get(instance.process)
+        spec = process.spec if process is not None else ProcessSpec(instance.process)
+        host.instances[instance.number] = instance.process, declared_spec(spec, SPEC_FIELDS)
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
-        self.neighbours.note_change(instance.process)
+        self.note_change(instance.process)
         return added
 
     def reserve(self, instance: InstanceId, host: Host, now: float, ranking: Ranking) -> None:
@@ -452,10 +477,15 @@ class MasterState:
             and migration.source_host is instance.host
         )
 
+    def note_change(self, name: str) -> None:
+        """Note that the instances of a process, or the one that owns its name, have changed."""
+        self.neighbours.note_change(name)
+        self.flows.note_change(name)
+
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""
         del self.instances[instance.id.number]
-        instance.host.instances.discard(instance.id.number)
+        instance.host.instances.pop(instance.id.number, None)
         name = instance.id.process
         self._numbers_of(name).discard(instance.id.number)
         if not self.unowned_instances.get(name, True):
@@ -463,7 +493,7 @@ class MasterState:
         if instance.devices and not self._may_return(instance):
             self.hosts.hold(instance.host, instance.id, ())
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
-        self.neighbours.note_change(name)
+        self.note_change(name)
 
     def clear_left_behind(self, process: Process) -> None:
         """Note that no instance of a process on a lost host counts as its own any more."""

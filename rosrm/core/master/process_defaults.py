@@ -17,6 +17,8 @@ IDENTITY: Final = (
 _OF_NODES: Final = ("parameters", "remappings", "health")
 #: Fields of services only; a job does not restart by default, because it may not be repeatable.
 _OF_SERVICES: Final = ("standby", "restart.when")
+#: Fields of jobs only.
+_OF_JOBS: Final = ("time_limit",)
 #: Fields whose values may be secret.
 _PRIVATE: Final = ("arguments", "parameters", "environment")
 _BUILT_IN: Final = ProcessSpec("")
@@ -84,7 +86,8 @@ def _applies(path: str, default: Any, spec: ProcessSpec) -> bool:
         return False  # they are options of another strategy
     if not spec.ros and (first in _OF_NODES or (path, default) == ("readiness.kind", "graph")):
         return False
-    return spec.kind is not Kind.JOB or not {first, path} & set(_OF_SERVICES)
+    others = _OF_SERVICES if spec.kind is Kind.JOB else _OF_JOBS
+    return not {first, path} & set(others)
 
 
 def _is_left_out(path: str, own: Any, built_in: Any, spec: ProcessSpec) -> bool:

@@ -18,6 +18,8 @@ MigrationRequested      begins a migration
 CheckpointRequested     begins to dump a process into an image
 RestoreRequested        begins to restore a process from its image
 HostStateRequested      cordons, uncordons, drains
+RebalanceRequested      evens out the load of the hosts, or replies with the moves that would
+ReloadRequested         lets the master's file be read, then orders the slaves to read theirs
 PruneRequested          removes ended processes and departed hosts from the listings
 OrderAnswered           notes whether the slave accepted the order, and the result of an executor
 HandoffReported         notes the reported phase of a handoff's source or destination
@@ -25,6 +27,7 @@ SourceStranded          lets a silent source resume whose handoff is not under w
 AssignmentWithdrawn     returns the process to its place in the queue
 PeerRefused             records the refusal
 KeyRevoked              gives the host no work; its silence does the rest
+SettingsRead            applies the settings, or refuses the file
 TimePassed              checks every deadline: silence, delivery, steps, hysteresis
 ======================  =========================================================================
 """
@@ -35,7 +38,15 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
-from rosrm.core.master import answers, lifecycle, plugin_failures, pruning, requests, tick
+from rosrm.core.master import (
+    answers,
+    lifecycle,
+    plugin_failures,
+    pruning,
+    reloading,
+    requests,
+    tick,
+)
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import place_waiting
 from rosrm.core.master.checkpoint import replication
@@ -67,10 +78,13 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.CheckpointRequested: requests.checkpoint_requested,
         happened.RestoreRequested: requests.restore_requested,
         happened.HostStateRequested: requests.host_state_requested,
+        happened.RebalanceRequested: requests.rebalance_requested,
+        happened.ReloadRequested: reloading.reload_requested,
         happened.PruneRequested: pruning.prune_requested,
         happened.OrderAnswered: answers.order_answered,
         happened.HandoffReported: handoff.handoff_reported,
         happened.SourceStranded: handoff.source_stranded,
+        happened.SettingsRead: reloading.settings_read,
         happened.TimePassed: tick.time_passed,
     }
 )

@@ -16,6 +16,7 @@ from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
+from rosrm.core.master.migration.rebalancing import begin_round, plan_round
 from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.process_defaults import with_defaults
@@ -28,6 +29,7 @@ from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.limits import limits_fault
 from rosrm.model.orders import RestartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.values import ProcessSpec
@@ -155,7 +157,10 @@ def _submission_fault(
 
 
 def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
-    """Return why the migration or the standby of a spec is refused; "": it is not."""
+    """Return why the limits, the migration or the standby of a spec are refused; "": not."""
+    fault = limits_fault(spec)
+    if fault:
+        return fault
     strategy = spec.migration.strategy
     if strategy is not None and strategy not in state.strategies:
         return why_not_selected(state, strategy)
@@ -167,9 +172,13 @@ def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
     return ""
 
 
+#: Paths of the fields that `_spec_fault` checks.
+_CHECKED: Final = ("migration.", "standby.", "limits.", "needs", "cpus", "realtime.", "nice")
+
+
 def _origin(defaulted: Sequence[str]) -> str:
     """Return the part of a refusal that names the fields with defaults of the cluster, if any."""
-    concerned = [path for path in defaulted if path.startswith(("migration.", "standby."))]
+    concerned = [path for path in defaulted if path.startswith(_CHECKED)]
     if not concerned:
         return ""
     given = "is" if len(concerned) == 1 else "are"
@@ -245,7 +254,7 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
 
 
 def _cancel(state: MasterState, process: Process, now: float, by: Requester) -> None:
-    process.wanted = DesiredState.CANCEL
+    process.wanted, process.overdue = DesiredState.CANCEL, False
     state.clear_left_behind(process)
     state.record(
         now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
@@ -312,6 +321,7 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         replication.drop_former_replicas(state, process)
         process.excluded.clear()
         process.demand = None
+        process.reschedules, process.queue_delay = 0, 0.0
         process.order = state.next_order
         state.next_order += 1
         state.enqueue(process, now)
@@ -406,3 +416,14 @@ def host_state_requested(
     reconsider_set_aside(state, now)
     details = f": {departures(state, host)}" if host.draining else ""
     state.emit(Reply(event.request, message=f"{host.name} is {done}{details}"))
+
+
+def rebalance_requested(state: MasterState, event: happened.RebalanceRequested, now: float) -> None:
+    """Begin one round of moves that even out the load of the hosts, or reply with its plan."""
+    if state.rebalancing.pending:
+        names = listed([name for name, _ in state.rebalancing.pending])
+        raise RequestRefused(f"a round is under way: {names} will move yet")
+    planned = plan_round(state, now)
+    if planned.shifts and not event.plan_only:
+        begin_round(state, planned, now)
+    state.emit(Reply(event.request, message=str(planned)))

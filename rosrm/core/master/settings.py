@@ -9,6 +9,8 @@ from typing import Final, Literal
 
 from rosrm.model.values import EMPTY, ProcessSpec
 
+Preemption = Literal["move", "requeue", False]
+
 #: Key of the quota of each user without an entry of its own.
 DEFAULT_QUOTA: Final = "default"
 
@@ -32,6 +34,15 @@ class CoreSettings:
             need and its measured usage; "declared": its need as at its first placement.
         max_migrations: highest number of migrations in flight.
         automatic: True: the core evicts processes from hosts that are over a limit.
+        link_period: seconds between two measurements of the links of a host; 0: no measurements.
+        learn_flows: True: slaves measure the flows between processes.
+        preemption: way in which processes make room for one of a higher priority that fits on no
+            host: "move" to other hosts; or "requeue", those that cannot move wait in the queue
+            again; False: not at all.
+        rebalance: True: the core moves processes to even out the load of the hosts.
+        rebalance_spread: difference between the loads of two hosts from which on it does so.
+        rebalance_after: seconds for which the difference must last, and between two rounds.
+        rebalance_moves: most processes that move in one round.
         order_retry: seconds after which an unanswered order is repeated.
         keep_ended: number of the newest terminal processes that are not garbage-collected.
         max_hosts: most hosts, also of those that left or are lost.
@@ -55,6 +66,13 @@ class CoreSettings:
     need: Literal["measured", "declared"] = "measured"
     max_migrations: int = 2
     automatic: bool = True
+    link_period: float = 10.0
+    learn_flows: bool = True
+    preemption: Preemption = "move"
+    rebalance: bool = False
+    rebalance_spread: float = 0.3
+    rebalance_after: float = 60.0
+    rebalance_moves: int = 4
     order_retry: float = 2.0
     keep_ended: int = 10_000
     max_hosts: int = 2_000

@@ -10,17 +10,20 @@ from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
 from rosrm.core.master.assignment.reservations import review_reservation
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.commands import Redeliver, Withdraw
-from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
 from rosrm.core.master.hosts.registration import review_departures
 from rosrm.core.master.lifecycle import stop_instance
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import evict_from_hosts
+from rosrm.core.master.migration.preemption import preempt
+from rosrm.core.master.migration.rebalancing import review_rebalancing
 from rosrm.core.master.migration.reunion import review_separated
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
+from rosrm.core.master.time_limits import review_time_limits
 from rosrm.model.orders import ReportInstances
 
 #: Seconds between two ticks; this work need not be done with every event.
@@ -39,6 +42,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     state.reviewed = now
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
+    review_time_limits(state, now)
     review_departures(state, now)
     review_lost_hosts(state, now)
     journal_gap.review(state, now)
@@ -46,9 +50,12 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     _ask_for_missing_statuses(state, now)
     _review_forged_batches(state, now)
     capabilities.ask_hosts(state, now)
+    links.ask_next_host(state, now)
     images.review(state, now)
     review_separated(state, now)
     evict_from_hosts(state, now)
+    preempt(state, now)
+    review_rebalancing(state, now)
     replication.review(state, now)
     periodic.review(state, now)
     reconsider_set_aside(state, now)

@@ -88,10 +88,17 @@ class Resumed(NamedTuple):
 
 
 class Spawned(NamedTuple):
-    """The session leader runs."""
+    """The session leader runs.
+
+    Attributes:
+        enforced: names of its limits and scheduling settings that hold.
+        note: text on limits that do not hold.
+    """
 
     instance: Key
     pid: int
+    enforced: tuple[str, ...] = ()
+    note: str = ""
 
 
 class SpawnFailed(NamedTuple):
@@ -109,6 +116,8 @@ class Exited(NamedTuple):
         code: exit code; UNKNOWN_EXIT: the end was not observed.
         signal: signal that killed it; 0: none.
         leftovers: other processes of its session still run.
+        out_of_memory: used bytes and limit in bytes (0: none), if the OOM killer ended a process of
+            the instance.
     """
 
     instance: Key
@@ -117,6 +126,7 @@ class Exited(NamedTuple):
     peak_memory: float = 0.0
     cpu_time: float = 0.0
     leftovers: bool = False
+    out_of_memory: tuple[float, float] | None = None
 
 
 class SessionEnded(NamedTuple):

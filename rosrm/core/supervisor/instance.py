@@ -6,6 +6,7 @@ import signal
 from typing import Final, Literal
 
 from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
+from rosrm.wording import size
 
 Phase = Literal[
     "starting", "running", "backoff", "stopping",
@@ -33,6 +34,8 @@ STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 KILL_AGAIN: Final = 1.0
 #: Number of SIGKILLs after which a shutdown stops waiting for a process stuck in the kernel.
 MOST_KILLS: Final = 5
+#: Share of its limit that an instance uses when the kernel kills it for this limit.
+_AT_LIMIT: Final = 0.9
 #: Exit code of a run without an observed end.
 UNKNOWN_EXIT: Final = -1
 
@@ -51,6 +54,7 @@ class Instance:
         stop_began: start of its stop.
         trail: text on the steps of the stop.
         fault: why its last run counts as failed, regardless of its exit; "": its exit decides.
+        enforced: names of the limits and scheduling settings that hold in its last run.
         fence: None: no fence; never changes after the start.
         heard: last contact: newest known time at which the master received a message of this host,
             or the time of the start.
@@ -60,9 +64,9 @@ class Instance:
     """
 
     __slots__ = (
-        "cpu_time", "deadline", "exit_code", "exit_signal", "fault", "fence", "fenced", "heard",
-        "key", "kill_by", "kills", "message", "peak_memory", "phase", "pid", "recent", "restart",
-        "restarts", "run_time", "started", "step", "stop", "stop_began", "then", "trail",
+        "cpu_time", "deadline", "enforced", "exit_code", "exit_signal", "fault", "fence", "fenced",
+        "heard", "key", "kill_by", "kills", "message", "peak_memory", "phase", "pid", "recent",
+        "restart", "restarts", "run_time", "started", "step", "stop", "stop_began", "then", "trail",
         "withdrawn",
     )  # fmt: skip
 
@@ -89,6 +93,7 @@ class Instance:
         self.stop_began = 0.0
         self.trail = ""
         self.fault = ""
+        self.enforced: tuple[str, ...] = ()
         self.peak_memory = 0.0
         self.cpu_time = 0.0
         self.run_time = 0.0
@@ -140,6 +145,14 @@ def ending(instance: Instance) -> str:
     if instance.exit_code == UNKNOWN_EXIT:
         return "ended while its host or its supervisor was down: its exit code is not known"
     return f"exit code {instance.exit_code}"
+
+
+def killed_for_memory(used: float, limit: float) -> str:
+    """Return a text on an end by the OOM killer; `limit` 0: the instance has none."""
+    if limit and used >= _AT_LIMIT * limit:
+        return f"killed: used {size(used)} of {size(limit)}"
+    of_limit = f" of {size(limit)}" if limit else ""
+    return f"killed: its host ran out of memory; it used {size(used)}{of_limit}"
 
 
 def signal_name(number: int) -> str:

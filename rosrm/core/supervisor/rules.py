@@ -26,6 +26,29 @@ class StopRule(NamedTuple):
     terminate_grace: float = 5.0
 
 
+class LimitRule(NamedTuple):
+    """Limits and scheduling of an instance; 0, (), "": none.
+
+    Attributes:
+        memory: bytes; above them the kernel kills the instance.
+        memory_high: bytes; above them the kernel slows it.
+        cpu: cores.
+        cpus: numbers of the CPUs that it may use.
+        policy: real-time policy, "fifo" or "rr", with `priority`.
+        nice: niceness.
+        required: True: it is refused if any of these cannot be enforced.
+    """
+
+    memory: float = 0.0
+    memory_high: float = 0.0
+    cpu: float = 0.0
+    cpus: tuple[int, ...] = ()
+    policy: str = ""
+    priority: int = 0
+    nice: int = 0
+    required: bool = False
+
+
 class FenceRule(NamedTuple):
     """Lightweight copy of `rosrm.model.values.Fence`."""
 

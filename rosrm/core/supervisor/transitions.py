@@ -23,12 +23,14 @@ from rosrm.core.supervisor.instance import (
     THEN_END,
     THEN_POLICY,
     THEN_RESTART,
+    UNKNOWN_EXIT,
     WITHDRAWN,
     Instance,
     Phase,
     Then,
     end,
     ending,
+    killed_for_memory,
     stopping,
 )
 from rosrm.core.supervisor.rules import RestartRule
@@ -47,7 +49,8 @@ def _spawned(instance: Instance, event: events.Event, now: float) -> list[Comman
     instance.phase = RUNNING
     instance.pid = event.pid
     instance.started = now
-    instance.message = instance.fault = ""
+    instance.message, instance.fault = event.note, ""
+    instance.enforced = event.enforced
     if instance.then == THEN_END:
         return _stop(instance, event, now)
     return [ReportStatus(instance.key)]
@@ -84,12 +87,22 @@ def _exited(instance: Instance, event: events.Event, now: float) -> list[Command
     instance.peak_memory = event.peak_memory
     instance.cpu_time = event.cpu_time
     instance.run_time = max(0.0, now - instance.started)
+    if event.out_of_memory and (event.code or event.signal) and not instance.fault:
+        instance.fault = _fault_of_memory(instance, *event.out_of_memory)
     if not event.leftovers:
         return _when_nothing_is_left(instance, now)
     if instance.phase == STOPPING:
         again: list[Command] = [Signal(instance.key, signal.SIGKILL)]
         return [ReportStatus(instance.key), *(again if instance.step >= _KILL else [])]
     return _begin_stop(instance, THEN_POLICY, now)
+
+
+def _fault_of_memory(instance: Instance, used: float, limit: float) -> str:
+    """Return why a run has failed in which the OOM killer ended the leader, or another process."""
+    killed = killed_for_memory(used, limit)
+    if instance.exit_signal == signal.SIGKILL or instance.exit_code == UNKNOWN_EXIT:
+        return killed
+    return f"{ending(instance)}, after a process of it was {killed}"
 
 
 def _cleared(instance: Instance, event: events.Event, now: float) -> list[Command]:

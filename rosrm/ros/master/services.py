@@ -123,6 +123,8 @@ class MasterServices:
             (srv.Restore, names.RESTORE, _restored),
             (srv.SetHostState, names.SET_HOST_STATE, _host_set),
             (srv.Prune, names.PRUNE, _pruned),
+            (srv.Rebalance, names.REBALANCE, _rebalanced),
+            (srv.Reload, names.RELOAD, _reloaded),
         ):
             offer(kind, path(name), self._as_event(kind, event))
         # Offered last, and DDS announces in this order: after a handshake all others are usable.
@@ -392,6 +394,14 @@ def _host_set(request: srv.SetHostState.Request, token: int, peer: Peer) -> happ
 def _pruned(request: srv.Prune.Request, token: int, peer: Peer) -> happened.Event:
     names, hosts = tuple(request.processes), tuple(request.hosts)
     return happened.PruneRequested(token, names, hosts, _requester(peer))
+
+
+def _rebalanced(request: srv.Rebalance.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.RebalanceRequested(token, bool(request.plan_only), _requester(peer))
+
+
+def _reloaded(_request: srv.Reload.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.ReloadRequested(token, _requester(peer))
 
 
 def _requester(peer: Peer) -> Requester:

@@ -20,6 +20,7 @@ from rosrm.core.slave.state import SlaveState
 from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.keys.security import Member
+from rosrm.model.devices import Device
 from rosrm.model.values import HostDescription, InstanceStatus, SnapshotReport
 from rosrm.ros import convert, names, qos
 from rosrm.ros.bounds import MOST_LETTERS
@@ -84,13 +85,13 @@ class SlaveEndpoint:
         seen: newest journal records of the masters that this host knows.
 
     Attributes:
+        description: of this host.
         link: state of the connection to the master.
         failure: reason to give up; "": there is none.
         cluster: name of the last master that greeted this slave; "" before the first one.
         epoch: newest known epoch of the master.
         failing: kind and name of each failing plugin on this host, with the reason; sent with the
             statuses. A probe is named by the resource that it reads.
-        devices: devices of this host, as they are now; sent with the registration and the statuses.
     """
 
     def __init__(
@@ -102,13 +103,12 @@ class SlaveEndpoint:
         self._endpoints = endpoints
         self._master = endpoints.security.master
         self._state, self._take, self._snapshots = state, take, snapshots
-        self._description = description
+        self.description = description
         self._seen = seen or JournalWatermark()
         self.link = MasterLink.SEARCHING
         self.failure = ""
         self.cluster = ""
         self.failing: dict[Plugin, str] = {}
-        self.devices = description.devices
         self.host_id = 0
         self.epoch = 0
         self._master_beat = 0
@@ -152,7 +152,7 @@ class SlaveEndpoint:
         readings = endpoints.participant.node.create_publisher(
             msg.SealedReading, topic, qos.READING_OUT
         )
-        channel, description = reading_channel(topic), self._description
+        channel, description = reading_channel(topic), self.description
         self._reporter = Reporter(
             lambda reading: readings.publish(seal_reading(master, channel, reading)),
             description.incarnation, description.period,
@@ -195,7 +195,7 @@ class SlaveEndpoint:
         self._asked_at = now
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role="slave",
-            name=self._description.name,
+            name=self.description.name,
         )  # fmt: skip
         self._control.call(
             self._clients[srv.Handshake], request, now + _PATIENCE, self._take_greeting
@@ -224,7 +224,7 @@ class SlaveEndpoint:
             return
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
-            host=convert.host_to_msg(replace(self._description, devices=self.devices)),
+            host=convert.host_to_msg(self.description),
             instances=[convert.status_to_msg(status) for status in self._state.statuses()],
             snapshots=[convert.snapshot_to_msg(one) for one in self._snapshots()],
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
@@ -298,6 +298,17 @@ class SlaveEndpoint:
         found = any(not status.state.ended for status in self._state.statuses())
         return _NAME_TAKEN_BY_FORMER if found and not self.host_id else _NAME_TAKEN
 
+    def set_devices(self, devices: tuple[Device, ...]) -> None:
+        """Describe the devices of this host as they are now."""
+        self.description = replace(self.description, devices=devices)
+        self.publish_statuses((), complete=False)
+
+    def describe_again(self, description: HostDescription) -> None:
+        """Register again, with another description of the same run of this slave."""
+        self.description = description
+        if self.link is not MasterLink.SEARCHING:
+            self._lose_master("the settings of this host have changed; registering again")
+
     def _lose_master(self, reason: str) -> None:
         self.link = MasterLink.SEARCHING
         self._poll_at = 0.0
@@ -317,7 +328,7 @@ class SlaveEndpoint:
         self._newest_beat = beat
         if not self._is_of_master(beat) or self._beat_clock.is_ahead(beat.beat / 1e9, now):
             return
-        self._endpoints.security.tickets_from = beat.tickets_from
+        self._endpoints.security.note_beat(beat.tickets_from)
         sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))
@@ -377,7 +388,7 @@ class SlaveEndpoint:
             self._poll.deadline = now + _PATIENCE
         request = srv.RequestProcess.Request(
             envelope=self._control.envelope(self._master_beat, self.epoch),
-            host_id=self.host_id, incarnation=self._description.incarnation,
+            host_id=self.host_id, incarnation=self.description.incarnation,
         )  # fmt: skip
         self._poll = self._control.call(
             self._clients[srv.RequestProcess], request, math.inf, self._take_work
@@ -424,7 +435,7 @@ class SlaveEndpoint:
         self._statuses.publish(
             msg.ProcessStatusBatch(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
-                incarnation=self._description.incarnation, sequence=self._status_sequence,
+                incarnation=self.description.incarnation, sequence=self._status_sequence,
                 complete=complete, strangers=self._strangers,
                 statuses=[convert.status_to_msg(one) for one in statuses],
                 failing=[
@@ -434,7 +445,7 @@ class SlaveEndpoint:
                     )
                     for (kind, name), reason in self.failing.items()
                 ],
-                devices=convert.devices_to_msg(self.devices),
+                devices=convert.devices_to_msg(self.description.devices),
             )
         )  # fmt: skip
         self._strangers = 0
@@ -453,7 +464,7 @@ class SlaveEndpoint:
             self._usages.publish(
                 msg.ProcessUsage(
                     protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
-                    incarnation=self._description.incarnation, numbers=numbers, cpu=cpu,
+                    incarnation=self.description.incarnation, numbers=numbers, cpu=cpu,
                     memory=memory,
                     others=[
                         msg.ResourceUsage(slot=slot, amounts=amounts)
@@ -469,7 +480,7 @@ class SlaveEndpoint:
         self._snapshot_reports.publish(
             msg.SnapshotReports(
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
-                incarnation=self._description.incarnation,
+                incarnation=self.description.incarnation,
                 snapshots=[convert.snapshot_to_msg(one) for one in states],
             )
         )  # fmt: skip
@@ -502,7 +513,7 @@ class SlaveEndpoint:
     def _send_leave(self, running: Sequence[InstanceStatus], done: Callable[[], None]) -> None:
         request = srv.Leave.Request(
             envelope=self._control.envelope(self._master_beat, self.epoch),
-            host_id=self.host_id, incarnation=self._description.incarnation,
+            host_id=self.host_id, incarnation=self.description.incarnation,
             left_running=[convert.status_to_msg(status) for status in running],
         )  # fmt: skip
         self._control.call(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -10,7 +11,15 @@ from rosrm.core.slave.events import Event
 from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
 from rosrm.keys.security import Member
-from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
+from rosrm.model.links import LinkReport
+from rosrm.model.orders import (
+    DropReplica,
+    MeasureLinks,
+    ReloadSettings,
+    ReplicateSnapshot,
+    RunExecutor,
+    SetRestartPolicy,
+)
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
 from rosrm.ros import names
@@ -67,6 +76,9 @@ class Duties:
         execute: runs an executor, and calls its last argument with the outcome. If that takes
             longer than the order allows, the executor's strategy counts as failing.
         read_log: returns a part of a log; raises `Refused`.
+        measure_links: measures links, and calls its last argument with the report.
+        reload: reads the settings file, and calls its argument with a summary and the fault, of
+            which one is "".
     """
 
     take: Callable[[Event], None]
@@ -75,6 +87,8 @@ class Duties:
     drop_snapshots: Callable[[InstanceId], None]
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
     read_log: Callable[[LogQuery], LogPart]
+    measure_links: Callable[[MeasureLinks, Callable[[LinkReport], None]], None]
+    reload: Callable[[Callable[[str, str], None]], None]
 
 
 class SlaveServices:
@@ -109,6 +123,12 @@ class SlaveServices:
                 case SetRestartPolicy():
                     self._set_restart(order, respond)
                     return
+                case MeasureLinks():
+                    self._measure_links(order, respond)
+                    return
+                case ReloadSettings():
+                    self._reload(respond)
+                    return
                 case ReplicateSnapshot(instance, hosts, every):
                     self._duties.keep(instance, hosts, every)
                 case DropReplica(instance):
@@ -126,6 +146,20 @@ class SlaveServices:
             respond(srv.ControlHost.Response(answer=answer))
 
         self._duties.set_restart(order, settled)
+
+    def _measure_links(self, order: MeasureLinks, respond: Callable[[Any], None]) -> None:
+        def done(report: LinkReport) -> None:
+            result = json.dumps(report.to_json())
+            respond(srv.ControlHost.Response(answer=accepted(), result=result))
+
+        self._duties.measure_links(order, done)
+
+    def _reload(self, respond: Callable[[Any], None]) -> None:
+        def done(summary: str, fault: str) -> None:
+            answer = refused("invalid", fault) if fault else accepted(summary)
+            respond(srv.ControlHost.Response(answer=answer))
+
+        self._duties.reload(done)
 
     def _execute(self, order: RunExecutor, respond: Callable[[Any], None]) -> None:
         def done(outcome: ExecutorOutcome) -> None:

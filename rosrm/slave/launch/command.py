@@ -19,7 +19,7 @@ from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ros_arguments
 from rosrm.supervisor import json_lines
 from rosrm.supervisor.client import log_path
-from rosrm.supervisor.client_values import LaunchOrder
+from rosrm.supervisor.client_values import LaunchOrder, limit_rule
 
 #: Most bytes of command line and environment, as the supervisor receives them; the rest of its
 #: longest line is for the other fields.
@@ -67,6 +67,7 @@ def launch_order(
         stop=spec.stop,
         fence=assignment.fence,
         last_contact=last_contact,
+        limits=limit_rule(spec),
     )
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 
-from .conftest import PACKAGES
+from tests.pip_environments import ROOT
+
+PACKAGES = ROOT / "examples" / "plugins"
 
 
 def install(environment, *names):

@@ -12,6 +12,12 @@ import pytest
 TUTORIALS = Path(__file__).resolve().parents[3] / "docs/tutorials"
 SCORING = TUTORIALS / "your-own-scoring-plugin.md"
 MIGRATION = TUTORIALS / "your-own-migration-strategy.md"
+#: Tutorials that begin with `rosrm plugin new`, and the number of their commands.
+FROM_TEMPLATE = {
+    TUTORIALS / "your-own-filter.md": 4,
+    TUTORIALS / "your-own-probe.md": 6,
+    TUTORIALS / "your-own-checkpoint-policy.md": 4,
+}
 
 _BLOCK = re.compile(
     r"<!-- (?P<what>file|run)(: (?P<about>[^>]*?))? -->\n```\w+\n(?P<text>.*?)```", re.DOTALL
@@ -74,6 +80,14 @@ def test_the_tutorial_of_a_strategy_does_what_it_says(environment):
     assert len(done) == 4
 
 
+@pytest.mark.parametrize("page", FROM_TEMPLATE, ids=lambda page: page.stem)
+def test_a_tutorial_from_a_template_does_what_it_says(page, environment):
+    """The written package becomes another plugin that keeps the contract and is selected."""
+    done = do(page, environment)
+    assert "pip install --quiet ." in done
+    assert len(done) == FROM_TEMPLATE[page]
+
+
 def test_the_tutorial_does_what_it_says(environment):
     """An empty folder becomes a policy that is pip-installed and selected by name."""
     done = do(SCORING, environment)
@@ -88,13 +102,20 @@ def test_the_tutorial_does_what_it_says(environment):
         "registry = Registry.discover()\n"
         "config = load_cluster('rosrm-fewest/cluster.yaml', registry)\n"
         "config = ClusterConfig.from_json(config.to_json())\n"
-        "policy = registry.scoring(config.scoring.policy, config.scoring.options)\n"
+        "policy = registry.scoring(config.scoring[0].policy, config.scoring[0].options)\n"
         "print(type(policy).__module__, policy._most)\n"
     )
     assert environment.python(code).split() == ["rosrm_fewest", "20"]
 
 
-@pytest.mark.parametrize(("page", "only_shown"), [(SCORING, 1), (MIGRATION, 0)])
+@pytest.mark.parametrize(
+    ("page", "only_shown"),
+    [
+        (SCORING, 1),
+        (MIGRATION, 0),
+        *((page, page.stem.endswith("filter")) for page in FROM_TEMPLATE),
+    ],
+)
 def test_every_marked_block_is_found(page, only_shown):
     """The pattern finds all marked blocks; a misspelt mark would silently skip a block."""
     text = page.read_text(encoding="utf-8")

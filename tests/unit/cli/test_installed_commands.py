@@ -111,10 +111,10 @@ def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installe
     """Hints name installed commands as they name built-in ones."""
     installed("acme", "hello = acme_commands:hello")
 
-    result = rosrm("helo")
+    result = rosrm("hallo")
 
     assert result.code == 2
-    assert "No such command 'helo'. Did you mean 'hello'?" in result.err
+    assert "No such command 'hallo'. Did you mean 'hello'?" in result.err
 
 
 @pytest.mark.parametrize(

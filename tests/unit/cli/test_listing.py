@@ -150,7 +150,7 @@ def test_ps_json_has_every_process_with_every_field(rosrm, client):
         "name": "talker", "kind": "service", "state": "running", "host": "alpha", "number": 1,
         "pid": 99, "restarts": 2, "migrations": 1, "exit_code": 0, "priority": 0,
         "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000, "reason": "",
-        "stale": False, "owner": "",
+        "stale": False, "owner": "", "cpu_limit": 0.0, "memory_limit": 0,
     }  # fmt: skip
 
 
@@ -257,6 +257,30 @@ def test_explain_shows_what_comes_from_the_defaults_of_the_cluster():
     said = 'From `defaults.process` of the cluster: restart.when "always", environment, needs'
     assert said in " ".join(lines)
     assert "defaults.process" not in "".join(drawn(explain.render({**STORY, "defaults": {}})))
+
+
+def test_explain_shows_limits_and_whether_they_hold():
+    limits = {"limits.memory": {"value": "500 MB"}, "nice": {"value": "-5"}}
+    expected = "Limits and scheduling: limits.memory 500 MB, nice -5."
+    assert expected in drawn(explain.render({**STORY, "limits": limits}))
+    limits["limits.memory"] |= {"holds": True, "reason": ""}
+    held = " ".join(drawn(explain.render({**STORY, "limits": limits})))
+    assert f"{expected} The host enforces them." in held
+    limits["nice"] |= {"holds": False, "reason": "CAP_SYS_NICE is required"}
+    unmet = " ".join(drawn(explain.render({**STORY, "limits": limits})))
+    assert f"{expected} Not enforced: nice: CAP_SYS_NICE is required." in unmet
+    limits["limits.memory"] |= {"used": "600 MB"}
+    above = " ".join(drawn(explain.render({**STORY, "limits": limits})))
+    assert "limits.memory 500 MB (earlier runs of its program used 600 MB), nice -5." in above
+
+
+def test_ps_shows_the_limits_that_hold():
+    """Without any, there is no column for them."""
+    other = process("other")
+    rows = [process("camera", cpu_limit=1.5), process("map", memory_limit=5 * 10**8), other]
+    columns = {column.header: list(column.cells) for column in tables.processes(rows).columns}
+    assert columns["LIMITS"] == ["1.5 cores", "500 MB", ""]
+    assert "LIMITS" not in [column.header for column in tables.processes([other]).columns]
 
 
 def test_explain_prints_the_rounding_error_of_a_score_as_zero():

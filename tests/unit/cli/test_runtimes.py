@@ -15,6 +15,7 @@ from rosrm.extensions.registry import Registry
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.records import Intent
 from rosrm.runtime.bootstrap import take_over
+from rosrm.runtime.settings_check import SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.testing import FakeProbe
 from tests.plugin_kit import plugin
@@ -33,7 +34,7 @@ def becomes(monkeypatch, tmp_path):
     seen = []
     monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=OURS))
     monkeypatch.setattr(
-        runtimes, "become", lambda module, settings: seen.append((module, settings))
+        runtimes, "become", lambda module, settings, source: seen.append((module, settings, source))
     )
     return seen
 
@@ -49,8 +50,9 @@ def test_a_master_starts_with_the_settings_of_its_file(rosrm, becomes, cluster_f
     assert result.code == 0
     assert result.err.startswith("master 'lab': domain 7, ")
     assert f"scoring weighted; migration relaunch; state in {tmp_path / 's'}" in result.err
-    ((module, settings),) = becomes
+    ((module, settings, source),) = becomes
     assert module == "rosrm.master"
+    assert source == SettingsSource("master", str(cluster_file), 7)
     config = ClusterConfig.from_json(settings)
     assert (config.name, config.ros.domain) == ("lab", 7)
 
@@ -61,15 +63,16 @@ def test_a_slave_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path):
     assert result.code == 0
     assert "slave of 'h1': domain " in result.err
     assert "limits memory 80%, cpu 70%, disk 90%" in result.err
-    ((module, settings),) = becomes
+    ((module, settings, source),) = becomes
     assert module == "rosrm.slave"
+    assert source == SettingsSource("slave", str(tmp_path / "h.yaml"), None)
     assert HostConfig.from_json(settings).host == "h1"
 
 
 def test_both_start_with_the_defaults_too(rosrm, becomes):
     assert rosrm("master").code == 0
     assert rosrm("slave").code == 0
-    assert [module for module, _ in becomes] == ["rosrm.master", "rosrm.slave"]
+    assert [module for module, *_ in becomes] == ["rosrm.master", "rosrm.slave"]
 
 
 @pytest.mark.parametrize(
@@ -98,10 +101,12 @@ def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch
         seen["handover"] = take_over(words[-2:])
 
     monkeypatch.setattr(os, "execv", execv)
-    runtimes.become("rosrm.slave", '{"host": "h"}')
+    source = SettingsSource("slave", "/etc/rosrm/host.yaml", 7)
+    runtimes.become("rosrm.slave", '{"host": "h"}', source)
     assert seen["words"][-4:-1] == ["-m", "rosrm.slave", "--settings-fd"]
     assert (seen["inherited"], seen["handover"].settings) == (True, '{"host": "h"}')
     assert list(seen["handover"].plugins) == installed_plugins()
+    assert seen["handover"].source == source
 
 
 def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes, cluster_file):
@@ -125,7 +130,7 @@ def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes,
     result = rosrm(*command)
     assert result.code == 0
     assert "the journal was recovered" in result.err
-    assert [module for module, _ in becomes] == ["rosrm.master"]
+    assert [module for module, *_ in becomes] == ["rosrm.master"]
     SqliteJournal(path).close()
 
 

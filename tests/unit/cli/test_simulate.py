@@ -142,7 +142,7 @@ def test_a_replay_with_other_decisions_is_reported(rosrm, tmp_path, content):
         if kind is not FrameKind.HEADER:
             return body
         header = json.loads(body)
-        header["config"]["scoring"]["options"] = {"weights": {}}
+        header["config"]["scoring"][0]["options"] = {"weights": {}}
         return json.dumps(header).encode()
 
     parts = [frame(kind, other(kind, body)) for kind, body, _ in frames(BytesIO(content), "r")]

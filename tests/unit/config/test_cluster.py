@@ -10,7 +10,7 @@ import pytest
 from annotated_types import Le
 
 from rosrm.config.cluster import load_cluster
-from rosrm.config.settings import ClusterConfig
+from rosrm.config.settings import ClusterConfig, ScoringChoice
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.extensions.registry import Registry
@@ -107,7 +107,7 @@ def test_every_setting_is_read(file, tmp_path):
     assert (config.ros.discovery_server, config.ros.transports) == ("10.0.0.1:11811", "UDPv4")
     assert (config.ros.namespace, config.ros.interface) == ("/fleet/rosrm", "wg0")
     assert config.security == "none"
-    assert (config.scoring.policy, config.scoring.options) == ("threshold", {"a": 1})
+    assert config.scoring == (ScoringChoice("threshold", 1.0, {"a": 1}),)
     assert dict(config.migration.strategies) == {"relaunch": {}, "handoff": {"x": 2}}
     assert config.core() == CoreSettings(
         backfill=True,
@@ -220,11 +220,10 @@ def test_options_are_checked_against_the_plugin_and_kept_in_base_units(file, reg
     config = load_cluster(
         file("scoring: {options: {mem: 0.5, window: 2min, order: [a]}}"), registry
     )
-    assert config.scoring.policy == "weighted"
-    assert config.scoring.options == {"mem": 0.5, "cpu": 0.0, "window": 120.0, "order": ["a"]}
-    assert registry.scoring("weighted", config.scoring.options).score == Weights(
-        0.5, 0.0, 120.0, ("a",)
-    )
+    (scoring,) = config.scoring
+    assert scoring.policy == "weighted"
+    assert scoring.options == {"mem": 0.5, "cpu": 0.0, "window": 120.0, "order": ["a"]}
+    assert registry.scoring("weighted", scoring.options).score == Weights(0.5, 0.0, 120.0, ("a",))
 
 
 def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, registry):
@@ -264,6 +263,55 @@ def test_a_fault_in_an_option_of_several_types_is_reported_once(refusal, registr
     ],
 )  # fmt: skip
 def test_options_that_nothing_takes_are_refused(refusal, registry, text, said):
+    assert said in refusal(load_cluster, text, registry)
+
+
+def test_one_policy_and_a_list_of_one_are_the_same(file, registry):
+    """The single form stays valid, and is a chain of one link with the weight 1."""
+    single = load_cluster(file("scoring: {policy: weighted, options: {mem: 0.5}}"), registry)
+    listed = load_cluster(file("scoring: [{policy: weighted, options: {mem: 0.5}}]"), registry)
+    assert single.scoring == listed.scoring
+    assert ClusterConfig.from_json(single.to_json()).scoring == single.scoring
+
+
+def test_a_chain_has_weights_and_options_for_each_policy(file, registry):
+    config = load_cluster(
+        file(
+            """
+            scoring:
+              - {policy: weighted, options: {mem: 0.5}}
+              - {policy: curved, weight: 0.5}
+            """
+        ),
+        registry,
+    )
+    assert config.chain == "weighted + 0.5 x curved"
+    assert [one.weight for one in config.scoring] == [1.0, 0.5]
+    assert config.scoring[0].options["mem"] == 0.5
+    assert ClusterConfig.from_json(config.to_json()).scoring == config.scoring
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("scoring: []", "1:10: scoring: at least one policy is required; or omit the key"),
+        ("scoring: [{policy: curved}, {policy: weighted}, {policy: curved}]",
+         "1:58: scoring: 'curved' is in the chain already; give it once, with one weight"),
+        ("scoring: [{policy: curved}, {policy: curvd}]",
+         "1:30: unknown scoring policy 'curvd'; did you mean 'curved'?"),
+        ("scoring: [{policy: curved, weight: -1}]", "1:36: scoring[0].weight: -1 is not within"),
+        ("scoring: [{policy: curved, weight: .nan}]", "1:36: scoring[0].weight: "),
+        ("scoring: {policy: curved, weight: heavy}", "1:35: scoring.weight: 'heavy' is not"),
+        ("scoring: [weighted]", "1:11: scoring[0]: a mapping is required, not \"weighted\""),
+        ("scoring: weighted", "1:10: scoring: a mapping is required, not \"weighted\""),
+        ("scoring: [{policy: curved, options: {wrong: 1}}]", "unknown key 'wrong' in options of"),
+        ("scoring: [{polcy: curved}]", "1:12: unknown key 'polcy' in scoring[0]"),
+        ("filters: [racks]", "1:11: unknown filter 'racks'. None is installed"),
+        ("filters: {racks: {a: 1}}", "1:11: unknown filter 'racks'. None is installed"),
+        ("filters: racks", "1:10: filters: a mapping is required, not \"racks\""),
+    ],
+)  # fmt: skip
+def test_a_wrong_chain_or_filter_is_refused_with_its_place(refusal, registry, text, said):
     assert said in refusal(load_cluster, text, registry)
 
 

@@ -13,10 +13,12 @@ from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (
     Kind,
+    Limits,
     MigrationPolicy,
     NeighbourRule,
     ProcessSpec,
     Readiness,
+    Realtime,
     RestartPolicy,
     StopPolicy,
 )
@@ -59,6 +61,9 @@ def test_every_key_is_read(file):
                 migration: {strategy: relaunch, overlap: false, options: {a: 1}}
                 readiness: {kind: graph, timeout: 10s}
                 stop: {interrupt_grace: 1s, terminate_grace: 500ms}
+                limits: {memory: 600MB, memory_high: 550 MB, cpu: 1.5 cores, enforce: required}
+                cpus: [2, 3]
+                nice: -5
             """
         )
     )
@@ -76,6 +81,8 @@ def test_every_key_is_read(file):
     assert spec.migration == MigrationPolicy("relaunch", False, {"a": 1})
     assert spec.readiness == Readiness("graph", 10.0)
     assert spec.stop == StopPolicy(1.0, 0.5)
+    assert spec.limits == Limits(6e8, 5.5e8, 1.5, "required")
+    assert (spec.cpus, spec.nice) == ((2, 3), -5)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +102,8 @@ def test_every_key_is_read(file):
         ("package: p, executable: e, ros: false", "ros", False),
         ("command: x, near: b", "neighbours", (NeighbourRule("near", ("b",)),)),
         ("command: x, near: []", "neighbours", ()),
+        ("command: x, talks_to: {b: 30MB/s, c: 5}", "talks_to", {"b": 30e6, "c": 5.0}),
+        ("command: x, talks_to: {memory: 1KiB/s}", "talks_to", {"memory": 1024.0}),
         (
             "command: x, apart: [b, {processes: [d], by: rack, prefer: true}, 5]",
             "neighbours",
@@ -112,6 +121,11 @@ def test_every_key_is_read(file):
             "command: x, spread: {group: g, prefer: true}",
             "neighbours",
             (NeighbourRule("apart", group="g", prefer=True),),
+        ),
+        (
+            "command: x, realtime: {policy: fifo, priority: 40}",
+            "realtime",
+            Realtime("fifo", 40),
         ),
         ("module: m", "ros", False),
         ("module: m, ros: true, remappings: [[a, b]]", "remappings", {"a": "b"}),
@@ -146,6 +160,14 @@ def test_the_processes_of_one_entry_are_one_group(file):
         ("apart: {processes: []}", "apart: at least one process is required"),
         ("near: {by: rack}", "near[0].processes: is missing"),
         ("near: [../b]", "near: "),
+        ("talks_to: {a: 1MB/s}", "talks_to: a names itself; only other processes are allowed"),
+        ("talks_to: {../b: 1MB/s}", "talks_to: '../b' cannot be the name of a process"),
+        ("talks_to: {b: fast}", "talks_to.b: 'fast' is not a number, or text such as \"30MB/s\""),
+        ("talks_to: {b: .nan}", "talks_to.b: "),
+        ("talks_to: {b: .inf}", "talks_to.b: "),
+        ("talks_to: {b: -1MB/s}", "talks_to.b: '-1MB/s' is not within 0..1e+15"),
+        ("talks_to: {b: 30MB}", "talks_to.b: unknown unit 'MB'; did you mean 'MB/s'?"),
+        ("talks_to: [b]", "talks_to: a mapping is required, not a list"),
         ("near: [[b]]", "near[0].processes[0]: text is required, not a list"),
         ("spread: {groups: g}", "unknown key 'groups' in spread; did you mean 'group'?"),
         ("near: {processes: [b], prefer: 1}", "near[0].prefer: true or false is required, not 1"),

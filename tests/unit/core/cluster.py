@@ -30,6 +30,7 @@ from rosrm.core.slave import events
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
+from rosrm.extensions.placement import PlacementPlugins, ScoringLink, SelectedFilter
 from rosrm.extensions.registry import Registry
 from rosrm.model.codec import to_plain
 from rosrm.model.orders import Order
@@ -203,11 +204,14 @@ class Cluster(World[Machine]):
 
     def __init__(
         self, *machines: Machine | str, policy: Any = None, strategies: Mapping[str, Any] = EMPTY,
-        fallback: Any = None, declared: Declared | None = None, **settings: Any,
+        fallback: Any = None, reads: tuple[str, ...] = (),
+        chain: Sequence[ScoringLink] = (), filters: Sequence[SelectedFilter] = (),
+        declared: Declared | None = None, **settings: Any,
     ) -> None:  # fmt: skip
-        self.settings = CoreSettings(**{"settle": 1e9, **settings})
-        self.policy = policy or Eq1()
-        self.fallback = fallback
+        self.settings = CoreSettings(**{"settle": 1e9, "link_period": 0.0, **settings})
+        fallback = ScoringLink(*fallback) if fallback else None
+        chain = tuple(chain) or (ScoringLink("eq1", policy or Eq1(), reads=reads),)
+        self.placement = lambda: PlacementPlugins(chain, fallback, tuple(filters))
         self.strategies = {"relaunch": StartFirstOrStopFirst(), "handoff": HandOver(), **strategies}
         self.declared = declared or declared_by(self.strategies)
         super().__init__(self._new_state(epoch=1))
@@ -222,9 +226,8 @@ class Cluster(World[Machine]):
 
     def _new_state(self, epoch: int) -> MasterState:
         state = MasterState(
-            self.settings, "eq1", self.policy, self.strategies, epoch, self.fallback,
-            declared=self.declared,
-        )  # fmt: skip
+            self.settings, self.placement(), self.strategies, epoch, declared=self.declared
+        )
         state.wall = self.wall
         return state
 

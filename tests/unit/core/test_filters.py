@@ -16,9 +16,15 @@ from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.declared_fields import declared_spec
-from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.extensions.placement import PlacementPlugins, SelectedFilter
 from rosrm.model.devices import Device, DeviceNeed
-from rosrm.model.values import HostDescription, InstanceId, ProcessSpec, ResourceDescription
+from rosrm.model.values import (
+    HostDescription,
+    InstanceId,
+    Limits,
+    ProcessSpec,
+    ResourceDescription,
+)
 
 RESOURCES = ("memory", "cpu", "gpu")
 
@@ -51,6 +57,43 @@ rarely = st.sampled_from([False] * 7 + [True])
 usually = st.sampled_from([True] * 7 + [False])
 
 
+class Armed:
+    """Filter of a plugin by a label."""
+
+    def mask(self, hosts, process):
+        return ~hosts.labelled("arm", "no")
+
+    def reason(self, hosts, process, row):
+        return "it has no arm"
+
+
+class Idle:
+    """Filter of a plugin by what assignments change."""
+
+    def mask(self, hosts, process):
+        return hosts.processes < 2
+
+    def reason(self, hosts, process, row):
+        return f"it runs {hosts.processes[row]} processes"
+
+
+class Broken(Armed):
+    """Filter of a plugin that fails."""
+
+    def mask(self, hosts, process):
+        raise RuntimeError("out of order")
+
+
+filters_of_plugins = st.sampled_from(
+    [
+        (),
+        (SelectedFilter("armed", Armed(), permanent=True),),
+        (SelectedFilter("idle", Idle()), SelectedFilter("armed", Armed())),
+        (SelectedFilter("broken", Broken(), permanent=True),),
+    ]
+)
+
+
 @st.composite
 def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
     """Draw hosts in any state that the master may know."""
@@ -63,7 +106,10 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         described = draw(resources)
         description = HostDescription(
             name, number + 1, labels=draw(labels), resources=described,
-            max_processes=draw(st.sampled_from([0, 1, 2])), devices=draw(devices),
+            max_processes=draw(st.sampled_from([0, 1, 2])),
+            unenforced={"limits.cpu": "no group"} if draw(rarely) else {},
+            cpus=draw(st.sampled_from([(), (0, 1), (0, 1, 2, 3)])),
+            devices=draw(devices),
         )  # fmt: skip
         host = table.register(description, 0.0)
         column = host.column
@@ -86,6 +132,7 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
             table.hold(host, InstanceId("other", number), held or ())
         if draw(rarely):
             table.prune(host)
+    table.set_claims({0: draw(st.integers(0, 2))} if draw(rarely) else {})
     return table
 
 
@@ -95,13 +142,20 @@ def demands(draw: st.DrawFn) -> Demand:
     estimated = frozenset(name for name in needs if draw(st.booleans()))
     excluded = draw(st.dictionaries(st.sampled_from(["h0", "h1", "h2"]), st.just("no"), max_size=1))
     required = draw(labels) if draw(rarely) else {}
-    spec = ProcessSpec("p", command=("run",), required_labels=required, devices=draw(device_needs))
+    limits = Limits(cpu=1.0, enforce=draw(st.sampled_from(["preferred", "required"])))
+    spec = ProcessSpec(
+        "p", command=("run",), required_labels=required, limits=limits,
+        cpus=draw(st.sampled_from([(), (1,), (1, 3)])), priority=draw(st.integers(0, 2)),
+        devices=draw(device_needs),
+    )  # fmt: skip
     read = declared_spec(spec, ())  # a filter may read only what makes rankings differ
-    return Demand(read, needs, estimated, excluded, draw(st.sampled_from([0.0, 0.05])))
+    plugins = PlacementPlugins(filters=draw(filters_of_plugins))
+    headroom = draw(st.sampled_from([0.0, 0.05]))
+    return Demand(read, needs, estimated, excluded, headroom, plugins=plugins)
 
 
 def ranked(table: HostTable, demand: Demand) -> Ranking:
-    return Ranking(table, (), demand, PluginCalls())
+    return Ranking(table, demand)
 
 
 def test_no_two_filters_have_one_name() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
-from rosrm.extensions.declared_fields import STANDARD_FIELDS, Declared
+from rosrm.extensions.declared_fields import STANDARD_FIELDS
 from rosrm.model.values import ResourceDescription
 from tests.unit.core.cluster import Cluster, Eq1, Machine, node, process
 
@@ -79,7 +79,7 @@ BROKEN = [
     ),
     (
         by_name,
-        "'name' of the spec, which its offer does not declare: write ScoringOffer(..., reads=",
+        "'name' of the spec, which its offer does not declare: add reads=('name',) to the offer",
     ),
     (reads("name", ""), "UndeclaredField"),
     (reads("nmae"), "AttributeError: a spec has no field 'nmae'; it has name, namespace"),
@@ -202,7 +202,7 @@ def test_a_reason_that_raises_changes_no_decision() -> None:
 @pytest.mark.parametrize("batched", [True, False])
 def test_a_policy_scores_by_the_fields_that_it_declares(*, batched: bool) -> None:
     """The policy reads a field that its offer declares, for one process and for batches."""
-    cluster = three(policy=Policy(by_name), declared=Declared(reads=("name",)))
+    cluster = three(policy=Policy(by_name), reads=("name",))
     specs = [process(f"{group}_{n}") for n in range(2) for group in "cab"]
     for batch in [specs] if batched else [[spec] for spec in specs]:
         cluster.submit(*batch)
@@ -219,7 +219,7 @@ def test_declared_values_are_compared_with_their_types() -> None:
         seen.append(repr(process.spec.parameters["a"]))
         return Scores(hosts.column("memory"))
 
-    cluster = three(policy=Policy(look), declared=Declared(reads=("parameters",)))
+    cluster = three(policy=Policy(look), reads=("parameters",))
     cluster.submit(*(node(f"p{n}", parameters={"a": a}) for n, a in enumerate((1, 1.0, True))))
     assert set(seen) == {"1", "1.0", "True"}
 

@@ -31,6 +31,7 @@ from rosrm.model.values import (
     MigrationPolicy,
     ProcessSpec,
     Readiness,
+    ReschedulePolicy,
     RestartPolicy,
     SnapshotReport,
     StandbyPolicy,
@@ -99,7 +100,8 @@ def spec(
         needs={"memory": memory * MIB} if memory else {},
         required_labels={"arm": "yes"} if special else {},
         migration=migration or MigrationPolicy(), restart=restart, readiness=Readiness(timeout=4.0),
-        standby=standby,
+        standby=standby, reschedule=ReschedulePolicy(int(loss == "elsewhere"), 1.0),
+        time_limit=6.0 if kind == "job" and memory == 100 else 0.0,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
         devices=NEEDS[devices],
     )  # fmt: skip
@@ -118,15 +120,17 @@ class Play(RuleBasedStateMachine):
 
     @initialize(
         backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2), first=ways, second=ways,
-        loss=losses, devices=asked,
+        loss=losses, preemption=st.sampled_from(["move", "requeue", False]), rebalance=chance,
+        devices=asked,
     )  # fmt: skip
     def begin(
         self, backfill: bool, most: int, slots: int, first: str, second: str, loss: str,
-        devices: str,
+        preemption: str | bool, rebalance: bool, devices: str,
     ) -> None:  # fmt: skip
         self.cluster = Cluster(
             backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
             delivery_timeout=2.0, cooldown=2.0, hysteresis=0.4, order_retry=1.0,
+            preemption=preemption, rebalance=rebalance, rebalance_after=3.0, rebalance_spread=0.2,
             strategies={
                 "relaunch": StartFirstOrStopFirst(timeout=3.0),
                 "handoff": HandOver(timeout=3.0),
@@ -212,7 +216,7 @@ class Play(RuleBasedStateMachine):
             chosen = state.processes[assign.assignment.instance.process]
             for name in state.queue:
                 waits = state.processes[name]
-                if awaits_states(state, waits, self.cluster.now):
+                if awaits_states(state, waits, self.cluster.now) or name in state.queue.delayed:
                     continue
                 ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
                 alike = demand_of(state, waits).key == demand_of(state, chosen).key
@@ -848,11 +852,11 @@ class Play(RuleBasedStateMachine):
             if process.phase is ProcessPhase.FINISHED:
                 assert process.name in self.completed
             for host in process.excluded:
-                assert (process.name, host) in self.missing
+                assert (process.name, host) in self.missing or process.reschedules
             if process.phase is ProcessPhase.FAILED and not process.spec.ros:
                 missing = {name for name, _ in self.missing}
                 host_lost = process.spec.host_loss.then == "stop"
-                assert host_lost or process.name in self.failed | missing
+                assert host_lost or process.overdue or process.name in self.failed | missing
 
     def teardown(self) -> None:
         """Check that all processes reach their end once all faults are repaired."""

@@ -46,7 +46,7 @@ def cluster_with(capabilities: Capabilities, *machines: str | Machine) -> Cluste
     hook = hookimpl(specname="register_migration_strategies")(lambda: [offer])
     theirs = SimpleNamespace(register_migration_strategies=hook)
     registry = Registry.of(theirs=theirs, scoring=rosrm_scoring.plugin)
-    declared = registry.declared("weighted", {"teleport": {}})
+    declared = registry.declared({"teleport": {}})
     return Cluster(*machines, strategies={"teleport": Teleport()}, declared=declared)
 
 

@@ -58,8 +58,9 @@ def keys(kind: type, before: str = "") -> Iterator[str]:
         marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
         in_file = [mark.in_file() for mark in marks if hasattr(mark, "in_file")]
         members = get_args(hint) if get_origin(hint) is UnionType else ()
+        members = (*members, *(get_args(in_file[0]) if in_file else ()))
         optional = [one for one in members if is_dataclass(one)]
-        inner = (in_file or optional or [hint])[0]
+        inner = (optional or in_file or [hint])[0]
         if is_dataclass(inner):
             yield from keys(inner, f"{before}{f.name}.")
         else:
@@ -109,7 +110,8 @@ def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options)
 def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
-    wanted |= {"host_loss", "isolation", "standby", "health", "spread"}
+    wanted |= {"host_loss", "isolation", "standby", "health", "spread", "reschedule"}
+    wanted |= {"limits", "realtime"}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted
@@ -177,9 +179,11 @@ def test_every_field_of_an_offer_is_documented(offer):
 @pytest.mark.parametrize(
     ("offer", "kinds"),
     [
-        ("Probe", [contracts.Probe, contracts.ProbeContext, contracts.Sessions]),
+        ("Probe", [contracts.Probe, contracts.HostLabelling, contracts.ProbeContext,
+                   contracts.Sessions]),
         ("Scoring", [contracts.ScoringPolicy, contracts.HostView, contracts.ProcessView,
                      contracts.Scores]),
+        ("Filter", [contracts.PlacementFilter]),
         ("Migration", [contracts.MigrationStrategy, plan.Move, plan.Plan]),
         ("Checkpoint", [contracts.CheckpointPolicy, contracts.CheckpointView,
                         contracts.CheckpointChoice]),

@@ -13,6 +13,7 @@ import pytest
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
 from rosrm.extensions.contracts import (
     CheckpointOffer,
+    FilterOffer,
     MigrationOffer,
     ProbeContext,
     ProbeOffer,
@@ -20,6 +21,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.made import FailedProbe, Probes
+from rosrm.extensions.placement import SelectedFilter
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import Reading, ResourceDescription
 from tests.plugin_kit import plugin, registry_of
@@ -30,7 +32,7 @@ class Options:
     """Options of a plugin."""
 
     ratio: float = 0.5
-    score = propose = choose = None
+    score = propose = choose = mask = reason = None
 
 
 class Probe:
@@ -66,12 +68,16 @@ def test_each_kind_is_made_by_name_with_its_options():
         ScoringOffer("s", lambda options: options, Options),
         MigrationOffer("m", lambda options: options, Options),
         CheckpointOffer("c", lambda options: options, Options),
+        FilterOffer("f", lambda options: options, Options, reads=("name",), permanent=True),
     )
     assert registry.scoring("s", {"ratio": 1}) == Options(1.0)
+    assert registry.filters({"f": {"ratio": 1}}) == (
+        SelectedFilter("f", Options(1.0), permanent=True, reads=("name",)),
+    )
     assert registry.migrations({"m": {}}) == {"m": Options()}
     assert registry.checkpoint("c") == Options()
     assert registry.checkpoint(None) is None
-    kinds = ("checkpoint", "migration", "scoring")
+    kinds = ("checkpoint", "filter", "migration", "scoring")
     assert [(row.kind, row.state) for row in registry.rows()] == [(k, "selected") for k in kinds]
 
 
@@ -162,25 +168,6 @@ def test_a_resource_that_no_message_can_carry_is_refused(context, described, sai
     result = registry_of(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
     assert result.absent == {}
     assert f"Probe ({__file__}:{inspect.getsourcelines(Probe)[1]}) {said}" in failed(result)["a"]
-
-
-@pytest.mark.parametrize(
-    ("labels", "said"),
-    [
-        (["gpu"], "has `labels` of type list; a mapping is required"),
-        ({"gpu": 3}, "has the label 3; printable text is required"),
-        ({"gpu": "\x1b"}, "printable text is required"),
-    ],
-)
-def test_labels_that_no_host_can_have_are_refused(context, labels, said):
-    """The probe fails with its class and place; other labels are those of the host."""
-    probe = Probe("a")
-    probe.labels = labels
-    registry = registry_of(offered("a", lambda options, context: probe))
-    assert said in failed(registry.probes({"a": {}}, context))["a"]
-    probe.labels = {"gpu": "a model"}
-    (made,) = registry.probes({"a": {}}, context).made
-    assert made.labels == {"gpu": "a model"}
 
 
 def test_a_probe_reads_only_what_its_offer_declares(context):
@@ -359,6 +346,54 @@ def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_fails(context, se
     names = [resource.name for made in result.made for resource in made.resources]
     assert names == ["a", "b", *(f"r{i}" for i in range(14))]
     assert getattr(second, "closed", True)
+
+
+def labelled(labels):
+    probe = Probe("b")
+    probe.labels = labels
+    return probe
+
+
+def test_probes_label_their_host(context):
+    """The labels of all probes are joined; equal ones do not conflict."""
+    registry = registry_of(
+        offered("a", lambda options, context: Probe("a")),
+        offered("b", lambda options, context: labelled({"gpu.model": "A100", "floor": "2"})),
+        offered(
+            "c", lambda options, context: SimpleNamespace(
+                labels={"floor": "2"}, resources=Probe("c").resources, read=None, close=None
+            )
+        ),
+    )  # fmt: skip
+    result = registry.probes({"a": {}, "b": {}, "c": {}}, context)
+    assert result.labels == {"gpu.model": "A100", "floor": "2"}
+    assert failed(result) == {}
+
+
+@pytest.mark.parametrize(
+    ("labels", "said"),
+    [
+        (["x"], "has the labels ['x']; a mapping is required"),
+        ({"x": 1}, "has the label 'x': 1; printable text of at most 200"),
+        ({"": "x"}, "has the label '': 'x'; printable text of at most 200"),
+        ({"x": "a\nb"}, "printable text of at most 200"),
+        ({"x": "y" * 201}, "printable text of at most 200"),
+        ({str(n): "" for n in range(128)}, "exceeds the 128 labels"),
+        ({"floor": "3"}, "gives the label 'floor' another value than 'first'"),
+    ],
+)
+def test_a_probe_with_labels_that_cannot_be_taken_fails(context, labels, said):
+    """The host keeps the labels of its other probes."""
+    first, second = labelled({"floor": "2"}), labelled(labels)
+    first.resources = Probe("a").resources
+    registry = registry_of(
+        offered("first", lambda options, context: first, resources=("a",)),
+        offered("second", lambda options, context: second, resources=("b",)),
+    )
+    result = registry.probes({"first": {}, "second": {}}, context)
+    assert said in failed(result)["second"]
+    assert result.labels == {"floor": "2"}
+    assert second.closed
 
 
 def run(arguments):

@@ -18,10 +18,11 @@ REFUSED = {
     happened.HostRegistered, happened.SubmissionReceived, happened.CancelRequested,
     happened.RestartRequested, happened.MigrationRequested, happened.HostStateRequested,
     happened.CheckpointRequested, happened.RestoreRequested, happened.PruneRequested,
+    happened.RebalanceRequested, happened.ReloadRequested,
 }  # fmt: skip
 KEPT = {
     happened.HostLeft, happened.StatusesReceived, happened.OrderAnswered,
-    happened.HandoffReported, happened.AssignmentWithdrawn,
+    happened.HandoffReported, happened.AssignmentWithdrawn, happened.SettingsRead,
 }  # fmt: skip
 NEWEST = {happened.ProcessRequested, happened.SnapshotsReported, happened.KeyRevoked}
 DROPPED = {

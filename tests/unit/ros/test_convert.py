@@ -105,6 +105,7 @@ HOSTS = drawn(
     ).map(tuple),
     labels=st.dictionaries(PRINTABLE, PRINTABLE, max_size=3),
     absent=st.dictionaries(PRINTABLE, PRINTABLE, max_size=3),
+    unenforced=st.dictionaries(PRINTABLE, PRINTABLE, max_size=3),
     executors=st.lists(PRINTABLE, max_size=3).map(tuple),
     hostname=PRINTABLE, software_version=PRINTABLE,
 )  # fmt: skip
@@ -163,6 +164,8 @@ def test_rows_survive() -> None:
         "why",
         True,
         "user:ada",
+        1.5,
+        2**40,
     )
     plugin = PluginRow("probe", "gpu", "rosrm-resources 0.1", "absent", "no driver", "h")
     event = EventRow(2**40, 1.7e9, 12.5, "assigned", "a", "h", "a goes to h", {"n": [1, {"x": 2}]})
@@ -228,10 +231,21 @@ NONSENSE_IN_SPECS = {
     "a parameter too deep": lambda m: setattr(m, "parameters", value("[" * 100_000)),
     "migration options": lambda m: setattr(m.migration, "options", "[1]"),
     "options too deep": lambda m: setattr(m.migration, "options", '{"a":' * 100_000),
+    "a limit": lambda m: setattr(m.limits, "memory", NAN),
+    "an enforcement": lambda m: setattr(m.limits, "enforce", "maybe"),
+    "a policy": lambda m: setattr(m.realtime, "policy", "deadline"),
+    "a niceness": lambda m: setattr(m, "nice", 100),
+    "a CPU twice": lambda m: setattr(m, "cpus", [1, 1]),
     "a relation": lambda m: setattr(m, "neighbours", neighbour(relation="above")),
     "a rule about none": lambda m: setattr(m, "neighbours", neighbour(processes=[])),
     "a rule about both": lambda m: setattr(m, "neighbours", neighbour(group="g")),
     "a neighbour that is a path": lambda m: setattr(m, "neighbours", neighbour(processes=["../q"])),
+    "a flow to itself": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process=m.name)]),
+    "a flow to a path": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="../q")]),
+    "a flow that is no number": lambda m: setattr(
+        m, "talks_to", [msg.ProcessFlow(process="q", rate=float("nan"))]
+    ),
+    "many flows": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="q")] * 257),
     "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
     "a device of no kind": lambda m: setattr(m, "devices", asked(kind="")),
     "a share that is no number": lambda m: setattr(m, "devices", asked(amount=NAN)),

@@ -19,7 +19,7 @@ class Table:
         self.removed: list[tuple[int, float]] = []
         self.looks = 0
 
-    def add(self, leader: int) -> None:
+    def add(self, leader: int, group: object) -> None:
         self.leaders.append(leader)
 
     def remove(self, leader: int, cpu_time: float) -> None:
@@ -48,7 +48,7 @@ def told(state: InstanceState, pid: int = 0, cpu_time: float = 0.0) -> InstanceS
 
 def test_usage_is_reported_three_readings_after_its_measurement(table) -> None:
     """Each usage is reported once, and is not measured again before its report."""
-    watch = UsageWatch(table)
+    watch = UsageWatch(table, lambda _: None)
     watch.follow(told(InstanceState.RUNNING, 40))
     watch.look(1.0, {})
     watch.look(1.5, {})
@@ -59,7 +59,7 @@ def test_usage_is_reported_three_readings_after_its_measurement(table) -> None:
 
 def test_the_usage_of_a_session_is_that_of_its_processes(table) -> None:
     """A probe measures processes, of which a session may have several."""
-    watch = UsageWatch(table)
+    watch = UsageWatch(table, lambda _: None)
     watch.follow(told(InstanceState.RUNNING, 40))
     watch.look(1.0, {2: {40: 1.0, 41: 2.0, 50: 4.0}, 3: {}})
     *_, said = [watch.after_reading() for _ in range(3)]
@@ -68,14 +68,14 @@ def test_the_usage_of_a_session_is_that_of_its_processes(table) -> None:
 
 def test_nothing_is_looked_at_while_nothing_runs(table) -> None:
     """An idle host has no overhead."""
-    watch = UsageWatch(table)
+    watch = UsageWatch(table, lambda _: None)
     watch.look(1.0, {})
     assert (table.looks, watch.after_reading()) == (0, {})
 
 
 def test_a_session_is_followed_from_its_start_to_its_end(table) -> None:
     """A restart is a new session; an ended session hands over its CPU time."""
-    watch = UsageWatch(table)
+    watch = UsageWatch(table, lambda _: None)
     watch.follow(told(InstanceState.RUNNING, 40))
     watch.follow(told(InstanceState.BACKOFF, cpu_time=2.0))
     watch.follow(told(InstanceState.RUNNING, 41))
@@ -87,7 +87,7 @@ def test_a_session_is_followed_from_its_start_to_its_end(table) -> None:
 
 def test_one_that_was_never_seen_running_counts_too(table) -> None:
     """The process ended before the first look."""
-    watch = UsageWatch(table)
+    watch = UsageWatch(table, lambda _: None)
     watch.follow(told(InstanceState.STARTING))
     watch.follow(told(InstanceState.FAILED, 40, cpu_time=0.1))
     assert table.removed == [(40, 0.1)]
@@ -95,5 +95,5 @@ def test_one_that_was_never_seen_running_counts_too(table) -> None:
 
 def test_one_that_ended_before_this_slave_started_does_not_count(table) -> None:
     """The hours of CPU time of a recorded end are no present load."""
-    UsageWatch(table).follow(told(InstanceState.EXITED, cpu_time=3600.0))
+    UsageWatch(table, lambda _: None).follow(told(InstanceState.EXITED, cpu_time=3600.0))
     assert table.removed == []

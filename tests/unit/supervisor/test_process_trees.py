@@ -11,6 +11,7 @@ from rosrm.core.supervisor.instance import UNKNOWN_EXIT, Instance
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import RestartRule, StopRule
 from rosrm.supervisor import descriptors, procfs, takeover
+from rosrm.supervisor.instance_groups import InstanceGroups
 from rosrm.supervisor.instance_record import Recorded
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import Stat
@@ -28,7 +29,7 @@ def ended_leader() -> Stat:
 
 
 def trees(state: str, events: list[object]) -> ProcessTrees:
-    return ProcessTrees(state, selectors.DefaultSelector(), events.append)
+    return ProcessTrees(state, selectors.DefaultSelector(), events.append, InstanceGroups())
 
 
 def test_a_leader_that_ends_during_the_take_over_is_not_taken_over(tmp_path):

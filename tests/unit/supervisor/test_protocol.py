@@ -16,7 +16,7 @@ from rosrm.core.supervisor.events import (
     StatusStored,
     StopOrdered,
 )
-from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
+from rosrm.core.supervisor.rules import FenceRule, LimitRule, RestartRule, StopRule
 from rosrm.supervisor import json_lines as ls
 from rosrm.supervisor import messages
 from rosrm.supervisor.logs import LogLimits
@@ -35,6 +35,15 @@ RULES = st.builds(
     st.integers(0, 99),
     SECONDS,
 )
+LIMITS = st.builds(
+    LimitRule,
+    *[SECONDS] * 3,
+    st.lists(st.integers(0, 65_535), max_size=3).map(tuple),
+    st.sampled_from(["", "fifo", "rr"]),
+    st.integers(0, 99),
+    st.integers(-20, 19),
+    st.booleans(),
+)
 CHANGES = st.dictionaries(WORDS, st.none() | WORDS)
 ORDERS = st.one_of(
     st.builds(messages.Hello, WHOLE, WHOLE, st.just(LogLimits(1, 2, 3, 4, 5))),
@@ -51,6 +60,7 @@ ORDERS = st.one_of(
         st.text(),
         st.none() | st.builds(FenceRule, SECONDS, SECONDS, st.booleans()),
         SECONDS,
+        LIMITS,
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(FenceOrdered, KEYS),

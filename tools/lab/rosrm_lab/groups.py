@@ -2,7 +2,8 @@
 
 Each host has one group with three in it: `limited`, where its processes run within memory and CPU
 quota; `free`, for processes on the host outside its limits; and `own` for the lab's own processes:
-the first process, and the relays. (Version 2 requires processes in leaves only.)
+the first process, and the relays. Version 2 requires processes in leaves only, and a slave on the
+host makes groups for its processes below `limited`; so the processes there enter a group below it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from rosrm.errors import LabError
+from rosrm.runtime import cgroups
 from rosrm_lab.plan import PREFIX, HostPlan
 
 Leaf = Literal["limited", "free", "own"]
@@ -26,12 +28,6 @@ LEAVES: Final[tuple[Leaf, ...]] = ("limited", "free", "own")
 
 #: cpuacct: version 1 keeps the CPU time of a group there.
 _NEEDED: Final = ("memory", "cpu", "cpuacct")
-#: Seconds. Shorter than the kernel's 100 ms: a host that has used up its share is paused so shortly
-#: that ROS does not notice.
-_PERIOD: Final = 0.02
-_LONG_PERIOD: Final = 0.1
-#: Cores; below this the share of a short period is less than the least possible, a millisecond.
-_SHORT_ENOUGH: Final = 0.05
 #: Files that a kernel without swap, or without swap accounting, lacks.
 _ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
 #: Seconds for killed processes to leave their group, and for the kernel to release the group.
@@ -98,7 +94,7 @@ def make(hierarchies: Iterable[Hierarchy], lab: str, host: HostPlan) -> None:
     for hierarchy in hierarchies:
         try:
             for leaf in LEAVES:
-                _make_group(hierarchy, hierarchy.group(lab, host.name, leaf))
+                _make_group(hierarchy, _entered(hierarchy, lab, host.name, leaf))
             limited = hierarchy.group(lab, host.name, "limited")
             for name, value in limits(hierarchy, host):
                 if name not in _ABOUT_SWAP or (limited / name).exists():
@@ -117,8 +113,7 @@ def limits(hierarchy: Hierarchy, host: HostPlan) -> Iterator[tuple[str, str]]:
             yield "memory.max", str(host.memory)
             yield "memory.swap.max", "0"
     if "cpu" in hierarchy.controllers and host.cpu is not None:
-        period = _PERIOD if host.cpu >= _SHORT_ENOUGH else _LONG_PERIOD
-        quota, period_us = round(host.cpu * period * 1e6), round(period * 1e6)
+        quota, period_us = cgroups.cpu_quota(host.cpu)
         if hierarchy.version == 1:
             yield "cpu.cfs_period_us", str(period_us)
             yield "cpu.cfs_quota_us", str(quota)
@@ -128,7 +123,7 @@ def limits(hierarchy: Hierarchy, host: HostPlan) -> Iterator[tuple[str, str]]:
 
 def doors(hierarchies: Iterable[Hierarchy], lab: str, host: str, leaf: Leaf) -> list[Path]:
     """Return the files through which a process enters one of a host's groups."""
-    return [h.group(lab, host, leaf) / "cgroup.procs" for h in hierarchies]
+    return [_entered(h, lab, host, leaf) / "cgroup.procs" for h in hierarchies]
 
 
 def members(hierarchies: Iterable[Hierarchy], lab: str, host: str = "") -> set[int]:
@@ -231,6 +226,12 @@ def memory_left(hierarchies: Iterable[Hierarchy]) -> int | None:
     return None
 
 
+def _entered(hierarchy: Hierarchy, lab: str, host: str, leaf: Leaf) -> Path:
+    """Return the group that the processes of a leaf enter."""
+    group = hierarchy.group(lab, host, leaf)
+    return group / cgroups.AGENTS if (hierarchy.version, leaf) == (2, "limited") else group
+
+
 # --- helpers ----------------------------------------------------------------------------------
 
 
@@ -248,21 +249,13 @@ def _memory_used(hierarchy: Hierarchy, group: Path) -> int:
 
 def _mounted(root: Path) -> Iterator[tuple[int, Path, frozenset[str]]]:
     """Yield version, mount point and controllers of each hierarchy; version 1 first."""
-    found = []
-    for line in (root / "proc/self/mountinfo").read_text().splitlines():
-        before, _, after = line.partition(" - ")
-        kind, _, options = after.split(" ", 2)
-        if kind not in ("cgroup", "cgroup2"):
+    for mount in cgroups.mounts(str(root)):
+        if mount.version == 1:
+            yield 1, Path(mount.point), mount.controllers
             continue
-        inside = re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), before.split(" ")[4])
-        mount = root / inside.lstrip("/")
-        if kind == "cgroup":
-            found.append((1, mount, frozenset(options.split(","))))
-        else:
-            with contextlib.suppress(OSError):
-                names = (mount / "cgroup.controllers").read_text().split()
-                found.append((2, mount, frozenset(names)))
-    yield from sorted(found, key=lambda one: one[0])
+        with contextlib.suppress(OSError):
+            names = Path(mount.point, "cgroup.controllers").read_text().split()
+            yield 2, Path(mount.point), frozenset(names)
 
 
 def _make_group(hierarchy: Hierarchy, group: Path) -> None:

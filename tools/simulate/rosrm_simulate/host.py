@@ -23,7 +23,14 @@ from rosrm.core.slave import commands, events, reducer
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.devices import Device
-from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor, SetRestartPolicy
+from rosrm.model.orders import (
+    DropReplica,
+    MeasureLinks,
+    ReloadSettings,
+    ReplicateSnapshot,
+    RunExecutor,
+    SetRestartPolicy,
+)
 from rosrm.model.values import (
     EMPTY,
     MOST_USED,
@@ -148,6 +155,10 @@ class Host(ABC, Generic[ProgramT]):
         message = f"the simulation cannot carry out {order.executor!r}"
         return OrderAnswered(order_id, False, "failed", message)
 
+    def measure(self, order_id: OrderId, _order: MeasureLinks) -> OrderAnswered:
+        """Measure links, and answer; a simulated host does not."""
+        return OrderAnswered(order_id, False, "refused", "the simulation does not measure links")
+
     def replicate(self, order: ReplicateSnapshot | DropReplica) -> None:
         """Carry out an order about snapshots; here nodes publish none."""
 
@@ -265,8 +276,12 @@ class Host(ABC, Generic[ProgramT]):
         match order:
             case RunExecutor():
                 return self.execute(sent.order_id, order)
+            case MeasureLinks():
+                return self.measure(sent.order_id, order)
             case ReplicateSnapshot() | DropReplica():
                 self.replicate(order)
+            case ReloadSettings():
+                refusal = "a simulated host has no file"
             case SetRestartPolicy():
                 self._settled.clear()
                 self.tell(event_of(order), now)

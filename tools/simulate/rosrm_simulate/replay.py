@@ -12,10 +12,10 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.reducer import step
-from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.recording.encoding import Happened, decisions
 from rosrm.recording.reader import Recording
 from rosrm_simulate.meter import Meter, Outcome
@@ -62,9 +62,10 @@ class Replay:
 
 
 def replay(
-    recording: Recording, settings: CoreSettings, policy: NamedPolicy,
+    recording: Recording, settings: CoreSettings, placement: PlacementPlugins,
     strategies: Mapping[str, MigrationStrategy], watcher: Watcher | None = None,
     until: float = inf, *, declared: Declared | None = None,
+    chain_of: ChainOf | None = None,
 ) -> Replay:  # fmt: skip
     """Replay all events of a record in a core, at the same times.
 
@@ -74,15 +75,17 @@ def replay(
     Args:
         recording: of a master's run.
         settings: of the master's core.
-        policy: that orders the hosts, with its name.
+        placement: the policies and filters that judge hosts.
         strategies: by name.
         watcher: is called with each event and its commands.
         until: seconds from the beginning of the record: the run is measured up to here. All of it
             is replayed nonetheless.
-        declared: declarations of the offers of policy and strategies.
+        declared: declarations of the offers of the strategies.
+        chain_of: returns the scoring policies with other settings, after a reload; None: they stay.
     """
     header = recording.header
-    state = MasterState(settings, policy[0], policy[1], strategies, header.epoch, declared=declared)
+    state = MasterState(settings, placement, strategies, header.epoch, declared=declared)
+    state.chain_of = chain_of
     restore(state, lambda table: header.intents.get(table, {}), header.started)
     tail = header.intents.get("cluster", {}).get("tail")
     if tail is not None:

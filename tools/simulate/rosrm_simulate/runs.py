@@ -8,16 +8,18 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Final
 
 from rosrm.config.documents import Node
+from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import ClusterConfig
-from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.errors import ConfigError, RecordError
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.placement import PlacementPlugins
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Quantity
 from rosrm.recording.frames import is_record
@@ -203,9 +205,16 @@ def replay_record(
             f"{recording.header.software}): {fault}"
         ) from None
     extraction = Extraction(recording)
-    policy, strategies, declared = _plugins(config, registry)
+    placement, strategies, declared = _plugins(config, registry)
     replayed = replay(
-        recording, config.core(), policy, strategies, extraction.watch, until, declared=declared
+        recording,
+        config.core(),
+        placement,
+        strategies,
+        extraction.watch,
+        until,
+        declared=declared,
+        chain_of=partial(chain_of, registry),
     )
     return replayed, extraction.workload()
 
@@ -219,8 +228,8 @@ def run(
     """Simulate one variant of a workload."""
     if variant.hosts is not None:
         workload = workload.with_hosts(variant.hosts)
-    policy, strategies, declared = _plugins(variant.cluster, registry)
-    simulation = Simulation(workload, variant.cluster.core(), policy, strategies, declared)
+    placement, strategies, declared = _plugins(variant.cluster, registry)
+    simulation = Simulation(workload, variant.cluster.core(), placement, strategies, declared)
     began = time.perf_counter()
     outcome = simulation.run(None if shown is None else shown.named(variant.name))
     return SimulationRun(variant.name, len(workload.hosts), outcome, time.perf_counter() - began)
@@ -228,11 +237,9 @@ def run(
 
 def _plugins(
     config: ClusterConfig, registry: Registry
-) -> tuple[NamedPolicy, dict[str, MigrationStrategy], Declared]:
-    name = config.scoring.policy
-    policy = registry.scoring(name, config.scoring.options)
+) -> tuple[PlacementPlugins, dict[str, MigrationStrategy], Declared]:
     chosen = config.migration.strategies
-    return (name, policy), registry.migrations(chosen), registry.declared(name, chosen)
+    return placement_of(config, registry), registry.migrations(chosen), registry.declared(chosen)
 
 
 class Shown:

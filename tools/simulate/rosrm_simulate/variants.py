@@ -18,7 +18,10 @@ from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Quantity
 
 #: Sections of a cluster's settings that a variant can change.
-SECTIONS: Final = ("scoring", "migration", "queue", "defaults", "liveness", "delivery_timeout")
+SECTIONS: Final = (
+    "scoring", "filters", "migration", "queue", "rebalance", "defaults", "liveness",
+    "delivery_timeout",
+)  # fmt: skip
 _OF_A_VARIANT: Final = ("name", "hosts", *SECTIONS)
 
 

@@ -21,12 +21,28 @@ from rosrm.config.process import Labels, LabelsInFile, MigrationInFile
 from rosrm.config.rules import check_amounts, check_name, refuse_namesakes
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
-from rosrm.extensions.units import Amount, Count, Fraction, PositiveSeconds, Quantity, Seconds
+from rosrm.extensions.units import (
+    Amount,
+    ByteRate,
+    Count,
+    Fraction,
+    PositiveByteRate,
+    PositiveSeconds,
+    Quantity,
+    Seconds,
+)
 from rosrm.model.devices import DeviceNeed, device_fault, need_fault
 from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
 from rosrm.wording import counted
 from rosrm_simulate.variants import Variant, check_keys, load_variants, text_of, variants_of
-from rosrm_simulate.workload import Curve, Model, ProcessPlan, SimulatedHost, Workload
+from rosrm_simulate.workload import (
+    Curve,
+    Model,
+    ProcessPlan,
+    SimulatedHost,
+    SimulatedLink,
+    Workload,
+)
 
 _MODEL: Final = Model()
 _UNITS: Final = {"memory": "B", "cpu": "core", "disk": "B"}
@@ -79,6 +95,19 @@ class ModelInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkInFile:
+    """Network interface of a host."""
+
+    rate: PositiveByteRate
+    round_trip: Seconds = 0.0
+    limit: Fraction = 1.0
+
+    def simulated(self) -> SimulatedLink:
+        """Return the link of a simulated host."""
+        return SimulatedLink(self.rate, self.round_trip, self.limit)
+
+
+@dataclass(frozen=True, slots=True)
 class HostInFile:
     """One host."""
 
@@ -93,6 +122,7 @@ class HostInFile:
     joins: Seconds = 0.0
     leaves: Seconds | None = None
     lost: bool = False
+    link: LinkInFile | None = None
     devices: OfferedByKind = field(default_factory=dict)
 
 
@@ -117,6 +147,7 @@ class ProcessPlanInFile:
     labels: LabelsInFile = field(default_factory=LabelsInFile)
     devices: AskedByKind = field(default_factory=dict)
     migration: MigrationInFile = field(default_factory=MigrationInFile)
+    talks_to: Mapping[str, ByteRate] = field(default_factory=dict)
 
     def devices_asked(self) -> tuple[DeviceNeed, ...]:
         """Return the devices that the process asks for."""
@@ -253,6 +284,7 @@ def _host(node: Node, problems: Problems) -> SimulatedHost | None:
     return SimulatedHost(
         host.name, resources, {**_LIMITS, **host.limits}, host.labels, host.max_processes,
         host.busy, host.joins, inf if host.leaves is None else host.leaves, host.lost,
+        host.link.simulated() if host.link is not None else None,
         devices,
     )  # fmt: skip
 
@@ -301,6 +333,7 @@ def _spec(given: ProcessPlanInFile, needs: Mapping[str, float]) -> ProcessSpec:
         avoided_labels=given.labels.avoided, priority=given.priority,
         migration=MigrationPolicy(migration.strategy, migration.overlap, migration.options),
         devices=given.devices_asked(),
+        talks_to=given.talks_to,
     )  # fmt: skip
 
 

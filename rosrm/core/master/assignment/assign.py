@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
+from functools import reduce
 from math import inf
 from typing import Any, Final
 
 import numpy as np
 
+from rosrm.core.master.assignment.flows import joined, traffic_of
 from rosrm.core.master.assignment.neighbours import (
     awaited_neighbour,
     neighbours_of,
@@ -44,23 +46,24 @@ _FIRST_REQUEST: Final = 1.0
 def demand_of(state: MasterState, process: Process) -> Demand:
     """Return the demand of a process.
 
-    A change of the learned needs, of the hosts with a replica of its snapshot, or of the hosts of
-    its neighbours rebuilds it.
+    A change of the learned needs, of the hosts with a replica of its snapshot, of the hosts of its
+    neighbours, or of its flows rebuilds it.
     """
     version = state.learned.version
     near = state.replication.replicas.hosts_of(process.name, process.born)
-    neighbours = neighbours_of(state, process)
+    neighbours, traffic = neighbours_of(state, process), traffic_of(state, process)
     known = process.demand
     if (
         known is None
         or known[0] != version
         or known[1].near != near
         or known[1].neighbours != neighbours
+        or known[1].traffic != traffic
     ):
         needs = state.estimate(process.spec)
         demand = Demand(
             process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
-            neighbours=neighbours, reads=state.declared.reads,
+            neighbours=neighbours, traffic=traffic, plugins=state.placement,
         )  # fmt: skip
         # Equal processes share one demand, because thousands of them may wait.
         known = process.demand = (version, state.demands.setdefault(demand.key, demand))
@@ -84,7 +87,8 @@ def demand_to_move(
     amounts, guessed = demand_amounts(state, process, measured_need(state, seen))
     return Demand(
         process.spec, amounts, guessed, excluded, headroom,
-        neighbours=neighbours_of(state, process, together=together), reads=state.declared.reads,
+        neighbours=neighbours_of(state, process, together=together),
+        traffic=traffic_of(state, process, together=together), plugins=state.placement,
     )  # fmt: skip
 
 
@@ -97,7 +101,8 @@ def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, f
     """Return the demand of a process on the host of its image, where it is to be restored."""
     return Demand(
         process.spec, *demand_amounts(state, process, seen),
-        neighbours=neighbours_of(state, process), reads=state.declared.reads,
+        neighbours=neighbours_of(state, process), traffic=traffic_of(state, process),
+        plugins=state.placement,
     )  # fmt: skip
 
 
@@ -141,6 +146,7 @@ def joint_demand(state: MasterState, demands: Mapping[str, Demand]) -> Demand:
     return replace(
         demand, amounts=amounts, estimated=frozenset(amounts) - declared, excluded=excluded,
         spec=replace(demand.spec, devices=devices),
+        traffic=reduce(joined, (one.traffic for one in demands.values())),
     )  # fmt: skip
 
 
@@ -163,12 +169,12 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
     ranking = state.rankings.get(demand.key)
     if ranking is not None:
         ranking.refresh()
-    elif demand.neighbours:
+    elif demand.key[1]:
         alone = state.rankings.get((demand.key[0], ()))
-        alone = ranking_of(state, alone.demand if alone else replace(demand, neighbours=()))
+        alone = ranking_of(state, alone.demand if alone else demand.alone())
         ranking = state.rankings[demand.key] = alone.beside(demand)
     else:
-        ranking = Ranking(state.hosts, state.policies, demand, state.plugins)
+        ranking = Ranking(state.hosts, demand)
         state.rankings[demand.key] = ranking
     return ranking
 
@@ -233,13 +239,26 @@ def _first_request_awaited(state: MasterState, now: float) -> str:
 
 
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
-    """Return the processes that wait for a snapshot and do not block those behind them."""
+    """Return the processes that wait for a time or snapshot, and do not block those behind them."""
+    delayed = _delayed(state, now)
     if not np.isin(state.hosts.condition, _AWAY).any():
-        return frozenset()
+        return delayed
     names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
     for name in names:
         _record_wait_reason(state, state.processes[name], _AWAITS_SNAPSHOT, now)
-    return frozenset(names)
+    return delayed.union(names)
+
+
+def _delayed(state: MasterState, now: float) -> frozenset[str]:
+    """Return the processes that wait for the end of their delay."""
+    for name in list(state.queue.delayed):
+        process = state.processes[name]
+        if now >= process.placed_from:
+            state.queue.delayed.remove(name)
+            continue
+        why = f"it is placed on another host after {process.queue_delay:g} s"
+        _record_wait_reason(state, process, why, now)
+    return frozenset(state.queue.delayed)
 
 
 def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
@@ -314,8 +333,10 @@ def _decide_jointly(
     names = {process.name, *(one.name for one in tied)}
     demands = {process.name: ranking.demand}
     for one in tied:
-        neighbours = neighbours_of(state, one, together=names)
-        demands[one.name] = replace(demand_of(state, one), neighbours=neighbours)
+        demands[one.name] = replace(
+            demand_of(state, one), neighbours=neighbours_of(state, one, together=names),
+            traffic=traffic_of(state, one, together=names),
+        )  # fmt: skip
     joint = ranking_of(state, joint_demand(state, demands))
     return decide(joint) if joint.best() >= 0 else None
 
@@ -330,6 +351,7 @@ def _assign(
     state.reserve(instance, host, now, ranking)
     ranking.note_assignment()
     process.owner, process.left_behind, process.exit_code = instance.number, None, None
+    process.queue_delay = 0.0
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     devices = [str(one) for one in state.instances[instance.number].devices]
@@ -403,7 +425,9 @@ def _record_waiting(state: MasterState, process: Process, demand: Demand, now: f
     if not state.hosts.listed():
         _record_wait_reason(state, process, "no host has registered yet", now)
         return
-    reason = why_all_away(state.hosts, demand) or "no host can take it now"
+    room = state.preemption.room_made.get(process.name)
+    made = room.reason if room is not None and room.host is not None else ""
+    reason = why_all_away(state.hosts, demand) or made or "no host can take it now"
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _record_wait_reason(state, process, reason, now, {"decision": process.decision})

@@ -53,8 +53,10 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         raise _refusal(state, event, taken, "name_taken", now)
     is_new = known is None or known.pruned
     host = state.hosts.register(description, now)
+    state.link_queries.begin(host.name, now)
     host.failing.clear()  # the slave reports the plugins that fail in this run
     state.ahead_since.pop(host.column, None)
+    state.rebalancing.joined_at = now
     if is_new:
         save_host(state, host)
     state.record(
@@ -135,6 +137,12 @@ def _registered_again(
     state.hosts.last_contact[host.column] = now
     note_devices(state, host, event.description.devices, now)
     replication.note_states(state, host, event.snapshots, now)
+    if state.hosts.redescribe(host, event.description):
+        labels = dict(host.description.labels)
+        shown = ", ".join(f"{key}={value}" for key, value in labels.items()) or "none"
+        message = f"{host.name} has other labels: {shown}"
+        state.record(now, EventKind.HOST_CHANGED, message, host=host.name, facts={"labels": labels})
+        reconsider_set_aside(state, now)
     condition = state.hosts.condition_of(host)
     if condition in (HostCondition.LOST, HostCondition.SUSPECT):
         mark_up(state, host, now)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import Final
 
@@ -185,6 +186,38 @@ def try_move(
     Returns:
         None; or the reason why the process cannot be moved, and nothing has changed.
     """
+    planned = plan_moves(state, process, cause, now, headroom=headroom, host=host)
+    if isinstance(planned, Rejected):
+        return planned
+    begin_moves(state, planned, now)
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedMoves:
+    """The move of a process, with the moves of those that must stay on one host with it.
+
+    Attributes:
+        steps: for each process its migration, its own ranking, and the ranking that chose the host.
+    """
+
+    destination: Host
+    steps: tuple[tuple[Process, Migration, Ranking, Ranking], ...]
+
+
+def begin_moves(state: MasterState, planned: PlannedMoves, now: float) -> None:
+    """Begin planned moves."""
+    for process, migration, own, judged in planned.steps:
+        decision = decide(judged, chosen=planned.destination.column)
+        begin_move(state, process, migration, own, now)
+        state.note_decision(process, decision, "migrated", now)
+
+
+def plan_moves(
+    state: MasterState, process: Process, cause: str, now: float, *, headroom: float = 0.0,
+    host: Host | None = None,
+) -> PlannedMoves | Rejected:  # fmt: skip
+    """Plan the move of a process as `try_move` does; return the reason if it cannot be moved."""
     moving = [process, *running_with(state, process)]
     refusal = why_immovable(state, process) or _why_bound(state, moving)
     if refusal:
@@ -208,12 +241,11 @@ def try_move(
         if host is not None or not hosts:
             return Rejected(why)
         lacking.update(dict.fromkeys(hosts, shared))
-    for one, migration in zip(moving, migrations, strict=True):
-        judged = ranking if one is process else rankings[one.name]
-        decision = decide(judged, chosen=destination.column)
-        begin_move(state, one, migration, rankings[one.name], now)
-        state.note_decision(one, decision, "migrated", now)
-    return None
+    steps = [
+        (one, migration, rankings[one.name], ranking if one is process else rankings[one.name])
+        for one, migration in zip(moving, migrations, strict=True)
+    ]
+    return PlannedMoves(destination, tuple(steps))
 
 
 def _why_bound(state: MasterState, moving: Sequence[Process]) -> str:
@@ -356,7 +388,8 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
     lasting = {**process.excluded, source.name: "it is there"}
     measured = measured_need(state, instance.measured)
     amounts, estimated = demand_amounts(state, process, measured)
-    possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
+    demand = Demand(process.spec, amounts, estimated, lasting, plugins=state.placement)
+    possible = may_ever_take(state.hosts, demand)
     if any(possible[host.column] for host in state.hosts.listed() if host is not source):
         return ""
     if _is_alone(state, source):

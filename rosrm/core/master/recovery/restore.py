@@ -6,7 +6,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rosrm.core.master.checkpoint import images
-from rosrm.core.master.lifecycle import adopt_to_stop, note_awaited_ends, note_phase
+from rosrm.core.master.lifecycle import (
+    adopt_to_stop,
+    cancelled_as,
+    note_awaited_ends,
+    note_phase,
+)
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state import migration
@@ -69,6 +74,8 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
         left_behind=from_plain(LeftBehind, left) if left else None,
         **fields_from_plain(Process, item, processes.JOURNALED),
     )  # fmt: skip
+    if process.began:
+        process.started_at = now - max(0.0, state.wall - process.began)
     if not phase.is_terminal:
         process.exit_code = None
     state.add_process(process)
@@ -78,7 +85,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
 
 def _restore_place(state: MasterState, process: Process, now: float) -> None:
     if process.phase is ProcessPhase.QUEUED:
-        state.queue.add(process.name, process.spec.priority, process.order)
+        state.put_in_queue(process)
     elif process.phase is ProcessPhase.SET_ASIDE:
         state.set_aside.add(process.name)
     elif process.image is not None:
@@ -121,7 +128,8 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
             process.wanted = DesiredState.REQUEUE
         note_awaited_ends(state, process, now)
     elif process.wanted is DesiredState.CANCEL:
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        phase, reason = cancelled_as(process)
+        state.set_phase(process, phase, now, reason)
     else:
         state.enqueue(process, now, "no instance of it was left when the master started")
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from rosrm.core.master.scheduling.traffic import flow_view
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.extensions.link_views import FlowView
+from rosrm.model.values import EMPTY, ProcessSpec
 
 Columns = slice | IntArray
 
@@ -32,7 +36,10 @@ class Candidates:
         sets: (n,) number of further processes of this demand for which the host has devices; at
             most COUNTED.
         more: (n,) number of processes of this demand that were added to each host; None: none.
+        flows: flows of the process on each host; None: it has none, or no policy reads them.
         empty: True if the arrays are those of hosts without processes.
+        tenants: (n,) name to spec of each process on the host; None: as the table has them now.
+        tenants_read: True if a plugin has read which processes run on one of the hosts.
     """
 
     table: HostTable
@@ -47,10 +54,25 @@ class Candidates:
     inventories: list[Inventory]
     sets: IntArray | None = None
     more: IntArray | None = None
+    flows: FlowView | None = None
     empty: bool = False
+    tenants: tuple[Mapping[str, ProcessSpec], ...] | None = None
+    tenants_read: bool = False
 
     def __len__(self) -> int:
         return len(self.processes)
+
+    def tenants_of(self, row: int) -> Mapping[str, ProcessSpec]:
+        """Return name to spec of each process with an instance on the host of a row."""
+        if self.tenants is not None:
+            return self.tenants[row]
+        if self.empty:
+            return EMPTY
+        return dict(self.host(row).instances.values())
+
+    def keep_tenants(self) -> None:
+        """Copy the current processes of each host, because they change before they are read."""
+        self.tenants = tuple(map(self.tenants_of, range(len(self))))
 
     def host(self, row: int) -> Host:
         """Return the host of a row."""
@@ -78,11 +100,19 @@ def candidates(
         table=table, demand=demand, columns=columns, resources=table.resources, need=need,
         cells=cells, busy=busy, processes=processes, bound=table.bound[columns],
         inventories=table.devices.at(columns), more=more,
+        flows=_flows(table, demand, columns),
     )  # fmt: skip
     if demand.spec.devices:
         sets = table.devices.counts(demand.spec.devices)[columns]
         hosts.sets = sets if more is None else sets - more
     return hosts
+
+
+def _flows(table: HostTable, demand: Demand, columns: Columns) -> FlowView | None:
+    if not demand.traffic.flows or not demand.scores_flows:
+        return None
+    at = np.arange(len(table))[columns] if isinstance(columns, slice) else columns
+    return flow_view(table.links, demand.traffic, at)
 
 
 def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:

@@ -16,16 +16,19 @@ from rosrm.core.master.scheduling.candidates import Candidates, candidates
 from rosrm.core.master.scheduling.filters import BY_ASSIGNMENT, Refusal, first_of, refusals
 from rosrm.core.master.scheduling.host_views import host_view, process_view
 from rosrm.core.master.scheduling.proximity import unmet
-from rosrm.core.master.scheduling.ranking import TIE, NamedPolicy, Ranking
+from rosrm.core.master.scheduling.ranking import TIE, Ranking
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.lazy import Lazy
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Scores
+from rosrm.extensions.placement import ScoringLink
 from rosrm.extensions.plugin_calls import PluginCalls, required
 from rosrm.model.values import EMPTY
 
 #: Largest number of hosts that an explanation names all; of more, it names the best fitting ones.
 _NAMED_HOSTS: Final = 16
+#: Reason against a host if a plugin has failed, or gives another answer, since the decision.
+_NO_REASON: Final = "a plugin refused it that gives no reason now; see `rosrm plugins`"
 #: Kind of a decision; "": not set yet.
 DecisionKind = Literal["", "assigned", "set_aside", "waits", "migrated"]
 
@@ -50,35 +53,58 @@ class Verdict:
         }  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """The part of one policy in the scores of a decision; `scores` None: the policy failed."""
+
+    link: ScoringLink
+    scores: Scores | None
+    plugins: PluginCalls
+
+    def vetoes(self, at: int) -> bool:
+        """Return True if the policy vetoes a host."""
+        return (
+            self.scores is not None and self.scores.veto is not None and bool(self.scores.veto[at])
+        )
+
+    def reason(self, at: int, *, veto: bool) -> str:
+        """Return the policy's own reason, or a note that the policy failed."""
+        if self.scores is None:
+            return ""
+        ask = self.scores.veto_reason if veto else self.scores.reason
+        hook = "veto_reason" if veto else "reason"
+        try:
+            return self.plugins.ask("scoring", self.link.name, hook, lambda: str(ask(at)))
+        except PluginError as error:
+            return f"(no reason, because the policy failed: {error})"
+
+
 @dataclass(slots=True)  # not frozen, because that costs 1 µs for each of thousands
 class Moment:
     """Copies of the values of n hosts at the time of a decision.
 
     Attributes:
-        plugins: guards the calls of the policy.
-        hosts: with copies of the arrays that assignments change.
+        judges: the scoring policies that decided.
+        hosts: with copies of all that assignments change.
         value: (n,) score plus tie-break; inf where the host did not fit.
         standing: for each host the first failed filter that assignments do not change.
     """
 
-    policy: NamedPolicy | None
-    plugins: PluginCalls
+    judges: tuple[ScoringLink, ...]
     hosts: Candidates
     value: FloatArray
     standing: tuple[Refusal | None, ...]
 
-    def scores(self) -> Scores | None:
-        """Return the policy's scores again, for their reasons (a policy is pure); None: none."""
-        if self.policy is None or not len(self.hosts):
-            return None
-        name, policy = self.policy
-        hosts, process = host_view(self.hosts), process_view(self.hosts)
-        try:
-            return self.plugins.ask(
-                "scoring", name, "score", lambda: required(policy.score(hosts, process), Scores)
-            )
-        except PluginError:
-            return None  # the decision itself does not need the reasons
+    def parts(self) -> list[Part]:
+        """Return the scores of each policy again, for their reasons (a policy is pure)."""
+        if not len(self.hosts):
+            return []
+        return [Part(link, _scores_of(link, self.hosts), self.plugins) for link in self.judges]
+
+    @property
+    def plugins(self) -> PluginCalls:
+        """Return the guard of the calls of plugins."""
+        return self.hosts.demand.plugins.calls
 
     def refusals(self) -> list[Refusal | None]:
         """Return for each host the first filter that it failed."""
@@ -169,38 +195,57 @@ def _moment(ranking: Ranking, columns: list[int]) -> Moment:
     value = ranking.value[at]
     some_fail = np.inf in value.tolist()
     standing = ranking.standing_refusals(columns) if some_fail else (None,) * len(columns)
-    return Moment(ranking.judge, ranking.plugins, hosts, value, standing)
+    if ranking.reads_tenants:
+        hosts.keep_tenants()
+    return Moment(ranking.judges, hosts, value, standing)
 
 
 def _verdicts(moment: Moment, *, chosen: bool) -> tuple[Verdict, ...]:
     """Return the verdicts on the hosts of a moment; `chosen`: the first host was chosen."""
-    scores, refused = moment.scores(), moment.refusals()
+    parts, refused = moment.parts(), moment.refusals()
     return tuple(
-        _verdict(moment, scores, refused[at], at, chosen=chosen and at == 0)
+        _verdict(moment, parts, refused[at], at, chosen=chosen and at == 0)
         for at in range(len(moment.hosts))
     )
 
 
 def _verdict(
-    moment: Moment, scores: Scores | None, refused: Refusal | None, at: int, *, chosen: bool
+    moment: Moment, parts: Sequence[Part], refused: Refusal | None, at: int, *, chosen: bool
 ) -> Verdict:
     name, value = moment.hosts.host(at).name, float(moment.value[at])
     if value < np.inf:
         score = value - TIE * float(moment.hosts.processes[at])
-        reason = _policy_reason(moment, scores, at, veto=False)
-        reason = "; ".join(filter(None, (reason, unmet(moment.hosts, at))))
+        reason = "; ".join(filter(None, (_sum(parts, at), unmet(moment.hosts, at))))
         return Verdict(name, "chosen" if chosen else "fits", score, reason)
     if refused is not None:
         return Verdict(name, refused.filter.verdict, None, refused.reason)
-    return Verdict(name, "vetoed", None, _policy_reason(moment, scores, at, veto=True))
+    return Verdict(name, "vetoed", None, _vetoes(parts, at) or _NO_REASON)
 
 
-def _policy_reason(moment: Moment, scores: Scores | None, at: int, *, veto: bool) -> str:
-    """Return the policy's own reason, or a note that the policy failed."""
-    if scores is None or moment.policy is None:
-        return ""
-    hook, reason = ("veto_reason", scores.veto_reason) if veto else ("reason", scores.reason)
+def _sum(parts: Sequence[Part], at: int) -> str:
+    """Return the reasons for the score of a host; of a chain with the score of each policy."""
+    if len(parts) == 1 and parts[0].link.weight == 1.0:
+        return parts[0].reason(at, veto=False)
+    return " + ".join(
+        f"{part.link} {part.scores.value[at]:.3f} ({part.reason(at, veto=False)})"
+        for part in parts
+        if part.scores is not None
+    )
+
+
+def _vetoes(parts: Sequence[Part], at: int) -> str:
+    """Return the reason of each veto on a host; of a chain with the name of the policy."""
+    vetoes = [part for part in parts if part.vetoes(at)]
+    if len(parts) == 1:
+        return "".join(part.reason(at, veto=True) for part in vetoes)
+    return "; ".join(f"{part.link.name}: {part.reason(at, veto=True)}" for part in vetoes)
+
+
+def _scores_of(link: ScoringLink, hosts: Candidates) -> Scores | None:
+    views = host_view(hosts), process_view(hosts, link.reads)
     try:
-        return moment.plugins.ask("scoring", moment.policy[0], hook, lambda: str(reason(at)))
-    except PluginError as error:
-        return f"(no reason, because the policy failed: {error})"
+        return hosts.demand.plugins.calls.ask(
+            "scoring", link.name, "score", lambda: required(link.policy.score(*views), Scores)
+        )
+    except PluginError:
+        return None  # the decision itself does not need the reasons

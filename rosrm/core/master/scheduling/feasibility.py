@@ -11,6 +11,7 @@ from rosrm.core.master.scheduling.candidates import Candidates, as_if_empty
 from rosrm.core.master.scheduling.filters import (
     EXCLUSION,
     FILTERS,
+    LINKS,
     NEIGHBOURS,
     Filter,
     Lasts,
@@ -55,7 +56,7 @@ def refused_everywhere(table: HostTable, demand: Demand) -> bool:
     """Return True if every host that might have taken the process has refused it."""
     if not demand.excluded:
         return False
-    allowed = Demand(demand.spec, demand.amounts, demand.estimated)
+    allowed = Demand(demand.spec, demand.amounts, demand.estimated, plugins=demand.plugins)
     might = may_ever_take(table, allowed)
     return all(table.hosts[column].name in demand.excluded for column in np.flatnonzero(might))
 
@@ -88,7 +89,7 @@ def _fit_empty(hosts: Candidates) -> BoolArray:
 def _possible(table: HostTable, demand: Demand) -> BoolArray:
     """Return a mask, (H,), of the hosts that may take a demand before a lasting change."""
     hosts = _every(table, demand)
-    possible = _fit_empty(hosts) & passing([EXCLUSION, NEIGHBOURS], hosts)
+    possible = _fit_empty(hosts) & passing([EXCLUSION, NEIGHBOURS, LINKS], hosts)
     there = passing(_AWAY, hosts)
     return possible & there if there.any() else possible
 

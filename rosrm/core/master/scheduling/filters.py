@@ -1,7 +1,8 @@
 """Placement filters: the rules by which hosts may take a process, with the reasons against a host.
 
 `FILTERS` is the complete list. Each entry has a mask over many hosts, which a ranking reads, and
-the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
+the reason against one host, which `rosrm explain` prints. A new rule is one more entry. The last
+entry stands for the filters of plugins.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from typing import Final, Literal
 
 import numpy as np
 
-from rosrm.core.master.scheduling import proximity
+from rosrm.core.master.scheduling import plugin_filters, proximity
 from rosrm.core.master.scheduling.candidates import Candidates
+from rosrm.core.master.scheduling.traffic import flow_view, keeping_limits
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
 from rosrm.core.master.state.hosts import HostCondition
-from rosrm.wording import amount, counted
+from rosrm.wording import amount, by_reason, counted, listed
 
 #: Tolerance in comparisons of sums of fractions.
 _CLOSE: Final = 1e-9
@@ -47,7 +49,7 @@ class Filter:
             the limiting setting if there is one. Called only for rows where `mask` is False.
         lasts: how long a host fails the filter. A process is set aside, and does not block the
             queue, if each host fails a permanent filter even as an empty host, or a rule on
-            neighbours. A host that is away counts as failing, unless all hosts are away.
+            neighbours or links. A host that is away counts as failing, unless all hosts are away.
         by_assignment: True if an assignment changes the mask. Mask and reason then may read only
             the demand and the arrays of the candidates, because a decision copies those alone and
             formats the reason later.
@@ -148,6 +150,28 @@ def _why_no_resources(hosts: Candidates, row: int) -> str:
     return f"it has no {min(hosts.demand.declared - there)}"
 
 
+def _can_enforce(hosts: Candidates) -> BoolArray | None:
+    required, cpus = _to_enforce(hosts)
+    if not required and not cpus:
+        return None
+    return hosts.table.enforcing(required, cpus)[hosts.columns]
+
+
+def _why_not_enforced(hosts: Candidates, row: int) -> str:
+    own, (required, cpus) = hosts.host(row).description, _to_enforce(hosts)
+    lacking = [str(number) for number in cpus if own.cpus and number not in own.cpus]
+    if lacking:
+        return f"it has no CPU {listed(lacking)}; it has {listed(map(str, own.cpus))}"
+    faults = ((name, own.unenforced[name]) for name in required if name in own.unenforced)
+    return f"it cannot enforce {by_reason(faults)}"
+
+
+def _to_enforce(hosts: Candidates) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Return the settings that a host must be able to enforce, and the CPUs that it must have."""
+    spec = hosts.demand.spec
+    return (spec.enforcement if spec.limits.enforce == "required" else ()), spec.cpus
+
+
 # --- neighbours -------------------------------------------------------------------------------
 
 
@@ -163,6 +187,21 @@ def _why_not_kept(hosts: Candidates, row: int) -> str:
         for rule in hosts.demand.neighbours
         if not rule.prefer and not proximity.keeping(hosts.table, rule)[column]
     )
+
+
+# --- links of the host ------------------------------------------------------------------------
+
+
+def _keeps_link_limits(hosts: Candidates) -> BoolArray | None:
+    table = hosts.table
+    kept = keeping_limits(table.links, hosts.demand.traffic, len(table), empty=hosts.empty)
+    return None if kept is None else kept[hosts.columns]
+
+
+def _why_over_link(hosts: Candidates, row: int) -> str:
+    column = np.array([hosts.host(row).column])
+    view = flow_view(hosts.table.links, hosts.demand.traffic, column, empty=hosts.empty)
+    return view.describe(0, int(view.is_over()[0].argmax()))
 
 
 # --- presence of the host ---------------------------------------------------------------------
@@ -228,6 +267,20 @@ def _why_not_asked(_hosts: Candidates, _row: int) -> str:
     return "it has not requested work yet"
 
 
+def _is_unclaimed(hosts: Candidates) -> BoolArray | None:
+    claims, priority = hosts.table.claims, hosts.demand.spec.priority
+    if not claims:
+        return None
+    allowed = np.ones(len(hosts.table), np.bool_)
+    allowed[[column for column, claimed in claims.items() if priority < claimed]] = False
+    return allowed[hosts.columns]
+
+
+def _why_claimed(hosts: Candidates, row: int) -> str:
+    claimed = hosts.table.claims[hosts.host(row).column]
+    return f"room is being made there for a process of priority {claimed}"
+
+
 # --- filters that an assignment changes -------------------------------------------------------
 
 
@@ -277,12 +330,15 @@ def _why_no_room(hosts: Candidates, row: int) -> str:
 
 EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
 NEIGHBOURS: Final = Filter("neighbours", _keeps_neighbours, _why_not_kept, Lasts.NEIGHBOURS)
+LINKS: Final = Filter("links", _keeps_link_limits, _why_over_link, Lasts.NEIGHBOURS)
 #: In order: if a host fails several, the first one gives the reason.
 FILTERS: Final = (
     EXCLUSION,
     Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),
     Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
+    Filter("enforcement", _can_enforce, _why_not_enforced, Lasts.PERMANENT),
     NEIGHBOURS,
+    LINKS,
     Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
     Filter("expected", _is_not_expected, _why_not_up, Lasts.RETURN),
     Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),
@@ -300,7 +356,14 @@ FILTERS: Final = (
         by_assignment=True,
         verdict="full",
     ),
+    Filter("claim", _is_unclaimed, _why_claimed),
     Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
-)
+    Filter(
+        "plugins", plugin_filters.passing_plugins, plugin_filters.why_plugin_excludes,
+        Lasts.PERMANENT, by_assignment=True,
+    ),
+)  # fmt: skip
+#: Filters that a host may fail for lack of room alone.
+OF_ROOM: Final = ("processes", "limits", "room")
 STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)
 BY_ASSIGNMENT: Final = tuple(one for one in FILTERS if one.by_assignment)

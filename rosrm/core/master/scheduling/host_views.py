@@ -1,8 +1,8 @@
-"""Views of hosts for scoring policies, and the check of a policy's scores."""
+"""Views of hosts for scoring policies and filters, and the checks of their answers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -10,32 +10,50 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.scheduling.candidates import Candidates
-from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray
+from rosrm.core.master.scheduling.traffic import rates, round_trips
+from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray, IntArray
+from rosrm.core.master.state.links import LinkTable
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
-from rosrm.extensions.declared_fields import declared_spec
+from rosrm.extensions.declared_fields import FLOWS_FIELD, declared_spec
+from rosrm.extensions.link_views import NO_FLOWS
 from rosrm.extensions.plugin_calls import given, required
+from rosrm.model.values import ProcessSpec
 
 T = TypeVar("T")
 
 
 def host_view(hosts: Candidates) -> HostView:
-    """Return the view of some hosts for a policy."""
-    return HostView(
+    """Return the view of some hosts for a plugin."""
+    return _View(
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
-        _read_only(hosts.processes[:]), _Labels(hosts), _FreeDevices(hosts),
+        _read_only(hosts.processes[:]), _Labels(hosts), _Links(hosts), _Tenants(hosts),
+        _FreeDevices(hosts),
     )  # fmt: skip
 
 
-def process_view(hosts: Candidates) -> ProcessView:
-    """Return the view of a process for a policy, with its needs on each host."""
-    spec = declared_spec(hosts.demand.spec, hosts.demand.reads)
-    return ProcessView(spec, _read_only(hosts.need.T))
+class _View(HostView):
+    """A view whose masks of labels come from the cache of the table."""
+
+    def labelled(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (N,), of the hosts with a label of this value, as a new array."""
+        assert isinstance(self.labels, _Labels)
+        return self.labels.mask(key, value)
+
+
+def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
+    """Return the view of a process with its needs on each host.
+
+    `reads`: fields of the spec that the offer of the plugin declares.
+    """
+    spec = declared_spec(hosts.demand.spec, reads)
+    flows = hosts.flows if FLOWS_FIELD in reads and hosts.flows else NO_FLOWS
+    return ProcessView(spec, _read_only(hosts.need.T), flows)
 
 
 def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Make a view of a shared array read-only, because a policy might write into it."""
+    """Make a view of a shared array read-only, because a plugin might write into it."""
     view.flags.writeable = False
     return view
 
@@ -51,9 +69,7 @@ class _PerHost(Sequence[T]):
 
     def __getitem__(self, row: Any) -> Any:
         rows = range(len(self._hosts))[row]
-        if isinstance(rows, int):
-            return self._of(rows)
-        return [self._of(one) for one in rows]
+        return self._of(rows) if isinstance(rows, int) else [self._of(one) for one in rows]
 
     def _of(self, row: int) -> T:
         raise NotImplementedError
@@ -72,6 +88,18 @@ class _Labels(_PerHost[Mapping[str, str]]):
     def _of(self, row: int) -> Mapping[str, str]:
         return MappingProxyType(dict(self._hosts.host(row).description.labels))
 
+    def mask(self, key: str, value: str) -> BoolArray:
+        """Return the mask, (n,), of the hosts with a label of this value, as a new array."""
+        return np.array(self._hosts.table.labelled(key, value)[self._hosts.columns])
+
+
+class _Tenants(_PerHost[Mapping[str, ProcessSpec]]):
+    """The processes of each host; notes that a plugin has read them."""
+
+    def _of(self, row: int) -> Mapping[str, ProcessSpec]:
+        self._hosts.tenants_read = True
+        return MappingProxyType(self._hosts.tenants_of(row))
+
 
 class _FreeDevices(_PerHost[Mapping[str, float]]):
     """The free units of each host by kind."""
@@ -82,6 +110,45 @@ class _FreeDevices(_PerHost[Mapping[str, float]]):
         if hosts.more is not None:
             inventory = inventory.after(hosts.demand.spec.devices, int(hosts.more[row]))
         return MappingProxyType(inventory.free_by_kind())
+
+
+def checked_mask(mask: object, count: int) -> BoolArray:
+    """Return the mask of a filter; raise PluginError if it breaks the contract."""
+    found = np.asarray(mask)
+    if found.dtype != np.bool_:
+        shown = given(mask) if found.dtype == np.object_ else f"a mask of type {found.dtype}"
+        raise PluginError(f"answered {shown}; booleans are required, True: the host may be chosen")
+    if found.shape != (count,):
+        raise PluginError(f"a mask of shape {found.shape} for {count} hosts")
+    return found
+
+
+class _Links:
+    """`LinkView` of some hosts; computed when it is read, because few policies read it."""
+
+    def __init__(self, hosts: Candidates) -> None:
+        self._hosts = hosts
+
+    @property
+    def hosts(self) -> Sequence[str]:
+        return [host.name for host in self._hosts.table.hosts]
+
+    @property
+    def round_trip(self) -> FloatArray:
+        return self._read(round_trips, 0.0)
+
+    @property
+    def rate(self) -> FloatArray:
+        return self._read(rates, np.inf)
+
+    def _read(
+        self, values: Callable[[LinkTable, IntArray, IntArray], FloatArray], own: float
+    ) -> FloatArray:
+        every, at = np.arange(len(self._hosts.table)), self._hosts.columns
+        columns = every[at] if isinstance(at, slice) else at
+        found = values(self._hosts.table.links, columns, every)
+        found[columns[:, None] == every] = own
+        return _read_only(found)
 
 
 def checked_scores(

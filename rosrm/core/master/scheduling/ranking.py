@@ -1,7 +1,8 @@
 """Ranking of hosts for a process: filter, score, pick.
 
-A host fits if it passes every filter of `filters.py` and the policy does not veto it. Of the hosts
-that fit, the one with the lowest score is picked (with the policy `weighted`: Eq. 1 of the paper).
+A host fits if it passes every filter of `filters.py` and no policy vetoes it. Of the hosts that
+fit, the one with the lowest score is picked (with the policy `weighted`: Eq. 1 of the paper). The
+score of a chain of policies is the sum of their scores, each times its weight.
 A `Ranking` caches the scores for one demand. Equal processes share it, and after an assignment only
 the scores of the changed hosts are computed again.
 
@@ -17,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from rosrm.core.master.scheduling.candidates import Columns, candidates
+from rosrm.core.master.scheduling.candidates import Candidates, Columns, candidates
 from rosrm.core.master.scheduling.filters import (
     BY_ASSIGNMENT,
     STANDING,
@@ -27,13 +28,13 @@ from rosrm.core.master.scheduling.filters import (
 )
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.scheduling.proximity import keeping_all, preference
+from rosrm.core.master.scheduling.traffic import keeping_limits
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.devices import COUNTED
-from rosrm.core.master.state.host_arrays import FloatArray, IntArray
+from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
 from rosrm.errors import PluginError
-from rosrm.extensions.contracts import ScoringPolicy
-from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.extensions.placement import ScoringLink
 
 #: Added to the score for each process of a host: of equal scores, the host with fewer processes is
 #: picked, then the one that registered first.
@@ -43,8 +44,8 @@ _RUNNERS_UP: Final = 3
 #: Number of equal processes for which one call of the policy scores a host ahead.
 _AT_A_TIME: Final = COUNTED
 
-#: A scoring policy with its name.
-NamedPolicy = tuple[str, ScoringPolicy]
+#: Largest size of one policy's score in the sum of a chain, so that the sum is finite.
+_LARGEST_SCORE: Final = 1e300
 
 
 class Ranking:
@@ -54,22 +55,20 @@ class Ranking:
         need: (R, H) fractions of each host's capacity.
         value: (H,) score, term of preferred neighbours and tie-break; inf where the host does not
             fit now.
-        judge: the policy in use; None: every policy was left out, and each fitting host scores 0.
-        plugins: guards every call of a policy.
+        judges: the policies in use; (): all were left out, and each fitting host scores 0.
         failure: why policies were left out.
+        reads_tenants: True if a plugin has read which processes run on the hosts.
     """
 
-    def __init__(
-        self, table: HostTable, policies: Sequence[NamedPolicy], demand: Demand,
-        plugins: PluginCalls,
-    ) -> None:  # fmt: skip
+    def __init__(self, table: HostTable, demand: Demand) -> None:
         self.table = table
-        self.plugins = plugins
         self.demand = demand
+        self.judges = demand.plugins.chain
+        self.reads_tenants = False
         self.failure = ""
         self.version = table.version
         self.need = table.fractions(demand.amounts, demand.estimated)
-        self._left = list(policies)
+        self._fallback = demand.plugins.fallback
         self._seen = len(table.touched)
         every = slice(0, len(table))
         self._standing = passing(STANDING, candidates(table, demand, self.need, every))
@@ -84,37 +83,33 @@ class Ranking:
         self._judge(every)
 
     @property
-    def judge(self) -> NamedPolicy | None:
-        """Return the policy in use, with its name."""
-        return self._left[0] if self._left else None
-
-    @property
     def policy_name(self) -> str:
-        """Return the name of the policy in use, and the policies left out, with reasons."""
-        name = self._left[0][0] if self._left else ""
+        """Return the names of the policies in use, and the policies left out, with reasons."""
+        name = " + ".join(map(str, self.judges))
         if not self.failure:
             return name
         return f"{name} ({self.failure})" if name else self.failure
 
     def beside(self, demand: Demand) -> Ranking:
-        """Return this ranking for a demand that differs by its neighbours alone.
+        """Return this ranking for a demand that differs by its neighbours and flows alone.
 
-        Neighbours change with each assignment, so that few demands share a ranking with them. The
-        scores of the policy do not depend on them.
+        These change with each assignment, so that few demands share a ranking with them. The scores
+        of the policy do not depend on them.
         """
         found = copy(self)
-        found._set_neighbours(demand, self)  # noqa: SLF001 - it is of this class
+        found._set_surroundings(demand, self)  # noqa: SLF001 - it is of this class
         return found
 
-    def _set_neighbours(self, demand: Demand, alone: Ranking) -> None:
+    def _set_surroundings(self, demand: Demand, alone: Ranking) -> None:
         self.demand, self._alone, self._lowest = demand, alone, None
-        self._left, self._refusals, self._ahead = list(self._left), {}, {}
+        self._refusals, self._ahead = {}, {}
         self._preference = preference(self.table, demand)
         self.value = self.value + (0.0 if self._preference is None else self._preference)
-        kept = keeping_all(self.table, demand)
-        if kept is not None:
-            self._standing = self._standing & kept
-            self.value[~kept] = np.inf
+        limits = keeping_limits(self.table.links, demand.traffic, len(self.table))
+        for kept in (keeping_all(self.table, demand), limits):
+            if kept is not None:
+                self._standing = self._standing & kept
+                self.value[~kept] = np.inf
 
     def note_assignment(self) -> None:
         """Note that the newest change of the table was an assignment of this demand."""
@@ -130,7 +125,7 @@ class Ranking:
         columns = set(touched[self._seen :])
         alone = self._seen == len(touched) - 1
         self._seen = len(touched)
-        if alone and self._own == len(touched):
+        if alone and self._own == len(touched) and not self.reads_tenants:
             self._judge_ahead(columns.pop())
             return
         for column in columns & self._ahead.keys():
@@ -198,6 +193,9 @@ class Ranking:
             if judged is None:
                 self._judge(slice(0, len(self.table)))
                 return
+            if self.reads_tenants:  # which shows none of the processes that are added
+                self._judge(np.array([column]))
+                return
             values = self._ahead[column] = judged[::-1].tolist()
         self._lowest = None
         self.value[column] = values.pop()
@@ -209,31 +207,30 @@ class Ranking:
         """
         judged = candidates(self.table, self.demand, self.need, columns, more)
         fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
-        if not np.count_nonzero(fits):
-            return np.full(len(fits), np.inf)
-        tie = TIE * judged.processes
+        value = TIE * judged.processes
         if self._preference is not None:
-            tie = tie + self._preference[columns]
-        if not self._left:
-            return np.where(fits, tie, np.inf)
-        hosts, process = host_view(judged), process_view(judged)
-        name, policy = self._left[0]
-        try:
-            value, veto = self.plugins.ask(
-                "scoring", name, "score",
-                lambda: checked_scores(policy.score(hosts, process), hosts, fits),
-            )  # fmt: skip
-        except PluginError as error:
-            self._leave_out(error)
-            return None
-        if veto is not None:
-            fits = fits & ~veto
-        return np.where(fits, value + tie, np.inf)
+            value = value + self._preference[columns]
+        for link in self.judges if np.count_nonzero(fits) else ():
+            try:
+                score, veto = _scored(link, judged, fits)
+            except PluginError as error:
+                self._leave_out(link, error)
+                return None
+            value = score + value
+            if veto is not None:
+                fits = fits & ~veto
+        self.reads_tenants = self.reads_tenants or judged.tenants_read
+        return np.where(fits, value, np.inf)
 
-    def _leave_out(self, error: PluginError) -> None:
-        """Leave out a policy that raised or broke its contract: the next one decides, or none."""
-        name, _ = self._left.pop(0)
-        reason = f"left out: {name!r}, {error}"
+    def _leave_out(self, link: ScoringLink, error: PluginError) -> None:
+        """Leave out a policy that raised or broke its contract.
+
+        The other policies of the chain decide; after the last of them the fallback; then none.
+        """
+        self.judges = tuple(one for one in self.judges if one is not link)
+        if not self.judges and self._fallback is not None:
+            self.judges, self._fallback = (self._fallback,), None
+        reason = f"left out: {link.name!r}, {error}"
         self.failure = f"{self.failure}; {reason}" if self.failure else reason
         self._ahead.clear()
 
@@ -246,6 +243,20 @@ class Ranking:
             return self.value
         best = self._tier[fitting].min()
         return np.where(self._tier == best, self.value, np.inf)
+
+
+def _scored(
+    link: ScoringLink, hosts: Candidates, fits: BoolArray
+) -> tuple[FloatArray, BoolArray | None]:
+    """Return the weighted scores and the vetoes of a policy; raise PluginError if it fails."""
+    views = host_view(hosts), process_view(hosts, link.reads)
+    score, veto = hosts.demand.plugins.calls.ask(
+        "scoring", link.name, "score",
+        lambda: checked_scores(link.policy.score(*views), views[0], fits),
+    )  # fmt: skip
+    if link.weight != 1.0:
+        score = link.weight * np.clip(np.nan_to_num(score), -_LARGEST_SCORE, _LARGEST_SCORE)
+    return score, veto
 
 
 def _tiers(table: HostTable, demand: Demand) -> IntArray | None:

@@ -24,15 +24,19 @@ from rosrm.core.master.state.host_arrays import (
     HostColumns,
     IntArray,
 )
+from rosrm.core.master.state.links import LinkTable
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.devices import Device, HeldDevice
-from rosrm.model.values import HostDescription, InstanceId
+from rosrm.model.values import HostDescription, InstanceId, ProcessSpec
 
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
 _MOST_GUESSED: Final = 0.5
 #: Greatest step from one sequence of a host to the next; a greater one is an error or a forgery.
 MOST_AHEAD: Final = 1000
+
+#: Fields of a description that may change while the slave runs.
+CHANGEABLE: Final = ("labels",)
 
 
 class HostCondition(IntEnum):
@@ -66,7 +70,8 @@ class Host:
     Attributes:
         column: column of this host in the arrays of `HostTable`.
         attributed, shared: resources with this accounting on the host.
-        instances: numbers of the instances that run on the host or are assigned to it.
+        instances: number of each instance that runs on the host or is assigned to it, to the name
+            and the read-only spec of its process.
         over_since: resource name to the time since when the host is over this limit.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
@@ -89,7 +94,7 @@ class Host:
     pruned: bool = False
     attributed: frozenset[str] = frozenset()
     shared: frozenset[str] = frozenset()
-    instances: set[int] = field(default_factory=set)
+    instances: dict[int, tuple[str, ProcessSpec]] = field(default_factory=dict)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
     recorded_at: dict[str, float] = field(default_factory=dict)
@@ -109,12 +114,21 @@ class Host:
         """Return the name of the host."""
         return self.description.name
 
+    def enforces(self, settings: tuple[str, ...], cpus: tuple[int, ...]) -> bool:
+        """Return True if the host can enforce these settings, and is not known to lack a CPU."""
+        own = self.description
+        return own.unenforced.keys().isdisjoint(settings) and not (
+            own.cpus and set(cpus).difference(own.cpus)
+        )
+
 
 class HostTable(HostColumns):
     """All known hosts.
 
     Attributes:
         version: counter of changes that concern many hosts.
+        links: measured links between hosts, and the flows across them.
+        claims: column of a host on which room is made for a process -> priority of the process.
         touched: columns that assignments and ends have changed since `version` grew.
         devices: devices of each host, and the instances that hold them.
     """
@@ -123,10 +137,13 @@ class HostTable(HostColumns):
         super().__init__()
         self.by_name: dict[str, Host] = {}
         self.hosts: list[Host] = []
+        self.links = LinkTable()
         self.version = 0
         self.touched: list[int] = []
         self.devices = DeviceTable()
+        self.claims: dict[int, int] = {}
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}
+        self._enforcing: dict[tuple[tuple[str, ...], tuple[int, ...]], BoolArray] = {}
         self._listed: list[Host] | None = None
 
     # --- registration --------------------------------------------------------------------
@@ -173,9 +190,23 @@ class HostTable(HostColumns):
         self.incarnation[column] = description.incarnation
         self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
         self.refused_since[column] = np.inf
+        self.links.forget(column)
         self._labelled.clear()
+        self._enforcing.clear()
         self.set_devices(host, description.devices)
         return host
+
+    def redescribe(self, host: Host, description: HostDescription) -> tuple[str, ...]:
+        """Take over what a slave may change while it runs; return the names of what has changed."""
+        new = {name: getattr(description, name) for name in CHANGEABLE}
+        changed = tuple(
+            name for name, value in new.items() if value != getattr(host.description, name)
+        )
+        if changed:
+            host.description = replace(host.description, **new)
+            self._labelled.clear()
+            self.changed()
+        return changed
 
     def prune(self, host: Host) -> None:
         """Remove a host from every listing; its slave may register it later as a new host."""
@@ -184,7 +215,9 @@ class HostTable(HostColumns):
         for known in (host.over_since, host.over_at, host.recorded_at, host.blocked, host.failing):
             known.clear()
         self.incarnation[host.column] = 0
+        self.links.forget(host.column)
         self._labelled.clear()
+        self._enforcing.clear()
         self.set_devices(host, ())
         self.set_closed(host, cordoned=False, draining=False)
         self.set_condition(host, HostCondition.LEFT)
@@ -218,12 +251,29 @@ class HostTable(HostColumns):
             known = self._labelled[key, value] = np.array(found, np.bool_)
         return known
 
+    def enforcing(self, settings: tuple[str, ...], cpus: tuple[int, ...]) -> BoolArray:
+        """Return the mask, (H,), of hosts that can enforce these settings and have these CPUs.
+
+        Cached until a host registers.
+        """
+        known = self._enforcing.get((settings, cpus))
+        if known is None or len(known) != len(self):
+            found = [host.enforces(settings, cpus) for host in self.hosts]
+            known = self._enforcing[settings, cpus] = np.array(found, np.bool_)
+        return known
+
     # --- changes -------------------------------------------------------------------------
 
     def changed(self) -> None:
         """Note that many hosts have changed, which makes earlier rankings void."""
         self.version += 1
         self.touched.clear()
+
+    def set_claims(self, claims: dict[int, int]) -> None:
+        """Set for which priorities hosts are reserved while room is made there."""
+        if claims != self.claims:
+            self.claims = claims
+            self.changed()
 
     def ask(self, host: Host) -> None:
         """Note a request for work; placement also waits for the host's first reading."""

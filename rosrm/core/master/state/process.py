@@ -76,6 +76,7 @@ class Instance:
         at_once: it must be killed without delay, because another instance owns the name.
         order_at: time of the last order to stop or withdraw it; -inf: none.
         node_name: name of its node, if it differs from the name of the process.
+        enforced: names of its limits and scheduling settings that hold, as its slave reports.
         ready_at: time at which the first report of its readiness arrived at this master.
         devices: devices of its host that it holds.
     """
@@ -100,6 +101,7 @@ class Instance:
     at_once: bool = False
     order_at: float = -inf
     node_name: str = ""
+    enforced: tuple[str, ...] = ()
     ready_at: float = inf
     devices: tuple[HeldDevice, ...] = ()
 
@@ -154,7 +156,7 @@ class Image:
 #: Fields of a process that are journaled unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
-    "principal", "owned_from", "defaulted",
+    "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
 )  # fmt: skip
 
 
@@ -188,6 +190,11 @@ class Process:
         standby_at: time before which no standby is started.
         standby_tries: number of standbys that were lost in a row.
         standby_reason: condition of its standby, for listings.
+        started_at: time at which it first started since it left the queue; inf: not yet.
+        began: unix time of `started_at`; 0: not yet.
+        overdue: True: its time limit has passed, and it is being stopped.
+        reschedules: number of hosts on which it has failed in a row.
+        queue_delay: seconds in the queue before its next placement.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
@@ -219,6 +226,11 @@ class Process:
     standby_at: float = 0.0
     standby_tries: int = 0
     standby_reason: str = ""
+    started_at: float = inf
+    began: float = 0.0
+    overdue: bool = False
+    reschedules: int = 0
+    queue_delay: float = 0.0
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     defaulted: tuple[str, ...] = ()
     demand: tuple[int, Demand] | None = None
@@ -232,3 +244,8 @@ class Process:
     def name(self) -> str:
         """Return its name."""
         return self.spec.name
+
+    @property
+    def placed_from(self) -> float:
+        """Return the time from which a queued process may be placed."""
+        return self.since + self.queue_delay

@@ -13,10 +13,12 @@ class Queue:
 
     Attributes:
         version: counter of changes.
+        delayed: names in it that wait for the end of their delay.
     """
 
     def __init__(self) -> None:
         self.version = 0
+        self.delayed: set[str] = set()
         self._keys: list[_Key] = []
         self._of: dict[str, _Key] = {}
 
@@ -32,6 +34,7 @@ class Queue:
     def remove(self, name: str) -> None:
         """Remove a process from any place."""
         key = self._of.pop(name)
+        self.delayed.discard(name)
         del self._keys[bisect_left(self._keys, key)]
         self.version += 1
 

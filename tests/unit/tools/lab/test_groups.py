@@ -117,8 +117,11 @@ def test_version_2_hands_the_controllers_down_to_the_leaves(tmp_path, monkeypatc
     assert (limited / "cpu.max").read_text() == "10000 20000"
     assert (limited / "memory.max").read_text() == str(GIB)
     assert not (free / "memory.max").exists()
-    assert not (limited / "cgroup.subtree_control").read_text()  # this group has processes
-    assert groups.doors([hierarchy], "lab", "host1", "limited") == [limited / "cgroup.procs"]
+    # A slave gives them to the groups of its processes, so its own group is below this one.
+    assert (limited / "cgroup.subtree_control").read_text() == "+cpu +memory"
+    agents = limited / "rosrm-agent"
+    assert groups.doors([hierarchy], "lab", "host1", "limited") == [agents / "cgroup.procs"]
+    assert not (agents / "cgroup.subtree_control").read_text()  # this group has processes
 
 
 def test_a_top_group_that_another_lab_removes_is_made_again(tmp_path, monkeypatch):

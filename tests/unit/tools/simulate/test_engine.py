@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -13,7 +14,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.state.process import ProcessPhase
 from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.values import InstanceState
-from rosrm_simulate.workload import Curve
+from rosrm_simulate.workload import Curve, SimulatedLink
 
 from .workloads import MIB, host, plan, run, simulation
 
@@ -285,3 +286,52 @@ def test_progress_is_told():
     simulation([host("a", 8000.0)], plans).run(told.append)
     assert [one.events for one in told] == sorted(one.events for one in told)
     assert told[-1].ended <= 400 == told[-1].processes
+
+
+def test_flows_stay_within_the_limits_of_simulated_links():
+    """The detector runs behind the fast link, although the host of the slow one is emptier."""
+    hosts = [
+        host("robot", 100.0, link=SimulatedLink(100e6, 0.01)),
+        host("slow", 4096.0, link=SimulatedLink(5e6, 0.03)),
+        host("fast", link=SimulatedLink(100e6, 0.01)),
+    ]
+    robot = {"needs": {"memory": 70 * MIB}, "required_labels": {"name": "robot"}}
+    hosts[0] = replace(hosts[0], labels={"name": "robot"})
+    plans = [plan("camera", **robot), plan("detector", at=1.0, talks_to={"camera": 20e6})]
+    simulated = simulation(hosts, plans, until=5.0)
+    simulated.run()
+    processes = simulated.state.processes
+    assert simulated.state.instances[processes["detector"].owner].host.name == "fast"
+    links = simulated.state.hosts.links
+    assert links.round_trip[0, 1] == links.round_trip[1, 0] == pytest.approx(0.04)
+
+
+# --- moves for more than limits -----------------------------------------------------------------
+
+
+def test_a_process_of_a_lower_priority_makes_room_on_virtual_time():
+    """Settings of the preemption can be tried without a cluster."""
+    hosts = [host("a", 1000.0), host("b", 400.0)]
+    plans = [
+        plan("low", 300.0, strategy="relaunch"),
+        plan("high", 700.0, at=10.0, duration=5.0, priority=5),
+    ]
+    assert run(hosts, plans, until=60.0).finished == 1
+    assert run(hosts, plans, until=60.0, preemption=False).finished == 0
+
+
+def test_the_load_is_evened_out_on_virtual_time():
+    """Here the one host gets all processes before the other one is there."""
+    plans = [plan(f"p{i}", 150.0, strategy="relaunch") for i in range(4)]
+    hosts = [host("a", 1000.0), host("b", 1000.0, joins=20.0)]
+    for automatic, used in ((False, 0.6), (True, 0.3)):
+        outcome = run(hosts, plans, until=100.0, rebalance=automatic)
+        assert outcome.curves.usage["memory"][-1, 0] == pytest.approx(used, abs=0.01)
+
+
+def test_a_job_is_stopped_after_its_time_limit_on_virtual_time():
+    """It has not finished; nothing else happens for much longer than the other times last."""
+    plans = [plan("p", duration=900.0, time_limit=90.0), plan("q", duration=5.0, time_limit=90.0)]
+    outcome = run([host("a")], plans)
+    assert (outcome.finished, outcome.ended_otherwise) == (1, 1)
+    assert outcome.ends["p"] == pytest.approx(90.0, abs=1.0)

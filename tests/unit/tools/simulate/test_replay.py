@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.placement import PlacementPlugins, ScoringLink
 from rosrm.model.records import Intent
 from rosrm.model.requester import OPERATOR, Requester
 from rosrm.recording.encoding import Happened
@@ -40,7 +41,7 @@ def replay(record, *, policy=EQ1, settings=None, watch=None, **options):
     return replay_declared(record, core, policy, STRATEGIES, watch, declared=declared, **options)
 
 
-BY_CPU = ("weighted", Weighted(WeightedOptions({"cpu": 1.0})))
+BY_CPU = PlacementPlugins((ScoringLink("weighted", Weighted(WeightedOptions({"cpu": 1.0}))),))
 
 
 def busy(until: float = 60.0, **options) -> Simulation:

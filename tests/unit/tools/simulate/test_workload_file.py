@@ -17,6 +17,7 @@ from rosrm.model.values import Kind
 from rosrm_simulate import workload_file as in_file
 from rosrm_simulate.runs import run
 from rosrm_simulate.variants import variant_in_text
+from rosrm_simulate.workload import SimulatedLink
 from rosrm_simulate.workload_file import load_workload
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -71,6 +72,21 @@ def test_a_workload_says_all_that_is_simulated(load):
     assert (service.duration, made.until, made.model.start) == (inf, 300.0, 1.0)
 
 
+def test_a_workload_has_links_and_flows(load):
+    made = load(
+        "hosts: [{name: a, memory: 1GiB, cpu: 2, link: {rate: 5MB/s, round_trip: 20ms}}]\n"
+        "processes: [{name: p, memory: 1MB, talks_to: {q: 1MB/s}}]\n"
+    ).workload
+    assert made.hosts[0].link == SimulatedLink(5e6, 0.02)
+    assert made.processes[0].spec.talks_to == {"q": 1e6}
+
+
+@pytest.mark.parametrize("rate", [".nan", "0", "fast", "-1", ".inf"])
+def test_a_link_rate_that_is_no_positive_number_is_refused(load, rate):
+    with pytest.raises(ConfigError, match=r"link\.rate: "):
+        load(f"hosts: [{{name: a, memory: 1GiB, cpu: 2, link: {{rate: {rate}}}}}]\n{PROCESS}")
+
+
 def test_what_is_drawn_lies_within_its_bounds_and_is_the_seeds(load):
     text = HOST + (
         "processes: [{name: 'p{i}', foreach: {i: 'range(0, 50)'}, memory: [8MB, 80MB],"
@@ -91,14 +107,30 @@ def test_variants_say_their_own_word_over_the_settings(load):
     )  # fmt: skip
     base, calm, threshold, five = made.variants
     assert (base.name, calm.name) == ("as given", "calm")
-    assert base.cluster.scoring.options == {"weights": {"cpu": 1.0}, "missing": "worst"}
+    assert base.cluster.scoring[0].options == {"weights": {"cpu": 1.0}, "missing": "worst"}
     assert (calm.cluster.migration.automatic, calm.cluster.migration.cooldown) == (False, 7.0)
     assert calm.cluster.scoring == base.cluster.scoring
-    assert (threshold.name, threshold.cluster.scoring.policy) == (
+    assert (threshold.name, threshold.cluster.scoring[0].policy) == (
         "scoring.policy threshold", "threshold",
     )  # fmt: skip
-    assert threshold.cluster.scoring.options["weights"] == {"memory": 1.0, "cpu": 0.5, "disk": 0.0}
+    assert threshold.cluster.scoring[0].options["weights"] == {
+        "memory": 1.0,
+        "cpu": 0.5,
+        "disk": 0.0,
+    }
     assert (five.name, five.hosts) == ("hosts 5", 5)
+
+
+def test_a_variant_may_chain_policies(load, registry):
+    """A chain replaces a single policy and its options, and runs."""
+    comparison = load(
+        HOST + PROCESS + "cluster: {scoring: {policy: weighted, options: {missing: ignore}}}\n",
+        "scoring: [{policy: weighted}, {policy: threshold, weight: 0.5}]",
+    )
+    _, chained = comparison.variants
+    assert chained.cluster.chain == "weighted + 0.5 x threshold"
+    assert chained.cluster.scoring[0].options["missing"] == "worst"
+    assert run(comparison.workload, chained, registry).outcome.running == 1
 
 
 @pytest.mark.parametrize(

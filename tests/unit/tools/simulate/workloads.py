@@ -7,6 +7,7 @@ from math import inf
 
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.placement import PlacementPlugins, ScoringLink
 from rosrm.model.codec import to_plain
 from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
 from rosrm.recording.encoding import decisions, encode, encode_decisions
@@ -20,7 +21,7 @@ from rosrm_simulate.workload import Curve, ProcessPlan, SimulatedHost, Workload
 from tests.unit.core.cluster import declared_by
 
 MIB = 2.0**20
-EQ1 = ("weighted", Weighted(WeightedOptions()))
+EQ1 = PlacementPlugins((ScoringLink("weighted", Weighted(WeightedOptions())),))
 STRATEGIES = {"relaunch": Relaunch(RelaunchOptions()), "handoff": Handoff(HandoffOptions())}
 
 

@@ -28,7 +28,7 @@ class ThermometerOptions:
 class Thermometer:
     """A probe of one temperature sensor."""
 
-    def __init__(self, options: ThermometerOptions, context: ProbeContext) -> None:
+    def __init__(self, options: ThermometerOptions, _context: ProbeContext) -> None:
         if not Path(options.sensor).is_file():
             raise SkipPlugin(f"no sensor at {options.sensor}")
         self._options = options

@@ -1,0 +1,70 @@
+"""Reload of the master's settings: its file is read again, and becomes an event of the core."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rosrm.config.placement import settings_of_chain
+from rosrm.config.reloading import OF_CLUSTER, reloaded
+from rosrm.config.settings import ClusterConfig
+from rosrm.core.master.events import SettingsRead
+from rosrm.errors import RosrmError
+from rosrm.extensions.placement import ChainOf
+from rosrm.runtime.settings_check import SettingsCheck, SettingsSource
+
+
+class SettingsReload:
+    """Reads the file of the master on request, and after a SIGHUP without a terminal.
+
+    Args:
+        config: the settings at the start.
+        source: their origin.
+        chain_of: creates the scoring policies with other weights and options.
+    """
+
+    def __init__(self, config: ClusterConfig, source: SettingsSource, chain_of: ChainOf) -> None:
+        self.chain_of = chain_of
+        self._config = config
+        self._check = SettingsCheck(source)
+        self._hung_up = False
+        self._read: list[SettingsRead] = []
+
+    def hang_up(self, _number: int, _frame: Any) -> None:
+        """Handle a SIGHUP."""
+        self._hung_up = True
+
+    def start(self, request: int) -> None:
+        """Begin to read the file; `request` is the number of a request, 0: of none."""
+        self._check.start(lambda text, fault: self._read.append(self._event(request, text, fault)))
+
+    def poll(self) -> list[SettingsRead]:
+        """Return the outcomes of files that were read since the last call."""
+        if self._hung_up:
+            self._hung_up = False
+            self.start(0)
+        self._check.poll()
+        read, self._read = self._read, []
+        return read
+
+    def close(self) -> None:
+        """End a check that runs."""
+        self._check.close()
+
+    def _event(self, request: int, text: str, fault: str) -> SettingsRead:
+        if fault:
+            return SettingsRead(request, fault)
+        new = ClusterConfig.from_json(text)
+        same_policies = _policies(new) == _policies(self._config)
+        allowed = [one for one in OF_CLUSTER if same_policies or one != "scoring"]
+        read = reloaded(self._config, new, allowed)
+        chain = settings_of_chain(read.config)
+        try:
+            self.chain_of(chain)
+        except RosrmError as error:
+            return SettingsRead(request, f"scoring: {error}")
+        self._config = read.config
+        return SettingsRead(request, "", read.config.core(), chain, read.changed, read.kept)
+
+
+def _policies(config: ClusterConfig) -> list[str]:
+    return [one.policy for one in config.scoring]

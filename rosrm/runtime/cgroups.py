@@ -1,0 +1,148 @@
+"""Control groups (cgroups) of versions 1 and 2: mounts, and the group of this process.
+
+The supervisor imports this module: it stays small.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from typing import Final, NamedTuple
+
+#: Group for the processes of rosrm itself. In version 2 a group with processes in it gives no
+#: controllers to the groups below it, so slave and supervisor run beside the groups of instances.
+AGENTS: Final = "rosrm-agent"
+#: Controllers that limit memory and CPU.
+LIMITING: Final = ("memory", "cpu")
+#: Seconds. Shorter than the kernel's 100 ms: a process that has used up its share is paused so
+#: shortly that ROS does not notice.
+_PERIOD: Final = 0.02
+_LONG_PERIOD: Final = 0.1
+#: Cores; below this the share of a short period is less than the least possible, a millisecond.
+_SHORT_ENOUGH: Final = 0.05
+_ESCAPE: Final = re.compile(r"\\([0-7]{3})")
+
+
+class Mount(NamedTuple):
+    """A mounted hierarchy of control groups.
+
+    Attributes:
+        version: 1 or 2.
+        root: group at the mount point, as /proc/PID/cgroup writes it.
+        point: path of the mount point.
+        controllers: of version 1, among other words; of version 2 `cgroup.controllers` has them.
+    """
+
+    version: int
+    root: str
+    point: str
+    controllers: frozenset[str]
+
+
+def mounts(root: str = "/") -> list[Mount]:
+    """Return the mounted hierarchies, version 1 first.
+
+    Args:
+        root: of the file system; another one for recorded trees.
+
+    Raises:
+        OSError: /proc cannot be read.
+    """
+    found = []
+    with open(os.path.join(root, "proc/self/mountinfo"), encoding="utf-8") as file:
+        for line in file:
+            before, _, after = line.rstrip("\n").partition(" - ")
+            kind, _, options = after.split(" ", 2)
+            if kind in ("cgroup", "cgroup2"):
+                fields = before.split(" ")
+                point = os.path.join(root, _unescaped(fields[4]).lstrip("/"))
+                version = 1 if kind == "cgroup" else 2
+                words = frozenset(options.split(","))
+                found.append(Mount(version, _unescaped(fields[3]), point, words))
+    return sorted(found, key=lambda mount: mount.version)
+
+
+def own_group(mount: Mount, root: str = "/") -> str | None:
+    """Return the directory of this process's group; None: it is not visible at this mount."""
+    with open(os.path.join(root, "proc/self/cgroup"), encoding="utf-8") as file:
+        lines = [line.rstrip("\n").split(":", 2) for line in file]
+    for _, names, path in lines:
+        if (mount.version == 2 and not names) or set(names.split(",")) & mount.controllers - {""}:
+            inside = os.path.relpath(path, mount.root)
+            directory = os.path.normpath(os.path.join(mount.point, inside))
+            visible = not inside.startswith("..") and os.path.isdir(directory)
+            return directory if visible else None
+    return None
+
+
+def cpu_quota(cores: float) -> tuple[int, int]:
+    """Return the quota and the period of a limit, both in microseconds."""
+    period = _PERIOD if cores >= _SHORT_ENOUGH else _LONG_PERIOD
+    return round(cores * period * 1e6), round(period * 1e6)
+
+
+def enable(group: str, controllers: tuple[str, ...]) -> None:
+    """Give controllers to the groups below a group of version 2. Raises OSError."""
+    switch = os.path.join(group, "cgroup.subtree_control")
+    missing = set(controllers) - set(read(switch).split())
+    if missing:
+        write(switch, " ".join(f"+{name}" for name in sorted(missing)))
+
+
+def delegate(root: str = "/") -> None:
+    """Prepare this process's group of version 2 for groups below it, if that is possible.
+
+    The process moves into a group of its own if it is the last one that hinders this.
+    """
+    for mount in mounts(root):
+        own = own_group(mount, root) if mount.version == 2 else None
+        if own is None:
+            continue
+        base = os.path.dirname(own) if os.path.basename(own) == AGENTS else own
+        try:
+            offered = read(os.path.join(base, "cgroup.controllers")).split()
+            wanted = tuple(name for name in LIMITING if name in offered)
+            _enable_or_move(base, wanted)
+        except OSError:
+            continue  # `rosrm.supervisor.group_trees` says why
+
+
+def _enable_or_move(base: str, controllers: tuple[str, ...]) -> None:
+    try:
+        enable(base, controllers)
+    except OSError as error:
+        if error.errno != errno.EBUSY:
+            raise
+        leaf = os.path.join(base, AGENTS)
+        os.makedirs(leaf, exist_ok=True)
+        write(os.path.join(leaf, "cgroup.procs"), "0")
+        try:
+            enable(base, controllers)
+        except OSError:
+            write(os.path.join(base, "cgroup.procs"), "0")
+            os.rmdir(leaf)
+            raise
+
+
+def read(path: str) -> str:
+    """Return the content of a control file. Raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        return os.read(descriptor, 1 << 16).decode()
+    finally:
+        os.close(descriptor)
+
+
+def write(path: str, value: str) -> None:
+    """Write a control file. Raises OSError."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
+    try:
+        os.write(descriptor, value.encode())
+    finally:
+        os.close(descriptor)
+
+
+def _unescaped(path: str) -> str:
+    r"""Replace the octal escapes of mountinfo, which writes a space as \040."""
+    return _ESCAPE.sub(lambda code: chr(int(code[1], 8)), path)

@@ -1,0 +1,89 @@
+"""Usage of one instance as its control group measures it: shared pages count once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from rosrm.model.values import InstanceId
+from rosrm.supervisor.instance_groups import group_name, pids
+
+#: Control groups of a supervisor: version, directory and controllers of each.
+Trees = Iterable[tuple[int, str, tuple[str, ...]]]
+#: Keys of memory.stat: bytes that the kernel cannot reclaim, as for a session without a group.
+_USED: Final = {1: ("total_rss", "total_shmem"), 2: ("anon", "shmem")}
+
+
+class InstanceGroup:
+    """The control group of one instance, below one directory for each tree.
+
+    Args:
+        trees: of the supervisor; those without a group of the instance are left out.
+    """
+
+    def __init__(self, trees: Trees, instance: InstanceId) -> None:
+        name = group_name((instance.process, instance.number))
+        self._memory, self._cpu, self._procs = ("", 0), ("", 0), ""
+        for version, top, controllers in trees:
+            group = str(Path(top, name))
+            if not Path(group).is_dir():
+                continue
+            self._procs = self._procs or group
+            if "memory" in controllers:
+                self._memory = (f"{group}/memory.stat", version)
+            if version == 2 or "cpuacct" in controllers:
+                file = "cpuacct.usage" if version == 1 else "cpu.stat"
+                self._cpu = (f"{group}/{file}", version)
+
+    @property
+    def exists(self) -> bool:
+        """Return True if the instance has a group."""
+        return bool(self._procs)
+
+    def pids(self) -> list[int]:
+        """Return the pids of all processes of the instance."""
+        return pids(self._procs)
+
+    def cpu_time(self) -> float | None:
+        """Return the CPU seconds of all its processes, ended ones included; None: not measured."""
+        path, version = self._cpu
+        text = _content(path)
+        if not text:
+            return None
+        return int(text) / 1e9 if version == 1 else _numbers(text)["usage_usec"] / 1e6
+
+    def memory(self) -> int | None:
+        """Return anonymous and shared memory in bytes; None: not measured."""
+        path, version = self._memory
+        text = _content(path)
+        if not text:
+            return None
+        numbers = _numbers(text)
+        return sum(numbers[key] for key in _USED[version])
+
+
+def _numbers(text: str) -> dict[str, int]:
+    words = text.split()
+    return dict(zip(words[::2], map(int, words[1::2]), strict=True))
+
+
+def _content(path: str) -> str:
+    """Return the content of a control file; "": there is none.
+
+    Raises:
+        OSError: no file can be opened now.
+    """
+    if not path:
+        return ""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:  # the instance has ended
+        return ""
+    try:
+        return os.read(descriptor, 1 << 14).decode()
+    except OSError:  # the group was removed in between
+        return ""
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,166 @@
+"""Start of an instance within its limits: control group, CPUs, real-time scheduling, niceness."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple
+
+from rosrm.core.supervisor.rules import Key, LimitRule
+from rosrm.supervisor import group_trees
+from rosrm.supervisor.instance_groups import InstanceGroups
+from rosrm.supervisor.spawn import Scheduler, ScheduleRefused, SpawnError
+from rosrm.wording import by_reason, listed
+
+#: In place of the descriptor of a control group.
+NO_GROUP: Final = -1
+#: Attempts to start a process in its group.
+_ATTEMPTS: Final = 2
+_POLICIES: Final = {"fifo": os.SCHED_FIFO, "rr": os.SCHED_RR}
+
+#: Starts the process of an instance, given its group and its scheduling as in `spawn.spawn`.
+Spawn = Callable[[int, Scheduler | None], int]
+
+
+class Confined(NamedTuple):
+    """A started process.
+
+    Attributes:
+        enforced: names of the limits and scheduling settings that hold.
+        note: limits that do not hold, though this host can enforce them, with the reasons.
+    """
+
+    pid: int
+    enforced: tuple[str, ...]
+    note: str
+
+
+class Confinement:
+    """Limits and scheduling of the instances of one supervisor.
+
+    Attributes:
+        missing: name of a limit or scheduling setting to the reason why it cannot be enforced here.
+        groups: the control groups.
+
+    Args:
+        state: the state directory.
+    """
+
+    def __init__(self, state: str) -> None:
+        trees, self.missing = group_trees.find(state)
+        self.groups = InstanceGroups(trees)
+        self._cpus = os.sched_getaffinity(0)
+
+    def start(self, key: Key, limits: LimitRule, spawn: Spawn) -> Confined:
+        """Start an instance within its limits.
+
+        Raises:
+            SpawnError: it cannot be started, or its limits are required and cannot be enforced.
+        """
+        self._check_cpus(limits)
+        wanted = _wanted(limits)
+        faults = {name: self.missing[name] for name in wanted if name in self.missing}
+        if limits.nice > 0:  # this needs no rights
+            faults.pop("nice", None)
+        _check_required(limits, faults)
+        made = self.groups.make(key, limits, realtime=bool(limits.policy))
+        own = {name: fault for name, fault in made.items() if name in wanted}
+        _check_required(limits, own)
+        realtime = bool(limits.policy) and "realtime" not in faults
+        with _on_cpus(limits.cpus, self._cpus):
+            pid, late = self._spawn(key, limits, spawn, realtime)
+        own.update(late)
+        if limits.nice and "nice" not in faults:
+            own.update(_set_nice(pid, limits.nice))
+        enforced = tuple(name for name in wanted if name not in faults and name not in own)
+        return Confined(pid, enforced, by_reason(own.items()))
+
+    def _check_cpus(self, limits: LimitRule) -> None:
+        lacking = sorted(set(limits.cpus) - self._cpus)
+        if lacking:
+            raise SpawnError(f"this host has no {cpus_in_words(lacking)} for its processes")
+
+    def _spawn(
+        self, key: Key, limits: LimitRule, spawn: Spawn, realtime: bool
+    ) -> tuple[int, dict[str, str]]:
+        """Spawn the process; return its pid, and what the kernel has refused."""
+        if not realtime:
+            return self._spawn_inside(key, limits, spawn, None)
+        try:
+            scheduler = (_POLICIES[limits.policy], os.sched_param(limits.priority))
+            return self._spawn_inside(key, limits, spawn, scheduler)
+        except ScheduleRefused as error:
+            fault = {"realtime": str(error)}
+            _check_required(limits, fault)
+            pid, others = self._spawn_inside(key, limits, spawn, None)
+            return pid, {**fault, **others}
+
+    def _spawn_inside(
+        self, key: Key, limits: LimitRule, spawn: Spawn, scheduler: Scheduler | None
+    ) -> tuple[int, dict[str, str]]:
+        """Spawn the process in its group, or without one if no process can enter it."""
+        fault = ""
+        for _ in range(_ATTEMPTS):
+            try:
+                with self.groups.inside(key) as group:
+                    return spawn(group, scheduler), {}
+            except OSError as error:
+                fault = f"its control group cannot be entered: {error.strerror}"
+                # A supervisor beside this one may have removed the group, because it was empty.
+                self.groups.make(key, limits, realtime=bool(limits.policy))
+        faults = {name: fault for name in _wanted(limits) if name.startswith("limits.")}
+        _check_required(limits, faults)
+        self.groups.remove(key, 0.0)
+        return spawn(NO_GROUP, scheduler), faults
+
+
+def cpus_in_words(numbers: list[int]) -> str:
+    """Return "CPU 3", or "CPUs 3, 4 and 5"."""
+    return f"CPU{'s' if len(numbers) > 1 else ''} {listed(map(str, numbers))}"
+
+
+def _wanted(limits: LimitRule) -> tuple[str, ...]:
+    """Return the names of the limits and scheduling settings that are given."""
+    given = {
+        "limits.memory": limits.memory, "limits.memory_high": limits.memory_high,
+        "limits.cpu": limits.cpu, "cpus": limits.cpus, "realtime": limits.policy,
+        "nice": limits.nice,
+    }  # fmt: skip
+    return tuple(name for name, value in given.items() if value)
+
+
+def _check_required(limits: LimitRule, faults: dict[str, str]) -> None:
+    if limits.required and faults:
+        raise SpawnError(
+            f"its limits are required, and this host cannot enforce {by_reason(faults.items())}"
+        )
+
+
+@contextlib.contextmanager
+def _on_cpus(cpus: tuple[int, ...], own: set[int]) -> Iterator[None]:
+    """Give processes that are started in this context these CPUs; (): those of this process."""
+    if not cpus:
+        yield
+        return
+    try:
+        os.sched_setaffinity(0, cpus)
+    except OSError as error:
+        fault = f"{cpus_in_words(list(cpus))} cannot be used: {error.strerror}"
+        raise SpawnError(fault) from None
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # must not hide that the instance was started
+            os.sched_setaffinity(0, own)
+
+
+def _set_nice(leader: int, nice: int) -> dict[str, str]:
+    """Set the niceness of a process group that has just begun; return the fault, if any."""
+    try:
+        os.setpriority(os.PRIO_PGRP, leader, nice)
+    except ProcessLookupError:
+        return {}
+    except OSError as error:
+        return {"nice": f"niceness {nice} cannot be set: {error.strerror}"}
+    return {}

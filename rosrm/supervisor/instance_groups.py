@@ -1,0 +1,334 @@
+"""Control groups of the instances: one for each, which limits, measures and kills its processes.
+
+The path of a group follows from the instance, so the next supervisor finds it again. A process
+enters its group by inheritance: in version 1 the supervisor itself is in the group while it spawns
+(moving a process that runs would take 10 ms, because the kernel then waits for an RCU grace
+period); in version 2 the kernel starts the process in it (`spawn_into.py`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final
+
+from rosrm.core.supervisor.rules import Key, LimitRule
+from rosrm.runtime import cgroups
+from rosrm.supervisor import own_log
+from rosrm.supervisor.group_trees import PREFIX, Tree, make_top
+from rosrm.supervisor.paths import safe_name
+from rosrm.wording import size
+
+#: Most walks over a group of version 1 whose processes are killed, because they may fork.
+_KILLS: Final = 20
+#: Seconds between two attempts to remove a group that the kernel still counts as used.
+_REMOVE_AGAIN: Final = 0.2
+#: Links of a folder without folders in it.
+_LINKS: Final = 2
+#: Bytes; a limit above this is none (version 1 writes 2**63 less a page).
+_NO_LIMIT: Final = 2**62
+
+
+class InstanceGroups:
+    """The control groups of one supervisor's instances.
+
+    Attributes:
+        trees: where they are made; (): no instance has a group.
+    """
+
+    def __init__(self, trees: Sequence[Tree] = ()) -> None:
+        self.trees = tuple(trees)
+        self._made: dict[Key, tuple[Tree, ...]] = {}
+        self._kills_before: dict[Key, int] = {}
+        self._emptied: dict[str, float] = {}
+
+    def find_again(self, live: Iterable[Key]) -> None:
+        """Find the groups of instances of an earlier supervisor; kill and remove all others.
+
+        Groups of supervisors that have ended beside this one, and have no processes, are removed.
+        """
+        for key in live:
+            found = tuple(tree for tree in self.trees if os.path.isdir(_path(tree, key)))
+            if found:
+                self._made[key] = found
+        known = {group_name(key) for key in self._made}
+        for tree in self.trees:
+            for name in _folders(tree.top) - known:
+                self._end(os.path.join(tree.top, name), 0.0)
+            base = os.path.dirname(tree.top)
+            for other in _folders(base) - {os.path.basename(tree.top)}:
+                if other.startswith(PREFIX):
+                    remove_empty(os.path.join(base, other))
+
+    def make(self, key: Key, limits: LimitRule, *, realtime: bool) -> dict[str, str]:
+        """Make the group of an instance with its limits; return the faults by limit.
+
+        Args:
+            realtime: leave out groups of the controller cpu of version 1, which by default allow
+                no real-time scheduling, and whose limits have no effect on it.
+        """
+        faults: dict[str, str] = {}
+        made = []
+        for tree in self.trees:
+            if realtime and tree.version == 1 and "cpu" in tree.controllers:
+                continue
+            path = _path(tree, key)
+            try:
+                _make(path, tree)
+                made.append(tree)
+                faults.update(_set_limits(path, tree, limits))
+            except OSError as error:
+                fault = f"no control group {path} can be made: {error.strerror}"
+                faults.update(
+                    (name, fault) for name, controller in _CONTROLLER.items()
+                    if controller in tree.controllers
+                )  # fmt: skip
+        self._made[key] = tuple(made)
+        self._kills_before[key] = self._kills(key)
+        return faults
+
+    @contextlib.contextmanager
+    def inside(self, key: Key) -> Iterator[int]:
+        """Spawn an instance in this context: in its group, if it has one.
+
+        Yields a descriptor of the group of version 2; -1: it has none. Raises OSError if the group
+        is gone.
+        """
+        trees = self._made.get(key, ())
+        with contextlib.ExitStack() as left:
+            group = -1
+            for tree in trees:
+                path = _path(tree, key)
+                if tree.version == 2:
+                    group = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+                    left.callback(os.close, group)
+                else:
+                    # A thread that moves itself alone needs no grace period; this is the only one.
+                    left.callback(_return, tree.home)
+                    _enter(path)
+            yield group
+
+    def members(self, key: Key) -> list[int] | None:
+        """Return the pids of all processes of an instance; None: it has no group."""
+        trees = self._made.get(key)
+        if not trees:
+            return None
+        return pids(_path(trees[0], key))
+
+    def kill(self, key: Key) -> bool:
+        """Send SIGKILL to all processes of an instance; return False if it has no group."""
+        trees = self._made.get(key)
+        if not trees:
+            return False
+        kill(_path(trees[0], key))
+        return True
+
+    def out_of_memory(self, key: Key) -> tuple[float, float] | None:
+        """Return used bytes and limit (0: none) if the OOM killer ended a process of this run."""
+        if self._kills(key) <= self._kills_before.get(key, 0):
+            return None
+        tree = self._memory_tree(key)
+        assert tree is not None
+        path = _path(tree, key)
+        used, limit = _PEAK[tree.version], _MEMORY[tree.version]
+        most = _number(os.path.join(path, limit))
+        return _number(os.path.join(path, used)) or most, most
+
+    def remove(self, key: Key, now: float) -> None:
+        """Remove the group of an instance that has ended, with all that may be left in it."""
+        self._kills_before.pop(key, None)
+        for tree in self._made.pop(key, ()):
+            self._end(_path(tree, key), now)
+
+    def look(self, now: float) -> None:
+        """Remove groups that could not be removed before; called in each round."""
+        for path, due in list(self._emptied.items()):
+            if due <= now:
+                del self._emptied[path]
+                self._end(path, now)
+
+    def deadline(self) -> float | None:
+        """Return the time at which `look` is due; None: no group waits for its removal."""
+        return min(self._emptied.values(), default=None)
+
+    def close(self) -> None:
+        """Remove the groups of all instances if no process is left."""
+        for tree in self.trees:
+            remove_empty(tree.top)
+
+    def _end(self, path: str, now: float) -> None:
+        try:
+            os.rmdir(path)
+        except FileNotFoundError:
+            return
+        except OSError:  # a process is there, or the kernel has not released the last one yet
+            kill(path)
+            remove_empty(path)
+            self._emptied[path] = now + _REMOVE_AGAIN
+
+    def _memory_tree(self, key: Key) -> Tree | None:
+        return next((t for t in self._made.get(key, ()) if "memory" in t.controllers), None)
+
+    def _kills(self, key: Key) -> int:
+        tree = self._memory_tree(key)
+        if tree is None:
+            return 0
+        name = "memory.oom_control" if tree.version == 1 else "memory.events"
+        try:
+            lines = cgroups.read(os.path.join(_path(tree, key), name)).splitlines()
+        except OSError:
+            return 0
+        counts = dict(line.split() for line in lines)
+        return int(counts.get("oom_kill", 0))
+
+
+def remove_empty(group: str) -> None:
+    """Remove a group and those below it, as far as no process is in them."""
+    for name in _folders(group):
+        remove_empty(os.path.join(group, name))
+    with contextlib.suppress(OSError):
+        os.rmdir(group)
+
+
+def pids(group: str) -> list[int]:
+    """Return the other processes in a group and those below it; [] if it is gone."""
+    try:
+        with open(os.path.join(group, "cgroup.procs"), "rb") as file:
+            # 0: a process outside of our pid namespace; a signal to 0 would reach ourselves.
+            found = [int(pid) for pid in file.read().split() if int(pid) not in (0, os.getpid())]
+        has_groups = os.stat(group).st_nlink > _LINKS
+    except OSError:
+        return []
+    if has_groups:  # a process of the instance has made them
+        for name in _folders(group):
+            found += pids(os.path.join(group, name))
+    return found
+
+
+def kill(path: str) -> None:
+    """Send SIGKILL to all processes of a group, also to those that are forked meanwhile."""
+    try:
+        cgroups.write(os.path.join(path, "cgroup.kill"), "1")
+    except OSError:  # version 1, or a kernel before 5.14
+        for _ in range(_KILLS):
+            left = pids(path)
+            for pid in left:
+                with contextlib.suppress(OSError):
+                    os.kill(pid, signal.SIGKILL)
+            if not left:
+                return
+
+
+# --- files of a group -------------------------------------------------------------------------
+
+#: Controller of each limit.
+_CONTROLLER: Final = {
+    "limits.memory": "memory", "limits.memory_high": "memory", "limits.cpu": "cpu",
+}  # fmt: skip
+_MEMORY: Final = {1: "memory.limit_in_bytes", 2: "memory.max"}
+_PEAK: Final = {1: "memory.max_usage_in_bytes", 2: "memory.peak"}
+#: Files that a kernel without swap, or without accounting of it, lacks.
+_ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
+
+
+def limit_files(version: int, limits: LimitRule) -> Iterator[tuple[str, str, str]]:
+    """Yield name of the limit, control file and content, in the order of writing."""
+    memory = str(int(limits.memory))
+    if limits.memory and version == 1:
+        yield "limits.memory", _MEMORY[1], memory
+        yield "limits.memory", _ABOUT_SWAP[0], memory
+    elif limits.memory:
+        yield "limits.memory", _MEMORY[2], memory
+        yield "limits.memory", _ABOUT_SWAP[1], "0"
+        yield (
+            "limits.memory",
+            "memory.oom.group",
+            "1",
+        )  # the instance ends as a whole, and is reported
+    if limits.memory_high and version == 2:
+        yield "limits.memory_high", "memory.high", str(int(limits.memory_high))
+    if limits.cpu:
+        quota, period = cgroups.cpu_quota(limits.cpu)
+        if version == 1:
+            yield "limits.cpu", "cpu.cfs_period_us", str(period)
+            yield "limits.cpu", "cpu.cfs_quota_us", str(quota)
+        else:
+            yield "limits.cpu", "cpu.max", f"{quota} {period}"
+
+
+def _set_limits(path: str, tree: Tree, limits: LimitRule) -> dict[str, str]:
+    faults = {}
+    for name, file, content in limit_files(tree.version, limits):
+        if _CONTROLLER[name] not in tree.controllers:
+            continue
+        try:
+            cgroups.write(os.path.join(path, file), content)
+        except OSError as error:
+            if error.errno == errno.ENOENT and file in _ABOUT_SWAP:
+                continue
+            # Version 1 refuses a share above that of a group above, which then is the limit.
+            if error.errno == errno.EINVAL and file == "cpu.cfs_quota_us":
+                continue
+            faults[name] = _why(path, file, error, limits)
+    return faults
+
+
+def _why(path: str, file: str, error: OSError, limits: LimitRule) -> str:
+    if error.errno == errno.EBUSY:  # of a former run, which the kernel has not given back
+        used = size(_number(os.path.join(path, "memory.usage_in_bytes")))
+        return f"its control group uses {used} already, and the limit is {size(limits.memory)}"
+    return f"{file} of the control group {path} cannot be written: {error.strerror}"
+
+
+def _make(path: str, tree: Tree) -> None:
+    try:
+        os.mkdir(path)
+    except FileExistsError:  # of a former run; a new one has new counters
+        with contextlib.suppress(OSError):
+            os.rmdir(path)
+            os.mkdir(path)
+    except FileNotFoundError:  # the first one, or another supervisor removed the group above
+        make_top(tree)
+        os.mkdir(path)
+
+
+def _enter(path: str) -> None:
+    """Move this thread into a group of version 1. Raises OSError."""
+    cgroups.write(os.path.join(path, "tasks"), "0")
+
+
+def _return(home: str) -> None:
+    """Move this thread back; an error must not hide that the instance was started."""
+    try:
+        _enter(home)
+    except OSError as error:
+        own_log.write(f"the control group {home} cannot be entered again: {error.strerror}")
+
+
+def _number(path: str) -> float:
+    """Return the number in a control file; 0: none, or no limit."""
+    try:
+        text = cgroups.read(path).strip()
+    except OSError:
+        return 0.0
+    return float(text) if text.isdigit() and int(text) < _NO_LIMIT else 0.0
+
+
+def _folders(path: str) -> set[str]:
+    try:
+        with os.scandir(path) as entries:
+            return {entry.name for entry in entries if entry.is_dir(follow_symlinks=False)}
+    except OSError:
+        return set()
+
+
+def group_name(key: Key) -> str:
+    """Return the name of the group of an instance."""
+    return f"{safe_name(key[0])}.{key[1]}"
+
+
+def _path(tree: Tree, key: Key) -> str:
+    return os.path.join(tree.top, group_name(key))

@@ -1,0 +1,195 @@
+"""Limits of real processes: control groups of this machine, CPUs, scheduling."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from rosrm.core.supervisor.rules import LimitRule
+from rosrm.model.values import InstanceState, RestartPolicy
+from rosrm.supervisor import group_trees
+from rosrm.supervisor.client import SupervisorClient
+from rosrm.supervisor.instance_groups import pids
+from tests.waiting import wait_gone, wait_until
+
+MB = 1_000_000
+#: Says that it begins, then writes to each page of many bytes.
+HOG = (
+    "import sys; print('begun', flush=True); x = bytearray({0}); x[::4096] = b'1' * len(x[::4096])"
+)
+#: Starts a daemon with a session of its own and without environment, and says its pid.
+DAEMON = """
+import os, time
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        os.execve("/bin/sleep", ["sleep", "1000"], {})
+    os._exit(0)
+os.wait()
+time.sleep(1000)
+"""
+ONE_RESTART = RestartPolicy("on-failure", delay=0.05, attempts=1)
+
+
+@pytest.fixture(autouse=True)
+def enforcement(tmp_path) -> group_trees.Enforcement:
+    """Return what this machine can enforce; skip the test if that is nothing."""
+    found = group_trees.find(str(tmp_path))
+    if not {"limits.memory", "limits.cpu"}.isdisjoint(found.missing):
+        pytest.skip("; ".join(found.missing.values()))
+    return found
+
+
+def group_of(client: SupervisorClient, name: str, controller: str = "memory") -> Path:
+    """Return the group of an instance that has a controller."""
+    tops = [top for _, top, controllers in client.groups if controller in controllers]
+    return Path(tops[0]) / f"{name}.1"
+
+
+def groups(client: SupervisorClient) -> list[Path]:
+    """Return the groups of all instances."""
+    return [group for _, top, _ in client.groups for group in Path(top).glob("*.*/")]
+
+
+def wait_removed(client: SupervisorClient) -> None:
+    """Wait until no instance has a group."""
+    wait_until(lambda: not groups(client), "the removal of the groups")
+
+
+def test_a_leak_is_killed_at_its_limit_and_restarted(host, client) -> None:
+    """The end says how much the process used of how much; the restart policy applies."""
+    limits = LimitRule(memory=30 * MB)
+    client.start([host.python("leak", HOG.format(200 * MB), limits=limits, restart=ONE_RESTART)])
+    backoff = host.wait(client, "leak", InstanceState.BACKOFF)
+    assert backoff.message.startswith("killed: used 30.0 MB of 30.0 MB; restart 1 of 1")
+    assert backoff.exit_signal == signal.SIGKILL
+    assert host.ended(client, "leak").message.startswith("killed: used 30.0 MB of 30.0 MB")
+    assert host.log("leak").read_text() == "begun\n" * 2
+    wait_removed(client)
+
+
+def test_a_process_below_its_limits_is_not_killed(host, client) -> None:
+    """The limits are reported as enforced, and another signal is reported as before."""
+    limits = LimitRule(memory=200 * MB, cpu=1.5)
+    pid = host.sleeper(client, "calm", limits=limits)
+    os.kill(pid, signal.SIGKILL)
+    status = host.ended(client, "calm")
+    assert (status.enforced, status.message) == (
+        ("limits.memory", "limits.cpu"),
+        "killed by SIGKILL",
+    )
+
+
+def test_a_process_beyond_its_cpu_limit_waits(host, client) -> None:
+    """The kernel throttles it."""
+    client.start([host.python("busy", "while True: pass", limits=LimitRule(cpu=0.1))])
+    host.running(client, "busy")
+    statistics = group_of(client, "busy", "cpu") / "cpu.stat"
+
+    wait_until(
+        lambda: "nr_throttled 0\n" not in statistics.read_text(), "the pause of a busy process"
+    )
+
+
+def test_cpus_scheduling_and_niceness_are_set_before_the_program_runs(host, client) -> None:
+    """Its first instruction runs with them, so each thread and child has them."""
+    last = max(os.sched_getaffinity(0))
+    code = (
+        "import os; print(os.sched_getaffinity(0), os.sched_getscheduler(0), "
+        "os.sched_getparam(0).sched_priority)"
+    )
+    host.run(client, host.python("pinned", code, limits=LimitRule(cpus=(last,))))
+    assert host.log("pinned").read_text() == f"{{{last}}} {os.SCHED_OTHER} 0\n"
+    assert os.sched_getaffinity(client.pid) == os.sched_getaffinity(0)
+
+    status = host.run(client, host.python("quick", code, limits=LimitRule(policy="rr", priority=7)))
+    if "realtime" not in client.unenforced:
+        assert (status.enforced, status.message) == (("realtime",), "")
+        assert host.log("quick").read_text().endswith(f" {os.SCHED_RR} 7\n")
+
+    pid = host.sleeper(client, "kind", limits=LimitRule(nice=5))
+    assert os.getpriority(os.PRIO_PROCESS, pid) == 5
+
+
+@pytest.mark.parametrize("required", [True, False])
+def test_a_cpu_that_the_host_lacks_is_refused(host, client, required: bool) -> None:
+    """The master then tries another host."""
+    limits = LimitRule(cpus=(0, 4000, 4001), required=required)
+    status = host.run(client, host.order("pinned", "true", limits=limits))
+    assert status.state is InstanceState.REFUSED
+    assert status.message == "this host has no CPUs 4000 and 4001 for its processes"
+
+
+def test_a_stop_ends_a_daemon_that_hides(host, client) -> None:
+    """A daemon with an own session and without environment is in the group of its instance."""
+    client.start([host.python("parent", DAEMON)])
+    leader = host.running(client, "parent").pid
+    group = group_of(client, "parent")
+    wait_until(lambda: len(pids(str(group))) == 2, "the daemon")
+    (daemon,) = set(pids(str(group))) - {leader}
+    os.kill(leader, signal.SIGKILL)
+    assert host.ended(client, "parent").exit_signal == signal.SIGKILL
+    wait_gone(daemon)
+    wait_removed(client)
+
+
+def test_the_next_supervisor_finds_the_groups_again(host, client) -> None:
+    """Limits hold on, a group whose instance has ended is removed, and a stop kills the rest."""
+    limits = LimitRule(memory=30 * MB)
+    pid = host.sleeper(client, "lasting", limits=limits)
+    gone = host.sleeper(client, "gone", limits=limits)
+    client.start([host.python("parent", DAEMON)])
+    parent = host.running(client, "parent").pid
+    wait_until(lambda: len(pids(str(group_of(client, "parent")))) == 2, "the daemon")
+    host.kill_supervisor(client)
+    for ended in (gone, parent):
+        os.kill(ended, signal.SIGKILL)
+        wait_gone(ended)
+
+    client = host.connect()
+    assert host.ended_after_connect(client, "gone").state is InstanceState.FAILED
+    assert host.ended_after_connect(client, "parent").state is InstanceState.FAILED
+    wait_until(lambda: {one.name for one in groups(client)} == {"lasting.1"}, "the removal")
+    assert pids(str(group_of(client, "lasting"))) == [pid]
+    assert next(one for one in client.instances if one.pid == pid).enforced == ("limits.memory",)
+
+
+def test_supervisors_side_by_side_keep_apart(host, client, tmp_path) -> None:
+    """Equal names of instances of two supervisors have groups of their own."""
+    other = type(host)(tmp_path / "other")
+    try:
+        second = other.connect()
+        pid, other_pid = host.sleeper(client, "twin"), other.sleeper(second, "twin")
+        assert pids(str(group_of(client, "twin"))) == [pid]
+        assert pids(str(group_of(second, "twin"))) == [other_pid]
+        other.kill_supervisor(second)
+        os.kill(other_pid, signal.SIGKILL)
+        wait_gone(other_pid)
+        abandoned = group_of(second, "twin").parent
+        client = host.replace_supervisor(client)
+        assert not abandoned.exists()
+        assert pids(str(group_of(client, "twin"))) == [pid]
+    finally:
+        other.clean_up()
+
+
+def test_a_supervisor_whose_group_was_removed_makes_it_again(host, client) -> None:
+    """Another supervisor may remove the group while no instance is in it."""
+    host.run(client, host.order("first", "true"))
+    wait_removed(client)
+    for _, top, _ in client.groups:
+        Path(top).rmdir()
+    pid = host.sleeper(client, "second")
+    assert pids(str(group_of(client, "second"))) == [pid]
+
+
+def test_nothing_is_left_of_a_supervisor_that_has_ended(host, client) -> None:
+    """Its group is removed, too."""
+    host.run(client, host.order("job", "true", limits=LimitRule(memory=30 * MB)))
+    tops = [Path(top) for _, top, _ in client.groups]
+    client.close()
+    wait_gone(client.pid)
+    assert not any(top.exists() for top in tops)

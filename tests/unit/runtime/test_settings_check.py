@@ -1,0 +1,99 @@
+"""Check of a settings file in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.runtime.settings_check import SettingsCheck, SettingsSource
+from tests.waiting import wait_until
+
+
+def outcome(source: SettingsSource) -> tuple[str, str]:
+    """Return the settings and the fault of one check."""
+    found: list[tuple[str, str]] = []
+    check = SettingsCheck(source)
+    check.start(lambda text, fault: found.append((text, fault)))
+
+    def is_done() -> bool:
+        check.poll()
+        return bool(found)
+
+    wait_until(is_done, "the check has ended")
+    return found[0]
+
+
+def test_a_valid_file_yields_its_settings_with_the_domain_of_the_command_line(
+    tmp_path: Path,
+) -> None:
+    """So a reload does not count the domain as a difference."""
+    path = tmp_path / "cluster.yaml"
+    path.write_text("queue: {backfill: true}\nros: {domain: 3}\n")
+    text, fault = outcome(SettingsSource("master", str(path), 7))
+    assert fault == ""
+    config = ClusterConfig.from_json(text)
+    assert (config.queue.backfill, config.ros.domain) == (True, 7)
+
+
+def test_an_invalid_file_yields_place_and_allowed_values(tmp_path: Path) -> None:
+    """As a start with this file does."""
+    path = tmp_path / "host.yaml"
+    path.write_text("host: h\nlimts: {memory: 0.5}\n")
+    text, fault = outcome(SettingsSource("slave", str(path)))
+    assert text == ""
+    assert f"{path}:2:1" in fault
+    assert "did you mean 'limits'?" in fault
+    path.write_text("host: h\nlimits: {memory: 0.5}\n")
+    assert HostConfig.from_json(outcome(SettingsSource("slave", str(path)))[0]).limits["memory"]
+
+
+def test_a_runtime_without_a_file_has_nothing_to_read() -> None:
+    """The answer says how to start it with one."""
+    assert outcome(SettingsSource("slave")) == (
+        "", "the slave was started without a file: start it with `--config FILE`",
+    )  # fmt: skip
+
+
+_SIGNALLED = """
+import os, signal, sys
+from rosrm.runtime.bootstrap import handle_signals
+heard = []
+handle_signals(lambda *_: heard.append("stop"), lambda *_: heard.append("reload"))
+os.kill(os.getpid(), signal.SIGHUP)
+print(*heard)
+"""
+
+
+def said_after_sighup(**how: object) -> str:
+    run = subprocess.run(
+        [sys.executable, "-c", _SIGNALLED], check=True, capture_output=True, text=True, **how
+    )
+    return run.stdout.strip()
+
+
+def test_a_sighup_without_a_terminal_reloads() -> None:
+    """As of a service manager: `kill -HUP`."""
+    assert said_after_sighup(start_new_session=True) == "reload"
+
+
+def test_a_sighup_with_a_terminal_stops() -> None:
+    """Its terminal was closed."""
+    pty = pytest.importorskip("pty")
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(sys.executable, [sys.executable, "-c", _SIGNALLED])
+    with os.fdopen(terminal, "rb", buffering=0) as output:
+        assert output.read(100).split() == [b"stop"]
+    os.waitpid(pid, 0)
+
+
+def test_an_ignored_sighup_stays_ignored() -> None:
+    """As by `nohup`."""
+    ignore = lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)  # noqa: E731
+    assert said_after_sighup(start_new_session=True, preexec_fn=ignore) == ""

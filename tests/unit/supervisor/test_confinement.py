@@ -1,0 +1,245 @@
+"""Start of an instance within its limits, where the host cannot enforce all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosrm.core.supervisor.rules import Key, LimitRule
+from rosrm.runtime import cgroups
+from rosrm.supervisor import group_trees, instance_groups
+from rosrm.supervisor.confinement import Confinement
+from rosrm.supervisor.group_trees import Tree
+from rosrm.supervisor.instance_groups import InstanceGroups, limit_files
+from rosrm.supervisor.spawn import ScheduleRefused, SpawnError
+
+KEY = ("camera", 1)
+
+
+@pytest.fixture
+def confinement(tmp_path: Path) -> Confinement:
+    """Return a confinement that has all rights and makes no groups."""
+    made = Confinement(str(tmp_path))
+    made.groups, made.missing = InstanceGroups(), {}
+    return made
+
+
+def started(_group: int, _scheduler: object) -> int:
+    """Pretend to start a process: its pid is one that no process can have."""
+    return 2**22 + 1
+
+
+def not_started(_group: int, _scheduler: object) -> int:
+    """Fail the test."""
+    raise AssertionError("the process was started")
+
+
+def test_what_the_host_cannot_enforce_is_left_out(confinement) -> None:
+    """The reason is known from the connection to the supervisor, so no note repeats it."""
+    confinement.missing = {"limits.memory": "nothing is delegated", "realtime": "no rights"}
+    limits = LimitRule(memory=1e8, cpu=1.0, cpus=(min(os.sched_getaffinity(0)),), policy="fifo",
+                       priority=1)  # fmt: skip
+    assert confinement.start(KEY, limits, started)[1:] == (("limits.cpu", "cpus"), "")
+
+
+def test_required_limits_that_cannot_be_enforced_refuse_the_start(confinement) -> None:
+    """All of them are named, and nothing is started."""
+    confinement.missing = dict.fromkeys(
+        ("limits.memory", "limits.cpu", "nice"), "nothing is delegated"
+    )
+    limits = LimitRule(memory=1e8, cpu=1.0, nice=-5, required=True)
+    with pytest.raises(SpawnError) as refused:
+        confinement.start(KEY, limits, not_started)
+    assert not refused.value.transient
+    assert str(refused.value) == (
+        "its limits are required, and this host cannot enforce limits.memory, limits.cpu and nice: "
+        "nothing is delegated"
+    )
+
+
+def test_a_higher_niceness_needs_no_rights(confinement) -> None:
+    """It is set even where a lower one cannot be."""
+    confinement.missing = {"nice": "no rights"}
+    assert confinement.start(KEY, LimitRule(nice=5, required=True), started)[1] == ("nice",)
+    assert confinement.start(KEY, LimitRule(nice=-5), started)[1] == ()
+
+
+@pytest.fixture
+def full(tmp_path: Path) -> InstanceGroups:
+    """Return groups below a group in which none can be made: a file is in its place."""
+    top = tmp_path / "top"
+    top.write_text("")
+    return InstanceGroups([Tree(1, str(top), str(tmp_path), ("memory",))])
+
+
+def test_a_group_that_cannot_be_made_is_noted(confinement, full: InstanceGroups) -> None:
+    """The process runs without this limit; a process without limits has no note."""
+    confinement.groups = full
+    pid, enforced, note = confinement.start(KEY, LimitRule(memory=1e8, nice=3), started)
+    assert (pid, enforced) == (2**22 + 1, ("nice",))
+    assert note.startswith("limits.memory: no control group ")
+    assert note.endswith("top/camera.1 can be made: Not a directory")
+    assert confinement.start(KEY, LimitRule(), started)[1:] == ((), "")
+
+
+def test_a_group_that_cannot_be_made_refuses_a_start_that_requires_it(confinement, full) -> None:
+    """The master tries another host."""
+    confinement.groups = full
+    with pytest.raises(SpawnError, match=r"cannot enforce limits\.memory: no control group "):
+        confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started)
+
+
+class Closed(InstanceGroups):
+    """Groups that can be made, and that no process can enter."""
+
+    def __init__(self, attempts: int) -> None:
+        super().__init__()
+        self.attempts = attempts
+
+    @contextlib.contextmanager
+    def inside(self, key: Key) -> Iterator[int]:
+        self.attempts -= 1
+        if self.attempts >= 0:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        yield 7
+
+
+def in_group(group: int, _scheduler: object) -> int:
+    """Return the descriptor of the group as the pid."""
+    return group
+
+
+def test_a_group_that_was_removed_is_made_again(confinement) -> None:
+    """Another supervisor may take it for a left-over."""
+    confinement.groups = Closed(1)
+    assert confinement.start(KEY, LimitRule(memory=1e8), in_group) == (7, ("limits.memory",), "")
+
+
+def test_a_group_that_no_process_can_enter_is_left_out(confinement) -> None:
+    """The process runs without, unless its limits are required."""
+    confinement.groups = Closed(9)
+    note = "limits.memory: its control group cannot be entered: Invalid argument"
+    assert confinement.start(KEY, LimitRule(memory=1e8), in_group) == (-1, (), note)
+    with pytest.raises(SpawnError, match="cannot be entered: Invalid argument"):
+        confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started)
+
+
+@pytest.mark.parametrize("required", [True, False])
+def test_realtime_that_the_kernel_refuses(confinement, required: bool) -> None:
+    """Without the requirement the process runs with the default scheduling, and a note."""
+
+    def start(_group: int, scheduler: object) -> int:
+        if scheduler is not None:
+            raise ScheduleRefused("/bin/x may not have real-time scheduling here")
+        return 2**22 + 1
+
+    limits = LimitRule(policy="fifo", priority=40, required=required)
+    if required:
+        with pytest.raises(SpawnError, match="cannot enforce realtime: /bin/x may not have"):
+            confinement.start(KEY, limits, start)
+    else:
+        note = "realtime: /bin/x may not have real-time scheduling here"
+        assert confinement.start(KEY, limits, start) == (2**22 + 1, (), note)
+
+
+@pytest.mark.parametrize(
+    ("version", "files"),
+    [
+        (1, {
+            "memory.limit_in_bytes": "512000000", "memory.memsw.limit_in_bytes": "512000000",
+            "cpu.cfs_period_us": "20000", "cpu.cfs_quota_us": "30000",
+        }),
+        (2, {
+            "memory.max": "512000000", "memory.swap.max": "0", "memory.oom.group": "1",
+            "memory.high": "400000000", "cpu.max": "30000 20000",
+        }),
+    ],
+)  # fmt: skip
+def test_the_control_files_of_each_version(version: int, files: dict[str, str]) -> None:
+    """Swap does not extend a limit, and in version 2 an instance is killed as a whole."""
+    limits = LimitRule(memory=512e6, memory_high=4e8, cpu=1.5)
+    assert {file: text for _, file, text in limit_files(version, limits)} == files
+    assert not list(limit_files(version, LimitRule()))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Iterator[tuple[InstanceGroups, Path]]:
+    """Return groups of version 2 in plain files, and the folder of one instance."""
+    group = tmp_path / "top" / "camera.1"
+    groups = InstanceGroups([Tree(2, str(group.parent), str(tmp_path), ("memory", "cpu"))])
+    group.mkdir(parents=True)
+    (group / "cgroup.procs").write_text("0\n12\n34\n")
+    return groups, group
+
+
+def test_a_process_outside_of_the_pid_namespace_is_left_out(files) -> None:
+    """Its pid is 0, and a signal to 0 would reach the supervisor itself."""
+    assert instance_groups.pids(str(files[1])) == [12, 34]
+
+
+def test_kills_of_an_earlier_run_are_not_reported(files) -> None:
+    """A group that could not be removed keeps its counters."""
+    groups, group = files
+    (group / "memory.events").write_text("low 0\noom 2\noom_kill 2\n")
+    (group / "memory.peak").write_text("500000000\n")
+    (group / "memory.max").write_text("500000000\n")
+    (group / "cpu.max").write_text("max 100000\n")
+    groups.make(KEY, LimitRule(), realtime=False)
+    assert groups.out_of_memory(KEY) is None
+    (group / "memory.events").write_text("low 0\noom 3\noom_kill 3\n")
+    assert groups.out_of_memory(KEY) == (5e8, 5e8)
+    (group / "memory.max").write_text("max\n")
+    assert groups.out_of_memory(KEY) == (5e8, 0.0)
+
+
+def test_a_host_without_control_groups_says_so(tmp_path: Path) -> None:
+    """Each limit has a reason, which names what is missing."""
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/mountinfo").write_text("")
+    found = group_trees.find(str(tmp_path), str(tmp_path))
+    assert found.trees == ()
+    assert found.missing["limits.cpu"] == "the kernel offers no control group with cpu"
+    assert "cgroup_enable=memory" in found.missing["limits.memory"]
+    assert found.missing["limits.memory_high"] == found.missing["limits.memory"]
+
+
+def recorded_tree(recorded: str, folder: Path, given: str) -> tuple[str, str]:
+    """Copy a recorded tree, with the controllers given to groups below; return root and group."""
+    root = folder / "root"
+    shutil.copytree(Path(__file__).parents[2] / "data/cgroup_v2" / recorded, root)
+    (root / "sys/fs/cgroup/cgroup.controllers").write_text("cpuset cpu io memory pids\n")
+    (mount,) = cgroups.mounts(str(root))
+    own = cgroups.own_group(mount, str(root))
+    assert own is not None
+    Path(own, "cgroup.subtree_control").write_text(f"{given}\n")
+    return str(root), own
+
+
+def test_a_controller_that_is_not_delegated_is_named(tmp_path: Path, monkeypatch) -> None:
+    """The other one can be used."""
+    root, own = recorded_tree("systemd", tmp_path, "memory")
+    monkeypatch.setattr(group_trees, "make_top", lambda tree: Path(tree.top).mkdir())
+    (tree,), missing = group_trees.find(str(tmp_path), root)
+    assert (tree.version, tree.controllers, tree.home) == (2, ("memory",), own)
+    assert missing.keys() & {"limits.memory", "limits.memory_high"} == set()
+    assert missing["limits.cpu"].startswith(f"the controller cpu is not delegated to {own}. To get")
+    assert not list(Path(own).glob("rosrm-state-*"))
+
+
+@pytest.mark.parametrize("recorded", ["docker", "systemd"])
+def test_a_group_that_is_not_delegated_says_how_to_get_it(recorded: str, tmp_path: Path) -> None:
+    """A group of version 2 with processes in it gives no controllers to groups below."""
+    root, own = recorded_tree(recorded, tmp_path, "")
+    found = group_trees.find(str(tmp_path), root)
+    assert found.trees == ()
+    assert found.missing["limits.memory"] == found.missing["limits.cpu"]
+    assert found.missing["limits.cpu"].startswith(
+        f"other processes are in the control group {own}, or "
+    )
+    assert "Delegate=yes" in found.missing["limits.cpu"]
