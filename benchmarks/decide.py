@@ -14,7 +14,8 @@ master's runtime, without the transport and the journal:
 - `constrained`: 1,000 processes submitted at once to 1,000 hosts. `plain`: ten different demands by
   turns; `applications`: the same demands with labels and neighbours, in applications of ten
   processes that belong together; `spread`: the same demands, in groups of 150 processes that keep
-  apart. Assignments a second, and how many times as long as `plain` each takes.
+  apart; `devices`: the same demands, half of them with a camera or a share of a GPU. Assignments a
+  second, and how many times as long as `plain` each takes.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.placement import PlacementPlugins, ScoringLink
+from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
@@ -54,6 +56,7 @@ _RACKS = 50
 _APPLICATION = 10
 _GROUP = 150
 _DEMANDS = 10
+_DEVICES = (Device("camera", "front", "/dev/video0"), Device("gpu", "0"), Device("gpu", "1"))
 
 #: Returns the spec of a process by its number.
 SpecOf = Callable[[int], ProcessSpec]
@@ -83,7 +86,7 @@ class Bench:
         for number in range(hosts):
             labels = {"rack": f"r{number % _RACKS}", "arch": "arm64" if number % 4 else "x86_64"}
             description = HostDescription(
-                f"h{number}", number + 1, labels=labels, resources=described
+                f"h{number}", number + 1, labels=labels, resources=described, devices=_DEVICES
             )
             self.step(happened.HostRegistered(number, description))
         self.read()
@@ -148,10 +151,10 @@ def rate_once(hosts: int, spec_of: SpecOf, count: int) -> float:
 
 
 def constrained(runs: int) -> dict[str, dict[str, float]]:
-    """Return the rates with labels and neighbours, measured by turns with the plain one."""
-    rates: dict[str, list[float]] = {"plain": [], "applications": [], "spread": []}
+    """Return the rates with labels, neighbours and devices, by turns with the plain one."""
+    rates: dict[str, list[float]] = {"plain": [], "applications": [], "spread": [], "devices": []}
     for _ in range(runs):
-        for name, spec_of in zip(rates, (mixed, of_application, spread), strict=True):
+        for name, spec_of in zip(rates, (mixed, of_application, spread, on_device), strict=True):
             rates[name].append(rate_once(_CONSTRAINED, spec_of, _CONSTRAINED))
     plain = median(rates["plain"])
     return {
@@ -191,6 +194,14 @@ def of_application(number: int) -> ProcessSpec:
 def spread(number: int) -> ProcessSpec:
     rule = NeighbourRule("apart", group=f"group {number // _GROUP}")
     return replace(mixed(number), neighbours=(rule,))
+
+
+def on_device(number: int) -> ProcessSpec:
+    spec = mixed(number)
+    if number % 2:
+        return spec
+    need = DeviceNeed("camera") if number % 4 else DeviceNeed("gpu", 0.25)
+    return replace(spec, devices=(need,))
 
 
 def _spec(number: int, needs: dict[str, float]) -> ProcessSpec:
