@@ -268,7 +268,7 @@ def test_a_filter_that_fails_lets_processes_wait(make_cluster, third_party, name
     cluster.stays(1.0, lambda: cluster.process("judged").state == "queued", "queued")
     (row,) = [row for row in plugins(cluster) if (row.kind, row.name) == ("filter", name)]
     assert (row.state, said in row.reason) == ("failing", True)
-    cluster.client.cancel("judged")
+    cluster.cancel("judged")
 
 
 # --- probes -----------------------------------------------------------------------------------
