@@ -20,6 +20,8 @@ STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
     "required_labels", "preferred_labels", "avoided_labels", "limits", "cpus", "realtime", "nice",
 )  # fmt: skip
+#: Field that gives the policy the flows of the process, also the learned ones.
+FLOWS_FIELD: Final = "talks_to"
 #: All fields of a spec, which an offer may declare; `given` is of use at the submission only.
 SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec) if f.name != "given")
 

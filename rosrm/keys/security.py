@@ -117,6 +117,9 @@ class Member(Security, Protocol):
     def instance_key(self, process: str, number: int) -> bytes | None:
         """Return the key of an instance on this host; None: with `security: none`."""
 
+    def link_key(self, host_id: int) -> bytes:
+        """Return the key of packets from the slave of another host; b"": `security: none`."""
+
 
 class MemberSecurity:
     """Security of a slave or client, which has a key and one master.
@@ -193,6 +196,10 @@ class MemberSecurity:
     def instance_key(self, process: str, number: int) -> bytes | None:
         """Return the key of an instance on this host."""
         return instance_key(self._key.key, process, number)
+
+    def link_key(self, host_id: int) -> bytes:
+        """Return the key of packets from the slave of another host."""
+        return derived(self._key.key, "link", host_id)
 
     def signature(self, content: bytes) -> bytes:
         """Return b"": only the master signs."""
@@ -271,6 +278,10 @@ class MasterSecurity:
     def introduction(self, host: Peer, ticket: Ticket) -> bytes:
         """Return the key of the bearer of a ticket for a host."""
         return ticket.key(self._secret.shared_key(host.grant))
+
+    def link_key_of(self, host: Peer, host_id: int) -> bytes:
+        """Return the key of packets from the slave of another host, given by its number, to one."""
+        return derived(self._secret.shared_key(host.grant), "link", host_id)
 
     def client(self) -> MemberSecurity:
         """Return the security of this master as a client of another one with the same secret."""
@@ -378,6 +389,16 @@ class NoSecurity:
     def instance_key(self, process: str, number: int) -> None:
         """Return no key."""
         del process, number
+
+    def link_key(self, host_id: int) -> bytes:
+        """Return no key."""
+        del host_id
+        return b""
+
+    def link_key_of(self, host: Peer, host_id: int) -> bytes:
+        """Return no key."""
+        del host, host_id
+        return b""
 
     def introduction(self, host: Peer, ticket: Ticket) -> bytes:
         """Return no key."""

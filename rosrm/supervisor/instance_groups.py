@@ -194,11 +194,11 @@ def remove_empty(group: str) -> None:
 
 
 def pids(group: str) -> list[int]:
-    """Return the processes in a group and those below it; [] if it is gone."""
+    """Return the other processes in a group and those below it; [] if it is gone."""
     try:
         with open(os.path.join(group, "cgroup.procs"), "rb") as file:
             # 0: a process outside of our pid namespace; a signal to 0 would reach ourselves.
-            found = [int(pid) for pid in file.read().split() if pid != b"0"]
+            found = [int(pid) for pid in file.read().split() if int(pid) not in (0, os.getpid())]
         has_groups = os.stat(group).st_nlink > _LINKS
     except OSError:
         return []

@@ -33,6 +33,8 @@ def render(explanation: Mapping[str, Any]) -> RenderableType:
 
 def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield _headline(explanation)
+    if explanation.get("flows"):
+        yield _flows(explanation["flows"])
     if explanation.get("kept"):
         yield _replicas(explanation["kept"])
     if explanation.get("checkpoint"):
@@ -73,6 +75,25 @@ def _headline(explanation: Mapping[str, Any]) -> Text:
     return text
 
 
+def _flows(flows: list[Mapping[str, Any]]) -> Text:
+    """Return the flows from and to other processes, and why some of them do not count yet."""
+    lines = []
+    for one in flows:
+        where = f" on {one['host']}" if one["host"] else ""
+        text = (
+            f"{amount(one['rate'], 'B/s')} {'from' if one['incoming'] else 'to'} "
+            f"{one['process']}{where} ({'measured' if one['learned'] else 'declared'})"
+        )
+        if one.get("round_trip") is not None:
+            text += f", round trip {one['round_trip'] * 1e3:.3g} ms"
+        if one.get("link_rate") is not None:
+            text += f", link {amount(one['link_rate'], 'B/s')}"
+        if not one["host"]:
+            text += f" does not count yet: {one['process']} {one['reason']}"
+        lines.append(text)
+    return Text(f"Flows: {'; '.join(lines)}.")
+
+
 def _replicas(replicas: list[Mapping[str, Any]]) -> Text:
     """Return the hosts with a replica of the snapshot, and the cycle of each."""
     places = [
@@ -97,7 +118,11 @@ def _checkpoint(checkpoint: Mapping[str, Any]) -> Text:
 
 def _limits(limits: Mapping[str, Mapping[str, Any]]) -> Text:
     """Return limits and scheduling, and those that do not hold in this run with the reasons."""
-    values = ", ".join(f"{name} {setting['value']}" for name, setting in limits.items())
+    values = ", ".join(
+        f"{name} {one['value']}"
+        + (f" (earlier runs of its program used {one['used']})" if "used" in one else "")
+        for name, one in limits.items()
+    )
     unmet = [(name, one["reason"]) for name, one in limits.items() if not one.get("holds", True)]
     if not unmet:
         holds = " The host enforces them." if any("holds" in one for one in limits.values()) else ""

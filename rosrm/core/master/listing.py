@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 from typing import Any, Final
 
 from rosrm.core.master.assignment.assign import decide_now
+from rosrm.core.master.assignment.flows import described_flows
 from rosrm.core.master.assignment.neighbours import awaited_neighbour
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
@@ -16,6 +18,7 @@ from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Pro
 from rosrm.model.limits import limits_in_words
 from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy, qualified_name
+from rosrm.wording import amount
 
 _CONDITION: Final = {
     HostCondition.UP: "up",
@@ -160,6 +163,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "decision": None if decision is None else {**decision, "elapsed": age},
         "limits": _limits(state, process),
         "defaults": defaulted_values(process.spec, process.defaulted),
+        "flows": described_flows(state, process),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
         "history": [
@@ -172,13 +176,18 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
 def _limits(state: MasterState, process: Process) -> Mapping[str, Any]:
     """Return limits and scheduling settings of a process with their values; {}: it has none.
 
-    If it runs: also whether each holds, and why not.
+    If it runs: also whether each holds, and why not. For a limit below the usage of earlier runs of
+    the program: also this usage.
     """
+    earlier = state.learned.estimate(process.spec, {}).amounts
     owner = state.instances.get(process.owner)
     runs = owner is not None and owner.is_running
     found: dict[str, Any] = {}
     for name, value in limits_in_words(process.spec).items():
         found[name] = {"value": value}
+        used = earlier.get(name.removeprefix("limits."), 0.0)
+        if used > getattr(process.spec.limits, name.removeprefix("limits."), inf):
+            found[name]["used"] = amount(used, "core" if name == "limits.cpu" else "B")
         if owner is not None and runs:
             reason = owner.host.description.unenforced.get(name, "")
             holds = name in owner.enforced

@@ -23,6 +23,7 @@ from rosrm.core.supervisor.instance import (
     THEN_END,
     THEN_POLICY,
     THEN_RESTART,
+    UNKNOWN_EXIT,
     WITHDRAWN,
     Instance,
     Phase,
@@ -87,13 +88,21 @@ def _exited(instance: Instance, event: events.Event, now: float) -> list[Command
     instance.cpu_time = event.cpu_time
     instance.run_time = max(0.0, now - instance.started)
     if event.out_of_memory and (event.code or event.signal) and not instance.fault:
-        instance.fault = killed_for_memory(*event.out_of_memory)
+        instance.fault = _fault_of_memory(instance, *event.out_of_memory)
     if not event.leftovers:
         return _when_nothing_is_left(instance, now)
     if instance.phase == STOPPING:
         again: list[Command] = [Signal(instance.key, signal.SIGKILL)]
         return [ReportStatus(instance.key), *(again if instance.step >= _KILL else [])]
     return _begin_stop(instance, THEN_POLICY, now)
+
+
+def _fault_of_memory(instance: Instance, used: float, limit: float) -> str:
+    """Return why a run has failed in which the OOM killer ended the leader, or another process."""
+    killed = killed_for_memory(used, limit)
+    if instance.exit_signal == signal.SIGKILL or instance.exit_code == UNKNOWN_EXIT:
+        return killed
+    return f"{ending(instance)}, after a process of it was {killed}"
 
 
 def _cleared(instance: Instance, event: events.Event, now: float) -> list[Command]:

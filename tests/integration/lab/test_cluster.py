@@ -168,7 +168,7 @@ def test_a_slave_beside_the_quota_of_its_jobs(cluster):
         "the job ends", cluster.processes, lambda p: p["group"]["state"] in ("finished", "failed")
     )
     limits = cluster.ask("logs", "group")
-    assert f"{lab.group('host1')}\n" in limits
+    assert f":{lab.group('host1')}/rosrm-state-" in limits  # its own group, below the limited one
     inner = [pid for pid in lab.pids("host1") if "rosrm.slave" in _command(pid)]
     assert inner
     assert lab.group("host1") not in Path(f"/proc/{inner[0]}/cgroup").read_text()

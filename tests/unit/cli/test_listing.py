@@ -248,6 +248,9 @@ def test_explain_shows_limits_and_whether_they_hold():
     limits["nice"] |= {"holds": False, "reason": "CAP_SYS_NICE is required"}
     unmet = " ".join(drawn(explain.render({**STORY, "limits": limits})))
     assert f"{expected} Not enforced: nice: CAP_SYS_NICE is required." in unmet
+    limits["limits.memory"] |= {"used": "600 MB"}
+    above = " ".join(drawn(explain.render({**STORY, "limits": limits})))
+    assert "limits.memory 500 MB (earlier runs of its program used 600 MB), nice -5." in above
 
 
 def test_ps_shows_the_limits_that_hold():

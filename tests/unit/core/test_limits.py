@@ -95,6 +95,15 @@ def test_listings_show_the_limits_that_hold() -> None:
     }  # fmt: skip
 
 
+def test_an_explanation_names_a_limit_below_the_usage_of_earlier_runs() -> None:
+    """The next run will probably be killed."""
+    cluster = Cluster("a")
+    cluster.state.learned.restore("run it", {"memory": 6e8, "cpu": 0.1})
+    cluster.submit(limited("p", memory=5e8, cpu=1.0))
+    limits = cluster.explain("p")["limits"]
+    assert (limits["limits.memory"]["used"], "used" in limits["limits.cpu"]) == ("600 MB", False)
+
+
 @pytest.mark.parametrize(
     ("fields", "fault"),
     [

@@ -55,9 +55,7 @@ def test_the_smallest_set_of_lower_processes_moves_away() -> None:
     assert cluster.phase("p") == "queued"
     cluster.wait(4.0)
     assert (cluster.where("p"), cluster.where("x"), cluster.where("y")) == (["a"], ["b"], ["a"])
-    message = (
-        "x makes room on a for p, which has a higher priority (5 over 0): it moves to b"
-    )  # fmt: skip
+    message = "x makes room on a for p, which has a higher priority (5 over 0): it moves to b"
     assert cluster.recorded("preempted") == [message, message]
     for name in ("p", "x"):
         assert message in [one["message"] for one in cluster.explain(name)["history"]]

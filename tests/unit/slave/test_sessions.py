@@ -5,6 +5,8 @@ import shutil
 
 import pytest
 
+from rosrm.model.values import InstanceId
+from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.sessions import SessionTable, SessionUsage
 from tests.limits import no_more_files
 
@@ -165,3 +167,75 @@ def test_without_descriptors_the_last_usage_stays(tree, table):
     assert table.members(10) == (10,)
     table.refresh(2.0)
     assert table.usage() == {10: SessionUsage(pytest.approx(0.5), 100 * PAGE)}
+
+
+# --- control groups ---------------------------------------------------------------------------
+
+P = InstanceId("p", 1)
+#: Files of a group of each version with 3 CPU seconds, 40 anonymous and 20 shared bytes.
+FILES = {
+    1: {
+        "memory.stat": "cache 999\nrss 1\ntotal_rss 40\ntotal_shmem 20\ntotal_cache 999\n",
+        "cpuacct.usage": "3000000000\n",
+    },
+    2: {"memory.stat": "anon 40\nfile 999\nshmem 20\n", "cpu.stat": "usage_usec 3000000\n"},
+}
+
+
+def grouped(path, version, controllers=("memory", "cpuacct", "cpu"), pids="10\n12\n"):
+    """Return the group of the instance, written as files of one version."""
+    group = path / f"top{version}" / "p.1"
+    group.mkdir(parents=True, exist_ok=True)
+    (group / "cgroup.procs").write_text(pids)
+    for name, text in FILES[version].items():
+        (group / name).write_text(text)
+    return InstanceGroup([(version, str(group.parent), controllers)], P)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_usage_of_a_group_is_that_of_the_instance(tree, table, tmp_path, version):
+    """Each byte counts once, a daemon in a session of its own is a member."""
+    tree.put(10, 10, own=7.0, pages=100)
+    tree.put(11, 10)  # of the session, and not in the group
+    tree.put(12, 12)
+    group = grouped(tmp_path, version)
+    table.add(10, group)
+    table.refresh(0.0)
+    assert table.members(10) == (10, 12)
+    assert table.usage() == {10: SessionUsage(0.0, 60)}
+    file, text = list(FILES[version].items())[1]
+    (tmp_path / f"top{version}" / "p.1" / file).write_text(text.replace("3", "4", 1))
+    table.refresh(2.0)
+    assert table.usage() == {10: SessionUsage(pytest.approx(0.5), 60)}
+
+
+def test_what_a_group_does_not_measure_is_read_of_its_processes(tree, table, tmp_path):
+    """A real-time process has no group of the controller cpu."""
+    tree.put(10, 10, own=7.0, pages=100)
+    tree.put(12, 12, own=1.0, pages=100)
+    group = grouped(tmp_path, 1, ("memory",))
+    table.add(10, group)
+    table.refresh(0.0)
+    tree.put(12, 12, own=2.0, pages=100)
+    table.refresh(1.0)
+    assert table.usage() == {10: SessionUsage(pytest.approx(1.0), 60)}
+
+
+def test_sessions_with_and_without_a_group_stand_side_by_side(tree, table, tmp_path):
+    """An instance whose group could not be made is measured by its session."""
+    for pid, session in ((10, 10), (12, 12), (20, 20), (21, 20)):
+        tree.put(pid, session, pages=10)
+    table.add(10, grouped(tmp_path, 2))
+    table.add(20, InstanceGroup([(2, str(tmp_path / "nowhere"), ("memory",))], P))
+    table.refresh(0.0)
+    assert (table.members(10), table.members(20)) == ((10, 12), (20, 21))
+    assert table.usage() == {10: SessionUsage(0.0, 60), 20: SessionUsage(0.0, 20 * PAGE)}
+
+
+def test_a_group_that_is_gone_reads_as_its_processes(tree, table, tmp_path):
+    """The end of the instance is reported later."""
+    tree.put(10, 10, pages=10)
+    table.add(10, grouped(tmp_path, 2, pids=""))
+    shutil.rmtree(tmp_path / "top2")
+    table.refresh(0.0)
+    assert table.usage() == {10: SessionUsage(0.0, 10 * PAGE)}

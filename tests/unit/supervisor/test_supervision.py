@@ -310,6 +310,36 @@ def test_an_unhealthy_run_has_failed_however_it_ends(when, phase):
     assert instance.message.startswith("unhealthy: silent")
 
 
+@pytest.mark.parametrize(
+    ("end", "text"),
+    [
+        (Exited(TALKER, signal=9, out_of_memory=(5e8, 5e8)), "killed: used 500 MB of 500 MB"),
+        (Exited(TALKER, -1, out_of_memory=(5e8, 5e8)), "killed: used 500 MB of 500 MB"),
+        (Exited(TALKER, 1, out_of_memory=(5e8, 5e8)),
+         "exit code 1, after a process of it was killed: used 500 MB of 500 MB"),
+        (Exited(TALKER, signal=9, out_of_memory=(2e8, 0.0)),
+         "killed: its host ran out of memory; it used 200 MB"),
+        (Exited(TALKER, signal=9), "killed by SIGKILL"),
+    ],
+)  # fmt: skip
+def test_an_end_by_the_oom_killer_is_reported_as_what_it_is(end, text):
+    """The restart policy applies as to any other failure."""
+    core, instance = started(restart=RestartRule("on-failure"))
+    core.handle(end, 1.0)
+    assert instance.phase == BACKOFF
+    assert instance.message.startswith(f"{text}; restart 1 of 5")
+    core.handle(TimePassed(), 60.0)
+    core.handle(Spawned(TALKER, 101, ("limits.memory",), "limits.cpu: no group"), 60.0)
+    assert (instance.message, instance.enforced) == ("limits.cpu: no group", ("limits.memory",))
+
+
+def test_a_run_that_ends_well_has_not_failed_though_a_child_was_killed():
+    """The leader has handled the end of its child."""
+    core, instance = started(restart=RestartRule("on-failure"))
+    core.handle(Exited(TALKER, 0, out_of_memory=(5e8, 5e8)), 1.0)
+    assert (instance.phase, instance.message) == (EXITED, "")
+
+
 def test_a_process_stopped_by_a_signal_is_killed_at_once():
     """A stopped process does not handle SIGINT; after SIGKILL no milder signal follows."""
     core, instance = started()

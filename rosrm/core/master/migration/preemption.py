@@ -23,7 +23,7 @@ from rosrm.core.master.assignment.assign import demand_of, ranking_of
 from rosrm.core.master.assignment.neighbours import awaited_neighbour, running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
-from rosrm.core.master.migration.room import is_leaving, share_of, trial
+from rosrm.core.master.migration.room import is_leaving, share_of, trial, why_no_room
 from rosrm.core.master.migration.start import moves_under_way, why_immovable
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.recovery.journal_gap import why_no_work
@@ -49,7 +49,7 @@ _MOST_HOSTS: Final = 32
 _MOST_SETS: Final = 64
 #: Most combinations of one size that a review looks at on one host.
 _MOST_COMBINATIONS: Final = 5_000
-#: Most sets whose moves a review plans together in vain, for one process.
+#: Most sets whose moves a review plans for one process.
 _MOST_TRIALS: Final = 20
 #: Most reasons against processes in one answer.
 _MOST_REASONS: Final = 3
@@ -168,9 +168,7 @@ def _in_vain(state: MasterState, search: _Search, host: Host, now: float) -> Roo
 
 
 def _wait_for_room(state: MasterState, search: _Search, host: Host, now: float) -> RoomMade:
-    names = sorted(
-        one.id.process for one in state.instances_of(host) if is_leaving(state, one)
-    )  # fmt: skip
+    names = sorted(one.id.process for one in state.instances_of(host) if is_leaving(state, one))
     leave = "leaves" if len(names) == 1 else "leave"
     why = f"{listed(names)} {leave} {host.name} to make room"
     return RoomMade(host, why, now + _GRACE, tried=search.tried)
@@ -193,9 +191,7 @@ def _hosts_in_question(state: MasterState, search: _Search) -> list[tuple[Host, 
     order = np.argsort(np.maximum(missing, 0.0).sum(axis=0), kind="stable")
     found = [(table.hosts[columns[at]], missing[:, at]) for at in order]
     # Nothing is missing where a policy has a veto.
-    return [
-        one for one in found if (one[1] > _CLOSE).any() and one[0].name not in search.tried
-    ]  # fmt: skip
+    return [one for one in found if (one[1] > _CLOSE).any() and one[0].name not in search.tried]
 
 
 def _leaving(state: MasterState, host: Host) -> FloatArray:
@@ -230,9 +226,8 @@ def _make_room(
             break
         if any(group.processes[0].name in search.stuck for group in chosen):
             continue
-        known = len(search.stuck)
+        trials += 1
         moves = _planned(state, search, chosen, now)
-        trials += len(search.stuck) == known
         if moves is not None:
             return _begin(state, search, host, chosen, moves, now)
     against = few(dict.fromkeys(search.against), _MOST_REASONS)
@@ -292,20 +287,18 @@ def _why_it_stays(state: MasterState, search: _Search, process: Process, now: fl
         return f"{process.name} is protected"
     if process.wanted is not DesiredState.RUN or process.name in state.migrations:
         return f"{process.name} is being moved or stopped"
-    return "" if state.settings.preemption == "requeue" else _why_it_cannot_move(
-        state, process, now
-    )  # fmt: skip
+    if state.settings.preemption == "requeue":
+        return ""
+    return _why_it_cannot_move(state, process, now)
 
 
 def _why_it_cannot_move(state: MasterState, process: Process, now: float) -> str:
     if now - process.moved_at < state.settings.cooldown:
         return f"{process.name} is in its cool-down of {state.settings.cooldown:g} s after a move"
-    return why_immovable(state, process)
+    return why_immovable(state, process) or why_no_room(state, process)
 
 
-def covering_sets(
-    groups: Sequence[Group], missing: FloatArray
-) -> Iterator[tuple[Group, ...]]:  # fmt: skip
+def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tuple[Group, ...]]:
     """Yield the sets of groups that free what is missing, the smallest first.
 
     A set with a superfluous group is left out. Of many groups only the first combinations of each
@@ -352,7 +345,7 @@ def _planned(
             moves.append(None if isinstance(planned, Rejected) else planned)
     if rejected is None:
         return moves
-    alone = _plan(state, search.process, rejected, now)
+    alone = _plan(state, search.process, rejected, now) if moves else planned
     if isinstance(alone, Rejected):
         search.stuck.add(rejected.name)
         search.against.append(alone.reason)
