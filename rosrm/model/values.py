@@ -262,7 +262,7 @@ class ProcessSpec:
         priority: processes with a higher number are placed first.
         neighbours: rules on its hosts, relative to other processes.
         cpus: numbers of the CPUs that it may use; (): all.
-        nice: its niceness, -20..19.
+        nice: its niceness, -20..19; 0: that of the slave.
         protect: True: it is neither moved nor stopped to make room for others.
         time_limit: seconds from the first start of a job on a host until the job has failed, with
             restarts and moves; its return to the queue begins them again. 0: no limit.
