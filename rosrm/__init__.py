@@ -29,7 +29,8 @@ Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, Migrati
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
                 ResourceDescription, Accounting, Reading, HostLabelling
-  scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
+  scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, LinkView, FlowView,
+                FloatArray, BoolArray
   filters       FilterOffer, PlacementFilter
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
                 PeriodicImaging, Capabilities, options_of
@@ -108,6 +109,7 @@ if TYPE_CHECKING:
         SpecChecking,
     )
     from rosrm.extensions.hookspecs import hookimpl
+    from rosrm.extensions.link_views import FlowView, LinkView
     from rosrm.extensions.options import options_of
     from rosrm.extensions.units import (
         Amount,
@@ -167,10 +169,11 @@ __all__ = [
     "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
-    "EventRow", "Execute", "FilterOffer", "FloatArray", "Fraction", "GraphDepartureLauncher",
-    "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLabelling", "HostLossPolicy",
+    "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
+    "GraphDepartureLauncher", "HandoffPhase", "Health", "HostChecking", "HostDescription",
+    "HostLabelling", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
-    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "Listing",
+    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "LinkView", "Listing",
     "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
     "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
     "PlacementFilter", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
@@ -198,6 +201,7 @@ _NAMES: Final = {
         "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
+    "extensions.link_views": "FlowView LinkView",
     "extensions.options": "options_of",
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
-from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.values import (
@@ -203,13 +203,16 @@ class ProcessInFile:
     near: tuple[NeighboursInFile, ...] = ()
     apart: tuple[NeighboursInFile, ...] = ()
     spread: SpreadInFile | None = None
+    talks_to: Annotated[Mapping[str, ByteRate], NullIsEmpty()] = field(
+        default_factory=lambda: EMPTY
+    )
+    reschedule: RescheduleInFile = field(default_factory=RescheduleInFile)
+    protect: bool = False
+    time_limit: Seconds = 0.0
     limits: LimitsInFile = field(default_factory=LimitsInFile)
     cpus: tuple[_CpuNumber, ...] = ()
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
-    reschedule: RescheduleInFile = field(default_factory=RescheduleInFile)
-    protect: bool = False
-    time_limit: Seconds = 0.0
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -235,9 +238,9 @@ class ProcessInFile:
             standby=_same(StandbyPolicy, self.standby),
             health=Health() if self.health is None else _same(Health, self.health),
             neighbours=tuple(self._neighbour_rules()),
+            reschedule=_same(ReschedulePolicy, self.reschedule),
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
-            reschedule=_same(ReschedulePolicy, self.reschedule),
             given=(),
         )
 
@@ -339,6 +342,15 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
                 yield Complaint((key,), f"{key}: {fault}")
 
 
+def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name in spec.talks_to:
+        fault = name_fault(name, "process")
+        if name == spec.name:
+            fault = f"{name} names itself; only other processes are allowed"
+        if fault:
+            yield Complaint(("talks_to", name), f"talks_to: {fault}")
+
+
 def _about_limits(spec: ProcessSpec) -> Iterator[Complaint]:
     fault = limits_fault(spec)
     if fault:
@@ -438,5 +450,6 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
+    (_about_flows, ("name", "talks_to")),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),
 )

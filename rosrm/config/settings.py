@@ -29,6 +29,7 @@ from rosrm.extensions.units import (
     Amount,
     Count,
     Fraction,
+    PositiveByteRate,
     PositiveCount,
     PositiveSeconds,
     Quantity,
@@ -237,6 +238,19 @@ class ControlSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class NetworkSettings:
+    """Measurement of links between hosts, and of flows between processes.
+
+    Attributes:
+        period: seconds between two measurements of the links of a host; 0: no measurements.
+        learn: True: slaves measure the flows that processes receive, each at most 1 % of a core.
+    """
+
+    period: Seconds = _CORE.link_period
+    learn: bool = _CORE.learn_flows
+
+
+@dataclass(frozen=True, slots=True)
 class JournalSettings:
     """Durable journal of events and intents.
 
@@ -287,6 +301,7 @@ class ClusterConfig:
         defaults: default needs of processes.
         liveness: time limits for silent hosts.
         control: times of messages.
+        network: measurement of links and flows.
         journal: journal of events and intents.
         record: recording of all events that the master receives, for replay.
         checkpoint: policy that places replicas of snapshots on other hosts, if any.
@@ -311,6 +326,7 @@ class ClusterConfig:
     defaults: ProcessDefaults = field(default_factory=ProcessDefaults)
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
     control: ControlSettings = field(default_factory=ControlSettings)
+    network: NetworkSettings = field(default_factory=NetworkSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
     checkpoint: CheckpointPolicySettings = field(default_factory=CheckpointPolicySettings)
@@ -343,6 +359,8 @@ class ClusterConfig:
             need=self.migration.need,
             max_migrations=self.migration.max_in_flight,
             automatic=self.migration.automatic,
+            link_period=self.network.period,
+            learn_flows=self.network.learn,
             preemption=self.queue.preemption,
             rebalance=self.rebalance.automatic,
             rebalance_spread=self.rebalance.spread,
@@ -403,6 +421,23 @@ class KeepSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """Links of this host to other hosts.
+
+    Attributes:
+        rate: bytes a second that each link can carry; None: the speed of its network interface.
+        rates: bytes a second by name of the other host, for links with another rate.
+        limit: fraction of these rates that flows of processes may use.
+        port: UDP port for the packets that measure round trips; 0: any free one.
+    """
+
+    rate: PositiveByteRate | None = None
+    rates: Mapping[str, PositiveByteRate] = field(default_factory=lambda: EMPTY)
+    limit: Fraction = 1.0
+    port: Annotated[int, Quantity(high=65535, whole=True)] = 0
+
+
+@dataclass(frozen=True, slots=True)
 class HostControlSettings:
     """Times of the requests to a slave.
 
@@ -436,6 +471,7 @@ class HostConfig:
         logs: logs of the processes.
         control: times of requests.
         keep: snapshots and replicas.
+        links: links to other hosts.
         on_stop: "stop": a slave that is stopped stops its processes; "keep": it leaves them running
             under the supervisor.
     """
@@ -458,6 +494,7 @@ class HostConfig:
     logs: LogSettings = field(default_factory=LogSettings)
     control: HostControlSettings = field(default_factory=HostControlSettings)
     keep: KeepSettings = field(default_factory=KeepSettings)
+    links: LinkSettings = field(default_factory=LinkSettings)
     on_stop: Literal["stop", "keep"] = "stop"
 
     def __post_init__(self) -> None:

@@ -24,7 +24,9 @@ _SECTIONS: Final = ("processes", "defaults")
 #: Keys that are allowed in an entry but not in `defaults`.
 _NOT_IN_DEFAULTS: Final = ("name", "foreach")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
-_NOT_IN_CLUSTER_DEFAULTS: Final = (*_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread")
+_NOT_IN_CLUSTER_DEFAULTS: Final = (
+    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to",
+)  # fmt: skip
 
 
 def load_work(path: str | Path, registry: Registry | None = None) -> tuple[ProcessSpec, ...]:

@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.extensions.link_views import NO_FLOWS, NO_LINKS, FlowView, LinkView
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
     EMPTY,
@@ -153,6 +154,7 @@ class HostView:
         capacity: (N, R) base units at usage 1.0; NaN as in `usage`.
         processes: (N,) number of processes on the host or reserved for it.
         labels: (N,) read-only mappings, the labels of each host, those of its probes included.
+        links: links between the hosts and all hosts of the cluster.
         tenants: (N,) read-only mappings, for each host: name to spec of each process with an
             instance there, assigned ones included. A spec is as at the start of the instance.
 
@@ -166,6 +168,7 @@ class HostView:
     capacity: FloatArray
     processes: npt.NDArray[np.int64]
     labels: Sequence[Mapping[str, str]] = ()
+    links: LinkView = NO_LINKS
     tenants: Sequence[Mapping[str, ProcessSpec]] = ()
 
     def labelled(self, key: str, value: str) -> BoolArray:
@@ -198,10 +201,13 @@ class ProcessView:
             field raises `UndeclaredField`.
         need: (N, R) demand of the process on each host, fractions of that host's capacity; inf
             where a host lacks a needed resource, never NaN.
+        flows: flows between the process and others, declared and learned ones; empty unless the
+            offer declares `talks_to` in `reads`.
     """
 
     spec: ProcessSpec
     need: FloatArray
+    flows: FlowView = NO_FLOWS
 
 
 @dataclass(frozen=True)

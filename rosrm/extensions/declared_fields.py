@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from types import MappingProxyType
 from typing import Any, Final, cast
 
 from rosrm.extensions.contracts import Capabilities
@@ -19,6 +20,8 @@ STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
     "required_labels", "preferred_labels", "avoided_labels", "limits", "cpus", "realtime", "nice",
 )  # fmt: skip
+#: Field that gives the policy the flows of the process, also the learned ones.
+FLOWS_FIELD: Final = "talks_to"
 #: All fields of a spec, which an offer may declare; `given` is of use at the submission only.
 SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec) if f.name != "given")
 
@@ -31,7 +34,7 @@ class UndeclaredField(LookupError):
 
 
 class DeclaredSpec:
-    """A spec that gives a plugin the standard fields and the declared ones, and no others."""
+    """A read-only spec that gives a plugin the standard fields and the declared ones, no others."""
 
     __slots__ = ("_reads", "_spec")
 
@@ -41,7 +44,8 @@ class DeclaredSpec:
 
     def __getattr__(self, name: str) -> Any:
         if name in STANDARD_FIELDS or name in self._reads:
-            return getattr(self._spec, name)
+            value = getattr(self._spec, name)
+            return MappingProxyType(value) if isinstance(value, dict) else value
         if name in SPEC_FIELDS:
             raise UndeclaredField(
                 f"the plugin reads {name!r} of the spec, which its offer does not declare: "

@@ -30,6 +30,9 @@ _METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
     "launcher": ("prepare",),
 }
 
+#: Most labels from all probes of a host; a registration with more than 256 would be refused.
+_MOST_LABELS: Final = 128
+_LONGEST_LABEL: Final = 200
 #: Seconds between two reads of a `FailedProbe`.
 _FAILED_PERIOD: Final = 10.0
 
@@ -187,15 +190,20 @@ def fault_of_labels(labels: object, before: Sequence[MadeProbe]) -> str:
         return f'has the labels {labels!r:.100}; a mapping is required, as {{"key": "value"}}'
     for key, value in labels.items():
         if not (key and _is_text(key) and _is_text(value)):
-            return f"has the label {key!r:.100}: {value!r:.100}; printable text is required"
+            return (
+                f"has the label {key!r:.100}: {value!r:.100}; printable text of at most "
+                f"{_LONGEST_LABEL} letters is required"
+            )
         others = [one.name for one in before if one.labels.get(key, value) != value]
         if others:
             return f"gives the label {key!r} another value than {others[0]!r}"
+    if len(labels) + sum(len(one.labels) for one in before) > _MOST_LABELS:
+        return f"exceeds the {_MOST_LABELS} labels that the probes of a host may give"
     return ""
 
 
 def _is_text(word: object) -> bool:
-    return isinstance(word, str) and word.isprintable()
+    return isinstance(word, str) and word.isprintable() and len(word) <= _LONGEST_LABEL
 
 
 def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:

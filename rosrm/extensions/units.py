@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
 from rosrm.model.durations import LONGEST
+from rosrm.model.values import LARGEST_RATE
 from rosrm.wording import get_close_matches
 
 _SIZES: Final = {
@@ -44,12 +45,14 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "duration": _DURATIONS,
     "size": _SIZES,
     "cores": _CORES,
+    "rate": _RATES,
     "amount": {**_SIZES, **_RATES, **_CORES},
 }
 _EXAMPLES: Final = {
     "duration": '"500ms" or "10s"',
     "size": '"500MB" or "2GiB"',
     "cores": '"0.5 cores"',
+    "rate": '"30MB/s"',
     "amount": '"500MB" or "0.5 cores"',
 }
 
@@ -161,6 +164,8 @@ class Quantity:
 
 Seconds = Annotated[float, Quantity("duration")]
 PositiveSeconds = Annotated[float, Quantity("duration", above=True)]
+ByteRate = Annotated[float, Quantity("rate", high=LARGEST_RATE)]
+PositiveByteRate = Annotated[float, Quantity("rate", high=LARGEST_RATE, above=True)]
 Bytes = Annotated[int, Quantity("size", whole=True)]
 Fraction = Annotated[float, Quantity(high=1.0, hint="a fraction: 0.8 means 80 %")]
 Count = Annotated[int, Quantity(high=2**31 - 1, whole=True)]

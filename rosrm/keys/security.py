@@ -83,6 +83,9 @@ class Security(Protocol):
     def remember(self, peer: Peer) -> None:
         """Store a peer whose message was genuine; a stranger is never stored."""
 
+    def accepts(self, ticket: Ticket) -> bool:
+        """Return True if the ticket of a genuine request is in force."""
+
     def signature(self, content: bytes) -> bytes:
         """Return the signature of a message to all receivers; b"" if this is not the master."""
 
@@ -99,6 +102,9 @@ class Member(Security, Protocol):
 
     master: Peer
 
+    def note_beat(self, tickets_from: int) -> None:
+        """Store the time of a beat of the master, and the lowest version of tickets in force."""
+
     def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
         """Return the slave for which this part is the bearer of a ticket.
 
@@ -110,6 +116,9 @@ class Member(Security, Protocol):
 
     def instance_key(self, process: str, number: int) -> bytes | None:
         """Return the key of an instance on this host; None: with `security: none`."""
+
+    def link_key(self, host_id: int) -> bytes:
+        """Return the key of packets from the slave of another host; b"": `security: none`."""
 
 
 class MemberSecurity:
@@ -123,6 +132,7 @@ class MemberSecurity:
     def __init__(self, key: PrincipalKey, run: bytes | None = None) -> None:
         self.run = run or new_run()
         self.tickets_from = 0
+        self._beat_at = 0
         self._key = key
         whom = str(key.grant.principal)
         self.described = f"the key of {whom}"
@@ -138,7 +148,7 @@ class MemberSecurity:
         ticket = ticket_of(name)
         if ticket is None:
             return None
-        if not ticket.is_valid(time.monotonic_ns()):
+        if not self._is_valid(ticket):
             return self._bearer_of(ticket)  # the bearer is genuine, if its message opens
         held: Mapping[str, Peer] = self._bearers.get(ticket.bearer, {})
         return held.get(name) or (self._bearer_of(ticket) if self._has_room(held) else None)
@@ -148,7 +158,7 @@ class MemberSecurity:
 
         No valid ticket is forgotten, because its recorded requests would then open again.
         """
-        return len(held) < _MOST_TICKETS or _is_void(next(iter(held.values())))
+        return len(held) < _MOST_TICKETS or not self._is_valid(_oldest(held))
 
     def _bearer_of(self, ticket: Ticket) -> Peer:
         link = new_link(ticket.key(self._key.key), Direction.FROM_PEER, Direction.TO_PEER)
@@ -156,12 +166,23 @@ class MemberSecurity:
 
     def remember(self, peer: Peer) -> None:
         """Keep a bearer whose request was genuine, as long as its ticket is valid."""
-        if peer.ticket is None or _is_void(peer):
+        if peer.ticket is None or not self._is_valid(peer.ticket):
             return
         held = self._bearers.setdefault(peer.ticket.bearer, OrderedDict())
         held[peer.name] = peer
-        while held and _is_void(next(iter(held.values()))):
+        while not self._is_valid(_oldest(held)):
             held.popitem(last=False)
+
+    def note_beat(self, tickets_from: int) -> None:
+        """Store the time of a beat of the master, and the lowest version of tickets in force."""
+        self.tickets_from, self._beat_at = tickets_from, time.monotonic_ns()
+
+    def accepts(self, ticket: Ticket) -> bool:
+        """Return True if the ticket of a genuine request is in force."""
+        return ticket.version >= self.tickets_from and self._is_valid(ticket)
+
+    def _is_valid(self, ticket: Ticket) -> bool:
+        return ticket.is_valid(time.monotonic_ns(), self._beat_at)
 
     def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
         """Return the slave to which a ticket of this part introduces.
@@ -175,6 +196,10 @@ class MemberSecurity:
     def instance_key(self, process: str, number: int) -> bytes | None:
         """Return the key of an instance on this host."""
         return instance_key(self._key.key, process, number)
+
+    def link_key(self, host_id: int) -> bytes:
+        """Return the key of packets from the slave of another host."""
+        return derived(self._key.key, "link", host_id)
 
     def signature(self, content: bytes) -> bytes:
         """Return b"": only the master signs."""
@@ -245,9 +270,18 @@ class MasterSecurity:
             self._peers[peer.name, peer.generation] = peer
             self._links[self._secret.shared_key(peer.grant)] = peer.link
 
+    def accepts(self, ticket: Ticket) -> bool:
+        """Return False: tickets are for slaves."""
+        del ticket
+        return False
+
     def introduction(self, host: Peer, ticket: Ticket) -> bytes:
         """Return the key of the bearer of a ticket for a host."""
         return ticket.key(self._secret.shared_key(host.grant))
+
+    def link_key_of(self, host: Peer, host_id: int) -> bytes:
+        """Return the key of packets from the slave of another host, given by its number, to one."""
+        return derived(self._secret.shared_key(host.grant), "link", host_id)
 
     def client(self) -> MemberSecurity:
         """Return the security of this master as a client of another one with the same secret."""
@@ -339,6 +373,14 @@ class NoSecurity:
         if len(self._peers) > _MOST_PEERS:
             self._peers.popitem(last=False)
 
+    def note_beat(self, tickets_from: int) -> None:
+        """Store the lowest version of the tickets in force."""
+        self.tickets_from = tickets_from
+
+    def accepts(self, ticket: Ticket) -> bool:
+        """Return True if a ticket is of a version in force."""
+        return ticket.version >= self.tickets_from
+
     def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
         """Return the slave for which this part is the bearer of a ticket."""
         del key
@@ -347,6 +389,16 @@ class NoSecurity:
     def instance_key(self, process: str, number: int) -> None:
         """Return no key."""
         del process, number
+
+    def link_key(self, host_id: int) -> bytes:
+        """Return no key."""
+        del host_id
+        return b""
+
+    def link_key_of(self, host: Peer, host_id: int) -> bytes:
+        """Return no key."""
+        del host, host_id
+        return b""
 
     def introduction(self, host: Peer, ticket: Ticket) -> bytes:
         """Return no key."""
@@ -386,8 +438,10 @@ class NoSecurity:
 Authority = MasterSecurity | NoSecurity
 
 
-def _is_void(peer: Peer) -> bool:
-    return peer.ticket is None or not peer.ticket.is_valid(time.monotonic_ns())
+def _oldest(held: Mapping[str, Peer]) -> Ticket:
+    ticket = next(iter(held.values())).ticket
+    assert ticket is not None, "only bearers of tickets are stored"
+    return ticket
 
 
 def _bearer_grant(ticket: Ticket) -> Grant:

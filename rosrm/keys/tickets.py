@@ -43,13 +43,21 @@ class Ticket(NamedTuple):
     process: str
     bearer: Principal
 
-    def is_valid(self, now: int) -> bool:
-        """Return True if a ticket is in force at a time of the slave's clock, ns.
+    def is_valid(self, now: int, beat_at: int) -> bool:
+        """Return True if a ticket has not expired.
 
-        That clock begins again when the host boots. So a ticket from before, which seems to be
-        valid for longer than any ticket, is void.
+        While the master is away, no bearer can get another ticket. So a ticket that was valid at
+        the master's newest beat is valid until the next one; otherwise slaves would send no more
+        replicas of snapshots.
+
+        The slave's clock begins again when the host boots. So a ticket from before, which seems to
+        be valid for longer than any ticket, is void.
+
+        Args:
+            now: time of the slave's clock, ns.
+            beat_at: time of the master's newest beat by that clock, ns.
         """
-        return now <= self.until <= now + _LIFE_NS
+        return beat_at <= self.until <= now + _LIFE_NS
 
     def text(self) -> str:
         """Return the ticket as text for messages."""

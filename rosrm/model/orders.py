@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from rosrm.model.links import MEASURE_SECONDS, LinkPeer
 from rosrm.model.values import EMPTY, Assignment, InstanceId, RestartPolicy
 
 
@@ -94,6 +95,19 @@ class DropReplica:
     instance: InstanceId
 
 
+@dataclass(frozen=True, slots=True)
+class MeasureLinks:
+    """Measure the links to other hosts; the answer has a `LinkReport`.
+
+    Attributes:
+        peers: the other hosts; (): report addresses, interfaces and flows only.
+        learn: measure the flows to the instances of this host from now on.
+    """
+
+    peers: tuple[LinkPeer, ...] = ()
+    learn: bool = False
+
+
 #: Orders to the slave's core.
 InstanceOrder = (
     StartInstance
@@ -103,7 +117,9 @@ InstanceOrder = (
     | SetRestartPolicy
     | ReportInstances
 )
-Order = InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica | ReloadSettings
+Order = (
+    InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica | ReloadSettings | MeasureLinks
+)
 
 #: Seconds that the check of a settings file may take.
 CHECK_TIMEOUT: Final = 20.0
@@ -111,6 +127,8 @@ CHECK_TIMEOUT: Final = 20.0
 
 def seconds_of(order: Order) -> float:
     """Return the seconds for which a slave may execute an order before it answers."""
+    if isinstance(order, MeasureLinks):
+        return MEASURE_SECONDS
     if isinstance(order, ReloadSettings):
         return CHECK_TIMEOUT
     return order.timeout if isinstance(order, RunExecutor) else 0.0

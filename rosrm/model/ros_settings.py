@@ -102,6 +102,12 @@ class RosSettings:
         """Return the interface of these settings or of ROSRM_INTERFACE; "": all interfaces."""
         return self._in_force().get(INTERFACE_VARIABLE, "")
 
+    def is_local(self) -> bool:
+        """Return True if ROS traffic stays on this machine."""
+        joined = self._in_force()
+        is_local = joined.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
+        return is_local or joined.get("ROS_LOCALHOST_ONLY") == "1"
+
     def _in_force(self) -> Mapping[str, str]:
         return {**os.environ, **self.environment()}
 

@@ -22,6 +22,8 @@ MOST_USED: Final[Mapping[str, float]] = MappingProxyType({"cpu": 65_536.0, "memo
 MOST_USED_OF_OTHERS: Final = 2.0**53
 #: Instance numbers and journal records grow one by one, and so never get as large as this.
 LARGEST_NUMBER: Final = 2**53
+#: Greatest rate of a flow or a link, in B/s.
+LARGEST_RATE: Final = 1e15
 
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 
@@ -261,11 +263,12 @@ class ProcessSpec:
         avoided_labels: a host with any of these labels is chosen only if no other host fits.
         priority: processes with a higher number are placed first.
         neighbours: rules on its hosts, relative to other processes.
-        cpus: numbers of the CPUs that it may use; (): all.
-        nice: its niceness, -20..19; 0: that of the slave.
+        talks_to: name of another process to the bytes a second that flow between both.
         protect: True: it is neither moved nor stopped to make room for others.
         time_limit: seconds from the first start of a job on a host until the job has failed, with
             restarts and moves; its return to the queue begins them again. 0: no limit.
+        cpus: numbers of the CPUs that it may use; (): all.
+        nice: its niceness, -20..19; 0: that of the slave.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -297,13 +300,14 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
     neighbours: tuple[NeighbourRule, ...] = ()
+    talks_to: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    reschedule: ReschedulePolicy = ReschedulePolicy()
+    protect: bool = False
+    time_limit: float = 0.0
     limits: Limits = Limits()
     cpus: tuple[int, ...] = ()
     realtime: Realtime = Realtime()
     nice: int = 0
-    reschedule: ReschedulePolicy = ReschedulePolicy()
-    protect: bool = False
-    time_limit: float = 0.0
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

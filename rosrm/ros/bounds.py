@@ -51,6 +51,7 @@ _OTHER_ENTRIES: Final = {
     "StandbyPolicy.apart_by": 256,
     "ProcessSpec.neighbours": 256,
     "NeighbourRule.processes": 1024,
+    "ProcessSpec.talks_to": 256,
     "ProcessStatusBatch.failing": 1000,
     "ProcessUsage.others": 16,
     "Sealed.body": 1 << 24,

@@ -153,6 +153,9 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
             msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
         ),
         neighbours=[_to_msg(msg.NeighbourRule, rule) for rule in spec.neighbours],
+        talks_to=[
+            msg.ProcessFlow(process=name, rate=float(rate)) for name, rate in spec.talks_to.items()
+        ],
     )  # fmt: skip
 
 
@@ -173,6 +176,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
             options=json_object(message.migration.options, "migration options"),
         ),
         neighbours=tuple(_from_msg(values.NeighbourRule, rule) for rule in message.neighbours),
+        talks_to={flow.process: flow.rate for flow in message.talks_to},
     )  # fmt: skip
     fault = limits_fault(spec)
     if fault:
@@ -195,6 +199,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _needs_fault(message)
         or _times_fault(message)
         or _neighbours_fault(message)
+        or _flows_fault(message)
     )
 
 
@@ -230,6 +235,19 @@ def _neighbours_fault(message: msg.ProcessSpec) -> str:
             fault = name_fault(name, "process")
             if fault:
                 return f"neighbours: {fault}"
+    return ""
+
+
+def _flows_fault(message: msg.ProcessSpec) -> str:
+    for flow in message.talks_to:
+        fault = name_fault(flow.process, "process")
+        if not fault and flow.process == message.name:
+            fault = f"{message.name} names itself; only other processes are allowed"
+        if not fault and not 0.0 <= flow.rate <= values.LARGEST_RATE:
+            allowed = f"0 to {values.LARGEST_RATE:g}"
+            fault = f"{flow.rate} B/s with {flow.process}; allowed: {allowed}"
+        if fault:
+            return f"talks_to: {fault}"
     return ""
 
 

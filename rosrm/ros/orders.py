@@ -9,9 +9,11 @@ from typing import Final
 from rosrm.errors import Refused
 from rosrm.model.description_checks import name_fault
 from rosrm.model.durations import LONGEST
+from rosrm.model.links import peer_to_json, peers_from_json
 from rosrm.model.orders import (
     DropReplica,
     FenceInstance,
+    MeasureLinks,
     Order,
     ReloadSettings,
     ReplicateSnapshot,
@@ -37,6 +39,7 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
     FenceInstance: _Request.FENCE,
     ReplicateSnapshot: _Request.REPLICATE,
     DropReplica: _Request.DROP_REPLICA,
+    MeasureLinks: _Request.MEASURE_LINKS,
     ReloadSettings: _Request.RELOAD,
 }
 #: Orders by an instance alone.
@@ -54,6 +57,10 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
             request.arguments = json.dumps(dict(arguments))
             return request
         case ReportInstances() | ReloadSettings():
+            return request
+        case MeasureLinks(peers, learn):
+            plain = [peer_to_json(peer) for peer in peers]
+            request.arguments = json.dumps({"peers": plain, "learn": learn})
             return request
         case StartInstance(assignment):
             request.assignment = convert.assignment_to_msg(assignment)
@@ -77,6 +84,8 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
         case _Request.EXECUTE:
             arguments = convert.json_object(request.arguments, "the arguments of an executor")
             return RunExecutor(request.executor, arguments, request.timeout)
+        case _Request.MEASURE_LINKS:
+            return _measure_links(request.arguments)
         case _Request.REPORT:
             return ReportInstances()
         case _Request.RELOAD:
@@ -88,6 +97,14 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
     if request.action not in _OF_INSTANCE:
         raise Refused(f"unknown action {request.action}")
     return _OF_INSTANCE[request.action](instance)
+
+
+def _measure_links(arguments: str) -> MeasureLinks:
+    plain = convert.json_object(arguments, "the arguments of a measurement")
+    try:
+        return MeasureLinks(peers_from_json(plain["peers"]), bool(plain["learn"]))
+    except (LookupError, ValueError) as error:
+        raise Refused(f"an order to measure links: {error}") from None
 
 
 def _fault(request: srv.ControlHost.Request) -> str:

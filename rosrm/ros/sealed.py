@@ -9,7 +9,6 @@ receivers are signed, in a `rosrm_msgs/Signed`, and not encrypted.
 from __future__ import annotations
 
 import struct
-import time
 from array import array
 from collections.abc import Callable
 from typing import Any, Final, Generic, TypeVar
@@ -211,7 +210,7 @@ class SealedEndpoints(Generic[SecurityT]):
                 genuine.answer(failed_response(service_type, refusal, "denied"))
             elif not first_contact and envelope.receiver_run != self.security.run:
                 genuine.answer(failed_response(service_type, _OTHER_RUN, "stale"))
-            elif peer.ticket is not None and not self._is_in_force(peer.ticket):
+            elif peer.ticket is not None and not self.security.accepts(peer.ticket):
                 genuine.answer(failed_response(service_type, _OLD_TICKET, "stale"))
             else:
                 fault = guard.call(lambda: handle(_plain(service_type.Request, plain), genuine))
@@ -219,10 +218,6 @@ class SealedEndpoints(Generic[SecurityT]):
                     genuine.answer(failed_response(service_type, fault))
 
         self.participant.serve(srv.Sealed, name, take)
-
-    def _is_in_force(self, ticket: Ticket) -> bool:
-        is_valid = ticket.is_valid(time.monotonic_ns())
-        return is_valid and ticket.version >= self.security.tickets_from
 
     def client(
         self, service_type: Any, name: str, peer: Peer, *, first_contact: bool = False

@@ -28,7 +28,8 @@ from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
-from rosrm.model.orders import RunExecutor, SetRestartPolicy
+from rosrm.model.links import LinkReport
+from rosrm.model.orders import MeasureLinks, RunExecutor, SetRestartPolicy
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -42,6 +43,7 @@ from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
+from rosrm.ros.slave.flows import FlowSampler
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.replication import ReplicationEndpoint
@@ -52,8 +54,10 @@ from rosrm.runtime.state_lock import only_one
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
+from rosrm.slave.interfaces import own_address
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
+from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sampler import ProbeReport, Sampler
@@ -104,6 +108,7 @@ class SlaveRuntime:
         self._incarnation = _random_number()
         self._stopping = ""
         self._accepting = False
+        self._learns = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
         self._state = SlaveState(
             max_processes=config.max_processes, max_starting=config.max_starting, max_age=max_age
@@ -138,6 +143,13 @@ class SlaveRuntime:
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._note_probes(first)
             self._note_broken(offered.broken)
+            name = f"{self._participant.node.get_name()}_flows"
+            self._flows = FlowSampler(lambda: self._participant.unwatched_node(name))
+            self._links = LinkProber(
+                config.links, key_of=security.link_key, own_id=lambda: self._endpoint.host_id,
+                only=own_address(config.ros), flows=self._flows.rates,
+            )  # fmt: skip
+            opened.callback(self._links.close)
             self._serve_master(max_age)
             self._starter = Starter(
                 config, self._snapshots, self._state, self._supervisor, self._endpoint,
@@ -162,7 +174,7 @@ class SlaveRuntime:
         probes = registry.probes(config.probes, context)
         self._sampler = Sampler(probes.made)
         opened.callback(self._sampler.close)
-        self._labels = {**probes.labels, **config.labels}
+        self._probe_labels = probes.labels
         self._limit = self._limits()
         return probes.absent
 
@@ -211,7 +223,7 @@ class SlaveRuntime:
         )  # fmt: skip
         duties = Duties(
             self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
-            self._execute, self._read_log, self._reload,
+            self._execute, self._read_log, self._measure_links, self._reload,
         )  # fmt: skip
         SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
@@ -230,7 +242,8 @@ class SlaveRuntime:
         config = self._config
         return HostDescription(
             name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
-            pid=os.getpid(), software_version=__version__, labels=self._labels,
+            pid=os.getpid(), software_version=__version__,
+            labels={**self._probe_labels, **config.labels},
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=self._executors.names, absent=self._absent,
             unenforced=self._supervisor.unenforced, cpus=tuple(sorted(os.sched_getaffinity(0))),
@@ -312,6 +325,7 @@ class SlaveRuntime:
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
                 guard.call(self._starter.look_at_graph, awaited)
+            guard.call(self._links.turn, now)
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
                 guard.call(self._look_at_health, now)
@@ -373,6 +387,7 @@ class SlaveRuntime:
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
+        self._look_at_flows()
         sample = self._sampler.latest(now)
         if sample.reports:
             self._note_probes(sample.reports)
@@ -417,6 +432,15 @@ class SlaveRuntime:
                 [one.memory for one in used],
                 {slot: [one.others[slot] for one in used] for slot in used[0].others},
             )
+
+    def _measure_links(self, order: MeasureLinks, done: Callable[[LinkReport], None]) -> None:
+        """Measure links, and learn flows from now on or no more."""
+        self._learns = order.learn
+        self._links.measure(order, done)
+
+    def _look_at_flows(self) -> None:
+        nodes = self._state.nodes() if self._learns else {}
+        self._participant.guard.call(self._flows.look, nodes)
 
     # --- core and supervisor -------------------------------------------------------------
 

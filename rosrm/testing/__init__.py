@@ -29,7 +29,14 @@ from rosrm.testing.probes import (
     made_probe,
     probe_context,
 )
-from rosrm.testing.scoring import ScoringContract, host_view, one_row, process_view, vetoes
+from rosrm.testing.scoring import (
+    ScoringContract,
+    flow_view,
+    host_view,
+    one_row,
+    process_view,
+    vetoes,
+)
 
 __all__ = [
     "CheckpointContract",
@@ -45,6 +52,7 @@ __all__ = [
     "Registry",
     "ScoringContract",
     "before_commit",
+    "flow_view",
     "host_view",
     "made_probe",
     "one_row",

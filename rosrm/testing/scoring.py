@@ -19,7 +19,8 @@ from rosrm.extensions.contracts import (
     ScoringOffer,
     ScoringPolicy,
 )
-from rosrm.extensions.declared_fields import SPEC_FIELDS, declared_spec
+from rosrm.extensions.declared_fields import FLOWS_FIELD, SPEC_FIELDS, declared_spec
+from rosrm.extensions.link_views import NO_FLOWS, FlowView
 from rosrm.extensions.plugin_calls import required
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.values import EMPTY, Kind, MigrationPolicy, ProcessSpec
@@ -65,6 +66,7 @@ def process_view(
     hosts: HostView,
     needs: Mapping[str, float] = EMPTY,
     *,
+    flows: FlowView = NO_FLOWS,
     reads: tuple[str, ...] = SPEC_FIELDS,
     **spec: Any,
 ) -> ProcessView:
@@ -73,6 +75,7 @@ def process_view(
     Args:
         hosts: candidates for the placement.
         needs: base units by resource.
+        flows: with other processes, see `flow_view`.
         reads: fields of the spec that the policy's offer declares; the default is all of them.
         spec: fields of the spec, e.g. `name="camera_0"` or `environment={"GROUP": "camera"}`.
     """
@@ -83,7 +86,45 @@ def process_view(
             row = hosts.resources.index(name)
             part = amount / hosts.capacity[:, row]
             need[row] = np.where(np.isnan(part), np.inf if amount > 0 else 0.0, part)
-    return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T)
+    return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T, flows)
+
+
+def flow_view(
+    rates: Mapping[str, float],
+    *,
+    local: Sequence[Sequence[bool]],
+    link: Sequence[Sequence[float]],
+    load: Sequence[Sequence[float]] | None = None,
+    round_trip: Sequence[Sequence[float]] | None = None,
+    limit: float = 1.0,
+) -> FlowView:
+    """Return the flows of a process, for a scoring policy.
+
+    Args:
+        rates: by name of the other process, bytes a second.
+        local: by host and flow: the other process runs on the host.
+        link: by host and flow: bytes a second that the link can carry; NaN: not known.
+        load: by host and flow: bytes a second of others on the link; None: no load.
+        round_trip: by host and flow, seconds; NaN or None: not measured.
+        limit: fraction of each link that flows may use.
+    """
+    is_local = np.array(local, np.bool_).reshape(len(local), len(rates))
+    rate = np.array(list(rates.values()), np.float64)
+    carries = np.where(is_local, np.inf, np.reshape(link, is_local.shape))
+    used = np.zeros(is_local.shape) if load is None else np.reshape(load, is_local.shape)
+    trip = np.full(is_local.shape, np.nan) if round_trip is None else np.array(round_trip)
+    return FlowView(
+        processes=tuple(rates),
+        hosts=tuple(f"host of {name}" for name in rates),
+        rate=rate,
+        incoming=np.ones(len(rates), np.bool_),
+        is_local=is_local,
+        link_rate=carries,
+        link_limit=carries * limit,
+        link_load=np.where(is_local, 0.0, used),
+        added=np.where(is_local, 0.0, rate),
+        round_trip=np.where(is_local, 0.0, trip.reshape(is_local.shape)),
+    )
 
 
 #: Specs that a policy must be able to score, given by their differing fields.
@@ -121,7 +162,26 @@ def placements(reads: Sequence[str]) -> Sequence[tuple[HostView, ProcessView]]:
     for resource in ("memory", "something"):
         bare = host_view({resource: [0.2, 0.4]})
         cases.append((bare, process_view(bare, reads=tuple(reads))))
+    if FLOWS_FIELD in reads:
+        cases += [_with_flows(chance, reads, *one) for one in ((1, 1), (7, 3), (1000, 12))]
     return cases
+
+
+def _with_flows(
+    chance: np.random.Generator, reads: Sequence[str], hosts: int, flows: int
+) -> tuple[HostView, ProcessView]:
+    """Return hosts and a process with flows, of which some values were not measured."""
+    shape = (hosts, flows)
+    view = flow_view(
+        {f"p{flow}": 10.0 ** float(chance.integers(0, 9)) for flow in range(flows)},
+        local=(chance.random(shape) < 0.2).tolist(),
+        link=np.where(chance.random(shape) < 0.3, np.nan, 1e7 * chance.random(shape)).tolist(),
+        load=(1e7 * chance.random(shape)).tolist(),
+        round_trip=np.where(chance.random(shape) < 0.3, np.nan, chance.random(shape)).tolist(),
+        limit=0.8,
+    )
+    at = host_view({"memory": chance.random(hosts).tolist()})
+    return at, process_view(at, flows=view, reads=tuple(reads))
 
 
 class ScoringContract:
@@ -227,4 +287,8 @@ def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, 
         name: getattr(hosts, name)[one]
         for name in ("names", "usage", "limit", "capacity", "processes", "labels", "tenants")
     }
-    return replace(hosts, **parts), replace(process, need=process.need[one])
+    flows = process.flows
+    if len(flows.rate):
+        names = ("is_local", "link_rate", "link_limit", "link_load", "added", "round_trip")
+        flows = replace(flows, **{name: getattr(flows, name)[one] for name in names})
+    return replace(hosts, **parts), replace(process, need=process.need[one], flows=flows)

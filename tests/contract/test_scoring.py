@@ -28,6 +28,14 @@ class TestNarrowThreshold(TestThreshold):
     options: ClassVar = {"enter": 0.5, "leave": 0.4, "watch": ("gpu",), "weights": {}}
 
 
+class TestNetwork(ScoringContract):
+    offer = OFFERS["network"]
+
+
+class TestNetworkByLocality(TestNetwork):
+    options: ClassVar = {"load": 0.0, "latency": 0.0, "missing": "ignore"}
+
+
 def test_each_shipped_policy_is_here():
     """Each policy in the plugin must have a contract class in this file."""
     held = {contract.offer.name for contract in ScoringContract.__subclasses__()}

@@ -25,7 +25,7 @@ from rosrm.extensions.hookspecs import hookimpl
 from rosrm.errors import SkipPlugin
 from dataclasses import replace
 from rosrm.extensions.contracts import (
-    Capabilities, LauncherOffer, MigrationOffer, ProbeOffer, ScoringOffer, Scores
+    Capabilities, FilterOffer, LauncherOffer, MigrationOffer, ProbeOffer, ScoringOffer, Scores
 )
 
 class Policy:
@@ -47,6 +47,19 @@ def register_scoring_policies():
         named("raises", raises), named("hangs", hangs),
         named("exits", lambda count: sys.exit(3)),
     ]
+
+class Filter:
+    def __init__(self, act): self.act = act
+    def mask(self, hosts, process): return self.act(hosts)
+    def reason(self, hosts, process, row): return f"it is called {hosts.names[row]}"
+
+@hookimpl
+def register_filters():
+    acts = {
+        "not_h0": lambda hosts: np.array([name != "h0" for name in hosts.names]),
+        "raises": raises, "hangs": hangs, "exits": lambda hosts: sys.exit(3),
+    }
+    return [FilterOffer(name, lambda options, act=act: Filter(act)) for name, act in acts.items()]
 
 class Probe:
     def __init__(self, name, act):
@@ -226,6 +239,36 @@ def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, po
         assert cluster.run(job(f"more{number}", "true"))[0].state == "finished"
     assert time.monotonic() - began < PATIENCE  # not awaited again and again
     cluster.wait_until("h0 up", lambda v: [row.state for row in v.hosts] == ["up"])
+
+
+# --- filters ----------------------------------------------------------------------------------
+
+
+def test_a_filter_excludes_hosts_with_its_reason(make_cluster, third_party) -> None:
+    """The master asks the filter that the configuration names, and explains it."""
+    cluster = make_cluster(host("h0"), host("h1"), filters={"not_h0": {}})
+    jobs = cluster.run(*(job(f"judged{number}", "true") for number in range(3)))
+    assert {row.host for row in jobs} == {"h1"}
+    hosts = cluster.client.explain("judged0")["decision"]["hosts"]
+    reasons = {row["name"]: row["reason"] for row in hosts}
+    assert reasons["h0"] == "it is called h0 (filter not_h0)"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("raises", "out of order"), ("hangs", "1 s"), ("exits", "SystemExit: 3")]
+)
+def test_a_filter_that_fails_lets_processes_wait(make_cluster, third_party, name, said) -> None:
+    """No host is chosen without the rule; the master continues to answer, and names the filter."""
+    cluster = make_cluster(host("h0"), filters={name: {}})
+    cluster.submit(job("judged", "true"))
+    event = cluster.wait_for_event("plugin_failed", says=f"'{name}'")
+    assert said in event.message
+    (reason,) = [row["reason"] for row in cluster.client.explain("judged")["decision"]["hosts"]]
+    assert reason.startswith(f"the filter {name} failed: ")
+    cluster.stays(1.0, lambda: cluster.process("judged").state == "queued", "queued")
+    (row,) = [row for row in plugins(cluster) if (row.kind, row.name) == ("filter", name)]
+    assert (row.state, said in row.reason) == ("failing", True)
+    cluster.cancel("judged")
 
 
 # --- probes -----------------------------------------------------------------------------------

@@ -134,5 +134,5 @@ class Threshold:
         for index in self._watched(hosts, process):
             used = np.nan_to_num(hosts.usage[row, index]) + process.need[row, index]
             fill = used / max(hosts.limit[row, index], _SMALLEST_LIMIT)
-            fills.append((hosts.resources[index], float(np.nan_to_num(fill))))
+            fills.append((hosts.resources[index], float(np.nan_to_num(fill, posinf=_WITHOUT))))
         return max(fills, key=lambda named: named[1])

@@ -33,6 +33,8 @@ def render(explanation: Mapping[str, Any]) -> RenderableType:
 
 def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield _headline(explanation)
+    if explanation.get("flows"):
+        yield _flows(explanation["flows"])
     if explanation.get("kept"):
         yield _replicas(explanation["kept"])
     if explanation.get("checkpoint"):
@@ -71,6 +73,25 @@ def _headline(explanation: Mapping[str, Any]) -> Text:
     if explanation.get("owner"):
         text.append(f"\nOwner: {explanation['owner']}")
     return text
+
+
+def _flows(flows: list[Mapping[str, Any]]) -> Text:
+    """Return the flows from and to other processes, and why some of them do not count yet."""
+    lines = []
+    for one in flows:
+        where = f" on {one['host']}" if one["host"] else ""
+        text = (
+            f"{amount(one['rate'], 'B/s')} {'from' if one['incoming'] else 'to'} "
+            f"{one['process']}{where} ({'measured' if one['learned'] else 'declared'})"
+        )
+        if one.get("round_trip") is not None:
+            text += f", round trip {one['round_trip'] * 1e3:.3g} ms"
+        if one.get("link_rate") is not None:
+            text += f", link {amount(one['link_rate'], 'B/s')}"
+        if not one["host"]:
+            text += f" does not count yet: {one['process']} {one['reason']}"
+        lines.append(text)
+    return Text(f"Flows: {'; '.join(lines)}.")
 
 
 def _replicas(replicas: list[Mapping[str, Any]]) -> Text:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from rosrm.core.master import events as happened
 from rosrm.core.master import reloading
 from rosrm.core.master.checkpoint import images, periodic, replication
-from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import steps
 from rosrm.core.master.state.pending_orders import (
     CapabilityQuery,
     ImageRemoval,
+    LinkMeasurement,
     MigrationStep,
     PeriodicCheckpoint,
     Reload,
@@ -32,6 +33,8 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             capabilities.note_answer(state, purpose, event, now)
         case PeriodicCheckpoint(number):
             periodic.note_answer(state, number, event, now)
+        case LinkMeasurement(host):
+            links.note_answer(state, host, event, now)
         case Reload(host):
             reloading.note_answer(state, host, event, now)
         case ImageRemoval(number):

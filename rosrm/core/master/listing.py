@@ -7,6 +7,7 @@ from math import inf
 from typing import Any, Final
 
 from rosrm.core.master.assignment.assign import decide_now
+from rosrm.core.master.assignment.flows import described_flows
 from rosrm.core.master.assignment.neighbours import awaited_neighbour
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
@@ -162,6 +163,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "decision": None if decision is None else {**decision, "elapsed": age},
         "limits": _limits(state, process),
         "defaults": defaulted_values(process.spec, process.defaulted),
+        "flows": described_flows(state, process),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
         "history": [

@@ -17,10 +17,12 @@ from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.flows import Flows
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
+from rosrm.core.master.state.link_queries import LinkQueries
 from rosrm.core.master.state.migration import Migration, migration_to_dict
 from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
@@ -31,7 +33,7 @@ from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.extensions.contracts import MigrationStrategy
-from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.declared_fields import SPEC_FIELDS, Declared, declared_spec
 from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.model.codec import to_plain
 from rosrm.model.event_kinds import EventKind
@@ -123,6 +125,8 @@ class MasterState:
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
+        self.flows = Flows()
+        self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
         self.time_limited: dict[str, None] = {}
         self.preemption = Preemption()
@@ -295,11 +299,13 @@ class MasterState:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
                 self.neighbours.add(process.spec)
+            self.flows.declare(process.name, process.spec.talks_to)
         else:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
             self.time_limited.pop(process.name, None)
             self.neighbours.remove(process.name)
+            self.flows.remove(process.name)
 
     def collect_garbage(self) -> None:
         """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
@@ -339,6 +345,7 @@ class MasterState:
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue = DesiredState.RUN, False
         process.started_at, process.began = inf, 0.0
+        self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.put_in_queue(process)
 
@@ -416,15 +423,20 @@ class MasterState:
         self.instances[instance.number] = added
         process = self.processes.get(instance.process)
         spec = process.spec if process is not None else ProcessSpec(instance.process)
-        host.instances[instance.number] = spec
+        host.instances[instance.number] = instance.process, declared_spec(spec, SPEC_FIELDS)
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
-        self.neighbours.note_change(instance.process)
+        self.note_change(instance.process)
         return added
 
     def reserve(self, instance: InstanceId, host: Host, now: float, ranking: Ranking) -> None:
         """Add an instance on the host that a ranking has chosen."""
         self.add_instance(instance, host, now, ranking.demand, ranking.need[:, host.column])
+
+    def note_change(self, name: str) -> None:
+        """Note that the instances of a process, or the one that owns its name, have changed."""
+        self.neighbours.note_change(name)
+        self.flows.note_change(name)
 
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""
@@ -435,7 +447,7 @@ class MasterState:
         if not self.unowned_instances.get(name, True):
             del self.unowned_instances[name]
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
-        self.neighbours.note_change(name)
+        self.note_change(name)
 
     def clear_left_behind(self, process: Process) -> None:
         """Note that no instance of a process on a lost host counts as its own any more."""

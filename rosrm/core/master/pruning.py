@@ -107,6 +107,7 @@ def _prune_host(state: MasterState, host: Host, by: Requester, now: float) -> st
     """
     ends_all = state.hosts.condition_of(host) is HostCondition.LEFT
     state.hosts.prune(host)
+    state.link_queries.remove(host.name)
     held = state.instances_of(host)
     for instance in held:
         lifecycle.gone(state, instance, now, f"{host.name} was pruned")

@@ -68,9 +68,7 @@ def _order_slaves(state: MasterState) -> None:
     _reply_if_complete(state)
 
 
-def note_answer(
-    state: MasterState, host: str, event: happened.OrderAnswered, now: float
-) -> None:  # fmt: skip
+def note_answer(state: MasterState, host: str, event: happened.OrderAnswered, now: float) -> None:
     """Note the answer of a slave; the last one completes the reply."""
     if host not in state.reloads.awaited:
         return

@@ -34,6 +34,8 @@ class CoreSettings:
             need and its measured usage; "declared": its need as at its first placement.
         max_migrations: highest number of migrations in flight.
         automatic: True: the core evicts processes from hosts that are over a limit.
+        link_period: seconds between two measurements of the links of a host; 0: no measurements.
+        learn_flows: True: slaves measure the flows between processes.
         preemption: way in which processes make room for one of a higher priority that fits on no
             host: "move" to other hosts; or "requeue", those that cannot move wait in the queue
             again; False: not at all.
@@ -64,6 +66,8 @@ class CoreSettings:
     need: Literal["measured", "declared"] = "measured"
     max_migrations: int = 2
     automatic: bool = True
+    link_period: float = 10.0
+    learn_flows: bool = True
     preemption: Preemption = "move"
     rebalance: bool = False
     rebalance_spread: float = 0.3

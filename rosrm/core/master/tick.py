@@ -10,7 +10,7 @@ from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
 from rosrm.core.master.assignment.reservations import review_reservation
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.commands import Redeliver, Withdraw
-from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
 from rosrm.core.master.hosts.registration import review_departures
@@ -50,6 +50,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     _ask_for_missing_statuses(state, now)
     _review_forged_batches(state, now)
     capabilities.ask_hosts(state, now)
+    links.ask_next_host(state, now)
     images.review(state, now)
     review_separated(state, now)
     evict_from_hosts(state, now)

@@ -101,6 +101,14 @@ class SlaveState:
         """Return the instances that become ready when their node appears in the ROS graph."""
         return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
 
+    def nodes(self) -> Mapping[int, str]:
+        """Return the number of each ready instance with a node to the node's full name."""
+        return {
+            instance.number: held.awaited.node_name
+            for instance, held in self.held.items()
+            if held.awaited is not None and held.status.state is InstanceState.READY
+        }
+
     def watched(self) -> Mapping[InstanceId, HeldInstance]:
         """Return the instances with health checks that apply now."""
         return {one: held for one, held in self.held.items() if held.watched is not None}

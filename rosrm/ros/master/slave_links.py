@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -17,7 +17,8 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign, OrderId, Redeliver, SendOrder, Withdraw
 from rosrm.errors import Refused
 from rosrm.keys.security import Authority, Peer
-from rosrm.model.orders import Order, StartInstance, seconds_of
+from rosrm.model.links import LinkPeer
+from rosrm.model.orders import MeasureLinks, Order, StartInstance, seconds_of
 from rosrm.model.values import Assignment, HostDescription
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlClient, accepted, version_refusal
@@ -311,7 +312,7 @@ class HostLinks:
             why = "the host does not report"
             self._handle(happened.OrderAnswered.missing(command.order_id, why))
             return
-        request = order_to_msg(self._order_with_key(command.order))
+        request = order_to_msg(self._order_with_key(command.order, link))
         deadline = now + seconds_of(command.order) + self._order_timeout
 
         def done(response: srv.ControlHost.Response | None) -> None:
@@ -327,10 +328,21 @@ class HostLinks:
 
         self.after_first_reading(link, send, deadline, done)
 
-    def _order_with_key(self, order: Order) -> Order:
-        if not isinstance(order, StartInstance):
-            return order
-        return StartInstance(self._keyed(order.assignment))
+    def _order_with_key(self, order: Order, link: HostLink) -> Order:
+        match order:
+            case StartInstance(assignment):
+                return StartInstance(self._keyed(assignment))
+            case MeasureLinks(peers):
+                return replace(order, peers=tuple(self._with_keys(peers, link)))
+        return order
+
+    def _with_keys(self, peers: Iterable[LinkPeer], link: HostLink) -> Iterator[LinkPeer]:
+        """Yield the peers with a valid key, each with the key of the packets between both."""
+        for peer in peers:
+            other = self.slave_of(peer.host_id)
+            if other is not None:
+                key = self._endpoints.security.link_key_of(other.peer, link.host_id)
+                yield replace(peer, key=key)
 
     def expire(self, now: float) -> None:
         """End the orders and requests that got no answer in time."""

@@ -321,7 +321,7 @@ class SlaveEndpoint:
         self._newest_beat = beat
         if not self._is_of_master(beat) or self._beat_clock.is_ahead(beat.beat / 1e9, now):
             return
-        self._endpoints.security.tickets_from = beat.tickets_from
+        self._endpoints.security.note_beat(beat.tickets_from)
         sent_at = self._note_beat(beat.beat, now)
         if self.link is MasterLink.REGISTERED:
             self._seen.note(Watermark(beat.journal, beat.incarnation, self.cluster))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -10,8 +11,10 @@ from rosrm.core.slave.events import Event
 from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
 from rosrm.keys.security import Member
+from rosrm.model.links import LinkReport
 from rosrm.model.orders import (
     DropReplica,
+    MeasureLinks,
     ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
@@ -73,6 +76,7 @@ class Duties:
         execute: runs an executor, and calls its last argument with the outcome. If that takes
             longer than the order allows, the executor's strategy counts as failing.
         read_log: returns a part of a log; raises `Refused`.
+        measure_links: measures links, and calls its last argument with the report.
         reload: reads the settings file, and calls its argument with a summary and the fault, of
             which one is "".
     """
@@ -83,6 +87,7 @@ class Duties:
     drop_snapshots: Callable[[InstanceId], None]
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
     read_log: Callable[[LogQuery], LogPart]
+    measure_links: Callable[[MeasureLinks, Callable[[LinkReport], None]], None]
     reload: Callable[[Callable[[str, str], None]], None]
 
 
@@ -118,6 +123,9 @@ class SlaveServices:
                 case SetRestartPolicy():
                     self._set_restart(order, respond)
                     return
+                case MeasureLinks():
+                    self._measure_links(order, respond)
+                    return
                 case ReloadSettings():
                     self._reload(respond)
                     return
@@ -138,6 +146,13 @@ class SlaveServices:
             respond(srv.ControlHost.Response(answer=answer))
 
         self._duties.set_restart(order, settled)
+
+    def _measure_links(self, order: MeasureLinks, respond: Callable[[Any], None]) -> None:
+        def done(report: LinkReport) -> None:
+            result = json.dumps(report.to_json())
+            respond(srv.ControlHost.Response(answer=accepted(), result=result))
+
+        self._duties.measure_links(order, done)
 
     def _reload(self, respond: Callable[[Any], None]) -> None:
         def done(summary: str, fault: str) -> None:

@@ -208,7 +208,7 @@ class Cluster(World[Machine]):
         chain: Sequence[ScoringLink] = (), filters: Sequence[SelectedFilter] = (),
         declared: Declared | None = None, **settings: Any,
     ) -> None:  # fmt: skip
-        self.settings = CoreSettings(**{"settle": 1e9, **settings})
+        self.settings = CoreSettings(**{"settle": 1e9, "link_period": 0.0, **settings})
         fallback = ScoringLink(*fallback) if fallback else None
         chain = tuple(chain) or (ScoringLink("eq1", policy or Eq1(), reads=reads),)
         self.placement = lambda: PlacementPlugins(chain, fallback, tuple(filters))

@@ -11,7 +11,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import OrderId, SendOrder
 from rosrm.core.slave import events, reducer
 from rosrm.core.slave.state import SlaveState
-from rosrm.model.orders import DropReplica, ReplicateSnapshot, RunExecutor
+from rosrm.model.orders import DropReplica, MeasureLinks, ReplicateSnapshot, RunExecutor
 from rosrm.model.values import (
     Assignment,
     HostDescription,
@@ -58,6 +58,7 @@ class Machine(Host[Program]):
         connected: True while the wires work.
         takes: False for a slave that accepts no work.
         leaves: True while its slave stops, from before the master learns it.
+        measures: returns the JSON of the report on links; None: its slave refuses the order.
     """
 
     memory: float = 16 * GIB
@@ -75,6 +76,7 @@ class Machine(Host[Program]):
     connected: bool = True
     takes: bool = True
     leaves: bool = False
+    measures: Callable[[MeasureLinks], Mapping[str, Any]] | None = None
     fresh: bool = False
 
     def __post_init__(self) -> None:
@@ -169,6 +171,11 @@ class Machine(Host[Program]):
         if not isinstance(result, Mapping):
             return happened.OrderAnswered(order_id, False, happened.BAD_RESULT, "no object")
         return happened.OrderAnswered(order_id, True, result=result)
+
+    def measure(self, order_id: OrderId, order: MeasureLinks) -> happened.OrderAnswered:
+        if self.measures is None:
+            return super().measure(order_id, order)
+        return happened.OrderAnswered(order_id, True, result=self.measures(order))
 
     def replicate(self, order: ReplicateSnapshot | DropReplica) -> None:
         name = order.instance.process

@@ -116,8 +116,8 @@ def demands(draw: st.DrawFn) -> Demand:
     required = draw(labels) if draw(rarely) else {}
     limits = Limits(cpu=1.0, enforce=draw(st.sampled_from(["preferred", "required"])))
     spec = ProcessSpec(
-        "p", command=("run",), required_labels=required, priority=draw(st.integers(0, 2)),
-        limits=limits, cpus=draw(st.sampled_from([(), (1,), (1, 3)])),
+        "p", command=("run",), required_labels=required, limits=limits,
+        cpus=draw(st.sampled_from([(), (1,), (1, 3)])), priority=draw(st.integers(0, 2)),
     )  # fmt: skip
     read = declared_spec(spec, ())  # a filter may read only what makes rankings differ
     plugins = PlacementPlugins(filters=draw(filters_of_plugins))

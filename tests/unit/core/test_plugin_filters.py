@@ -71,6 +71,18 @@ def test_a_filter_holds_for_the_destination_of_a_move():
     assert cluster.where("p") == ["c"]
 
 
+@pytest.mark.parametrize("permanent", [True, False])
+def test_a_drain_ends_if_no_other_host_passes_for_good(permanent):
+    """The process stays; with a filter that is not permanent it waits for a destination."""
+    cluster = filtered(SelectedFilter("named", Named("a"), permanent=permanent))
+    cluster.submit(process("p", migration=MigrationPolicy("relaunch")))
+    cluster.wait(1.0)
+    cluster.set_host("a", "drain")
+    cluster.wait(5.0)
+    assert cluster.where("p") == ["a"]
+    assert cluster.state.hosts.by_name["a"].drained is permanent
+
+
 @pytest.mark.parametrize(("permanent", "phase"), [(True, "set_aside"), (False, "queued")])
 def test_a_process_that_every_host_fails_for_good_is_set_aside(permanent, phase):
     """A permanent filter does not block the queue; another one waits for a change."""

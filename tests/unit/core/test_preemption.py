@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -12,8 +13,9 @@ from hypothesis import strategies as st
 
 from rosrm.core.master.migration.preemption import Group, covering_sets, rank
 from rosrm.core.master.state.process import Process, ProcessPhase
+from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.model.values import NeighbourRule, ProcessSpec
-from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
+from tests.unit.core.cluster import MIB, Cluster, Eq1, Machine, job, movable, process
 
 
 def machine(name: str, memory: float = 1000, **known: Any) -> Machine:
@@ -53,9 +55,7 @@ def test_the_smallest_set_of_lower_processes_moves_away() -> None:
     assert cluster.phase("p") == "queued"
     cluster.wait(4.0)
     assert (cluster.where("p"), cluster.where("x"), cluster.where("y")) == (["a"], ["b"], ["a"])
-    message = (
-        "x makes room on a for p, which has a higher priority (5 over 0): it moves to b"
-    )  # fmt: skip
+    message = "x makes room on a for p, which has a higher priority (5 over 0): it moves to b"
     assert cluster.recorded("preempted") == [message, message]
     for name in ("p", "x"):
         assert message in [one["message"] for one in cluster.explain(name)["history"]]
@@ -229,6 +229,30 @@ def test_a_process_is_not_moved_again_within_its_cool_down() -> None:
     assert (cluster.where("q"), cluster.where("x")) == (["b"], ["c"])
 
 
+class NotOnA(Eq1):
+    """Policy with a veto against host a, which it gives also when there is room."""
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:
+        found = super().score(hosts, process)
+        veto = np.array([name == "a" for name in hosts.names]) & (process.spec.priority > 0)
+        return Scores(found.value, veto=veto, veto_reason=lambda row: "not on a")
+
+
+def test_room_is_made_only_once_on_a_host_that_a_policy_excludes() -> None:
+    """The master cannot know a veto before there is room; processes must not leave again."""
+    cluster = cluster_of(machine("a", 600), machine("b", 400), policy=NotOnA(), cooldown=3.0)
+    filled(cluster, "a", movable("x", memory=350))
+    cluster.submit(process("p", memory=500, priority=5))
+    cluster.wait(4.0)
+    assert cluster.where("x") == ["b"]
+    cluster.wait(6.0)
+    assert "room was made on a, and the process does not fit" in cluster.explain("p")["reason"]
+    assert cluster.migrate("x", "a").accepted
+    cluster.wait(60.0, tick=0.5)
+    assert len(cluster.recorded("preempted")) == 2
+    assert (cluster.where("x"), cluster.state.hosts.claims) == (["a"], {})
+
+
 # --- properties -------------------------------------------------------------------------------
 
 
@@ -283,7 +307,7 @@ specs = st.lists(
 )  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(specs, st.sampled_from(["move", "requeue"]), st.booleans(), st.integers(1, 3))
 def test_preemption_touches_only_lower_processes_without_protection_and_comes_to_an_end(
     drawn: list[tuple[int, int, bool, bool]], mode: str, backfill: bool, most: int
@@ -296,10 +320,10 @@ def test_preemption_touches_only_lower_processes_without_protection_and_comes_to
     for i, (memory, priority, moves, protect) in enumerate(drawn):
         make = movable if moves else process
         cluster.submit(make(f"p{i}", memory=memory, priority=priority, protect=protect))
-        cluster.wait(1.5)
-    cluster.wait(60.0)
+        cluster.wait(1.5, tick=0.5)
+    cluster.wait(30.0, tick=0.5)
     before = len(cluster.records)
-    cluster.wait(20.0)
+    cluster.wait(15.0, tick=0.5)
     assert cluster.records[before:] == []
     for one in cluster.records:
         if one.kind == "preempted":
@@ -313,3 +337,25 @@ def test_preemption_touches_only_lower_processes_without_protection_and_comes_to
         if one.kind == "preempted" and one.process != one.facts["for"]
     ]  # fmt: skip
     assert len(pairs) == len(set(pairs))
+
+
+def test_many_processes_that_cannot_move_do_not_hide_one_that_can() -> None:
+    """A process without a destination is tried once, not in every set."""
+    cluster = cluster_of(machine("a", 2000), machine("b", 75))
+    many = [movable(f"p{i:02}", memory=80) for i in range(24)]
+    filled(cluster, "a", *many, movable("q", memory=70, priority=1))
+    cluster.submit(process("r", memory=78, priority=5))
+    cluster.wait(5.0)
+    assert (cluster.where("r"), cluster.where("q")) == (["a"], ["b"])
+
+
+def test_a_claim_ends_with_the_setting() -> None:
+    """A reload may switch preemption off while room is made."""
+    cluster = two_hosts()
+    cluster.machines["a"].stubborn.add("x")
+    cluster.submit(process("p", memory=450, priority=5))
+    cluster.wait(3.0)
+    assert cluster.state.hosts.claims == {0: 5}
+    cluster.state.settings = replace(cluster.state.settings, preemption=False)
+    cluster.wait(1.5)
+    assert cluster.state.hosts.claims == {}

@@ -28,6 +28,7 @@ from rosrm.model.values import (
     MigrationPolicy,
     ProcessSpec,
     Readiness,
+    ReschedulePolicy,
     RestartPolicy,
     SnapshotReport,
     StandbyPolicy,
@@ -83,7 +84,8 @@ def spec(
         needs={"memory": memory * MIB} if memory else {},
         required_labels={"arm": "yes"} if special else {},
         migration=migration or MigrationPolicy(), restart=restart, readiness=Readiness(timeout=4.0),
-        standby=standby,
+        standby=standby, reschedule=ReschedulePolicy(int(loss == "elsewhere"), 1.0),
+        time_limit=6.0 if kind == "job" and memory == 100 else 0.0,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
     )  # fmt: skip
 
@@ -196,7 +198,7 @@ class Play(RuleBasedStateMachine):
             chosen = state.processes[assign.assignment.instance.process]
             for name in state.queue:
                 waits = state.processes[name]
-                if awaits_states(state, waits, self.cluster.now):
+                if awaits_states(state, waits, self.cluster.now) or name in state.queue.delayed:
                     continue
                 ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
                 alike = demand_of(state, waits).key[4:] == demand_of(state, chosen).key[4:]
@@ -806,11 +808,11 @@ class Play(RuleBasedStateMachine):
             if process.phase is ProcessPhase.FINISHED:
                 assert process.name in self.completed
             for host in process.excluded:
-                assert (process.name, host) in self.missing
+                assert (process.name, host) in self.missing or process.reschedules
             if process.phase is ProcessPhase.FAILED and not process.spec.ros:
                 missing = {name for name, _ in self.missing}
                 host_lost = process.spec.host_loss.then == "stop"
-                assert host_lost or process.name in self.failed | missing
+                assert host_lost or process.overdue or process.name in self.failed | missing
 
     def teardown(self) -> None:
         """Check that all processes reach their end once all faults are repaired."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm.extensions.contracts import Scores
+from rosrm.extensions.declared_fields import declared_spec
 from rosrm.extensions.placement import SelectedFilter
 from tests.unit.core.cluster import Cluster, process
 
@@ -75,13 +76,18 @@ def test_only_a_policy_that_reads_tenants_is_called_after_each_assignment():
     assert even.calls < 24 + 24 // 2
 
 
-def test_tenants_are_read_only():
+def test_tenants_and_specs_are_read_only():
     """A policy cannot change the master's state through a view."""
     policy = Crowd()
     cluster = Cluster("a", policy=policy)
-    cluster.submit(process("p"))
+    for name in ("p", "q"):
+        cluster.submit(process(name, needs={"memory": 1.0}))
+    (tenants,) = policy.seen[-1].values()
     with pytest.raises(TypeError):
-        policy.seen[-1]["a"]["x"] = None
+        tenants["x"] = None
+    for spec in (tenants["p"], declared_spec(cluster["q"].spec, ())):
+        with pytest.raises(TypeError):
+            spec.needs["memory"] = 2.0
 
 
 @pytest.mark.parametrize("batched", [True, False])
@@ -107,3 +113,17 @@ def test_a_decision_is_explained_with_the_tenants_of_its_time():
         for name in ("p", "q")
     }
     assert reasons == {"p": ["beside []", "beside []"], "q": ["beside ['p']", "beside []"]}
+
+
+def test_tenants_have_their_specs_after_a_restart_of_the_master():
+    """Instances that the journal or a slave reports have the spec of their process."""
+    policy = Crowd()
+    cluster = Cluster("a", "b", policy=policy)
+    cluster.submit(process("p", priority=7))
+    cluster.wait(1.0)
+    cluster.restart_master()
+    cluster.wait(1.0)
+    cluster.submit(process("q"))
+    specs = {name: dict(tenants) for name, tenants in policy.seen[-1].items()}
+    spec = specs["a"]["p"]
+    assert (spec.name, spec.priority, spec.program) == ("p", 7, cluster["p"].spec.program)

@@ -110,8 +110,8 @@ def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options)
 def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
-    wanted |= {"host_loss", "isolation", "standby", "health", "spread", "limits", "realtime"}
-    wanted |= {"reschedule"}
+    wanted |= {"host_loss", "isolation", "standby", "health", "spread", "reschedule"}
+    wanted |= {"limits", "realtime"}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted

@@ -374,9 +374,11 @@ def test_probes_label_their_host(context):
     ("labels", "said"),
     [
         (["x"], "has the labels ['x']; a mapping is required"),
-        ({"x": 1}, "has the label 'x': 1; printable text is required"),
-        ({"": "x"}, "has the label '': 'x'; printable text is required"),
-        ({"x": "a\nb"}, "printable text is required"),
+        ({"x": 1}, "has the label 'x': 1; printable text of at most 200"),
+        ({"": "x"}, "has the label '': 'x'; printable text of at most 200"),
+        ({"x": "a\nb"}, "printable text of at most 200"),
+        ({"x": "y" * 201}, "printable text of at most 200"),
+        ({str(n): "" for n in range(128)}, "exceeds the 128 labels"),
         ({"floor": "3"}, "gives the label 'floor' another value than 'first'"),
     ],
 )

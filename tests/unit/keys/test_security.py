@@ -242,6 +242,7 @@ def test_no_valid_ticket_is_forgotten(master: MasterSecurity, monkeypatch) -> No
     assert not asks("ada", 3)
     assert asks("eve", 3)
     now = 2
+    robot.note_beat(tickets_from=0)
     assert asks("ada", 3)
 
 
@@ -263,9 +264,27 @@ def test_a_ticket_is_valid_for_a_minute(master: MasterSecurity, until: float) ->
     A message under a void ticket opens, so that its bearer can get an answer. Nothing is stored.
     """
     slave, ticket, robot = introduced(master, until)
-    assert not ticket.is_valid(time.monotonic_ns())
+    robot.note_beat(tickets_from=0)
+    assert not robot.accepts(ticket)
     assert opened(robot, slave.name, 0, said(slave))
     assert not robot._bearers
+
+
+def test_tickets_do_not_expire_while_the_master_is_away(monkeypatch) -> None:
+    """Nobody could get another ticket, and slaves would send no replicas."""
+    now = 0
+    monkeypatch.setattr(security, "time", SimpleNamespace(monotonic_ns=lambda: now))
+    robot = member(ROBOT)
+    valid, expired = (
+        Ticket(until, 3, "store_replica", 0, "talker", Principal("host", "robot-2"))
+        for until in (60, 59)
+    )
+    now = 60
+    robot.note_beat(tickets_from=3)
+    now = 10**15
+    assert (robot.accepts(valid), robot.accepts(expired)) == (True, False)
+    robot.note_beat(tickets_from=3)
+    assert not robot.accepts(valid)
 
 
 def test_a_recorded_request_opens_under_no_other_text_of_its_ticket(master: MasterSecurity) -> None:

@@ -30,9 +30,9 @@ def test_added_and_revoked_keys_are_found_within_a_second(home, security) -> Non
     watch = GrantsWatch(security)
     assert watch.has_changed(0.0)
     assert not watch.has_changed(1.0)
-    key_files.add_grant(home, ROBOT, Role.HOST)
+    grant = key_files.add_grant(home, ROBOT, Role.HOST)
     assert watch.has_changed(2.0)
-    robot = security.peer("host:robot-1", 1)
+    robot = security.peer("host:robot-1", grant.generation)
     assert robot is not None
     key_files.revoke(home, [ROBOT])
     assert watch.has_changed(3.0)
@@ -44,21 +44,21 @@ def test_files_that_cannot_be_used_change_nothing_and_are_reported_once(
 ) -> None:
     """The operator's mistake must not lock all hosts out."""
     caplog.set_level(logging.ERROR)
-    key_files.add_grant(home, ROBOT, Role.HOST)
+    grant = key_files.add_grant(home, ROBOT, Role.HOST)
     watch = GrantsWatch(security)
     assert watch.has_changed(0.0)
     (home / key_files.GRANTS_FILE).write_text("principals: 7")
     (home / key_files.GRANTS_FILE).chmod(0o644)
     for now in (1.0, 2.0, 3.0):
         assert not watch.has_changed(now)
-    assert security.peer("host:robot-1", 1) is not None
+    assert security.peer("host:robot-1", grant.generation) is not None
     (line,) = caplog.messages
     assert "chmod 600" in line
 
 
 def test_a_file_counts_as_soon_as_it_can_be_read(home, security) -> None:
     """A changed mode changes no time of the file; a lack of descriptors passes, too."""
-    key_files.add_grant(home, ROBOT, Role.HOST)
+    grant = key_files.add_grant(home, ROBOT, Role.HOST)
     watch = GrantsWatch(security)
     assert watch.has_changed(0.0)
     key_files.revoke(home, [ROBOT])
@@ -66,4 +66,4 @@ def test_a_file_counts_as_soon_as_it_can_be_read(home, security) -> None:
     assert not watch.has_changed(1.0)
     (home / key_files.GRANTS_FILE).chmod(0o600)
     assert watch.has_changed(3.0)
-    assert security.peer("host:robot-1", 1) is None
+    assert security.peer("host:robot-1", grant.generation) is None

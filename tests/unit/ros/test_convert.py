@@ -234,6 +234,12 @@ NONSENSE_IN_SPECS = {
     "a rule about none": lambda m: setattr(m, "neighbours", neighbour(processes=[])),
     "a rule about both": lambda m: setattr(m, "neighbours", neighbour(group="g")),
     "a neighbour that is a path": lambda m: setattr(m, "neighbours", neighbour(processes=["../q"])),
+    "a flow to itself": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process=m.name)]),
+    "a flow to a path": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="../q")]),
+    "a flow that is no number": lambda m: setattr(
+        m, "talks_to", [msg.ProcessFlow(process="q", rate=float("nan"))]
+    ),
+    "many flows": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="q")] * 257),
     "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
 }
 

@@ -18,6 +18,7 @@ OTHER_TYPES = {
     "node/migratable.py": "the types of the user's node",
     "ros/participant.py": "`serve`, which sealed.py alone calls",
     "ros/polling.py": "the types of its callers",
+    "ros/slave/flows.py": "topics of applications",
     "ros/slave/health.py": "topics and services of applications",
     "ros/slave/publisher_watch.py": "topics of applications",
 }

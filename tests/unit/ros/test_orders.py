@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import get_args
 
 import pytest
@@ -9,9 +10,11 @@ import pytest
 from rosrm.core.slave import events as happened
 from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
+from rosrm.model.links import LinkPeer
 from rosrm.model.orders import (
     DropReplica,
     FenceInstance,
+    MeasureLinks,
     Order,
     ReloadSettings,
     ReplicateSnapshot,
@@ -39,6 +42,7 @@ EVENTS = [
 ]
 ORDERS = [
     *(order for order, _ in EVENTS),
+    MeasureLinks((LinkPeer(2, "b", ("10.0.0.2",), 4000, b"k" * 32),), learn=True),
     RunExecutor("criu_dump", {"of": 7, "to": ["b"]}, 2.5),
     ReplicateSnapshot(ONE, ("b", "c"), 0.5),
     DropReplica(ONE),
@@ -90,3 +94,19 @@ def test_an_order_with_an_impossible_name_or_time_is_refused(order):
     """The time would never pass, and the name would become a part of files and logs."""
     with pytest.raises(Refused):
         order_from_msg(order_to_msg(order))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"host_id": 0}, {"host_id": "x"}, {"host": "../b"}, {"addresses": ["b.example"]},
+        {"addresses": 5}, {"port": 70000}, {"key": "zz"}, {"key": "00" * 33},
+    ],
+)  # fmt: skip
+def test_an_order_with_an_impossible_peer_is_refused(changes):
+    """No packet is sent to such a peer."""
+    peer = {"host_id": 2, "host": "b", "addresses": ["10.0.0.2"], "port": 4000, "key": ""}
+    request = order_to_msg(MeasureLinks())
+    request.arguments = json.dumps({"peers": [{**peer, **changes}], "learn": False})
+    with pytest.raises(Refused, match="an order to measure links"):
+        order_from_msg(request)

@@ -146,7 +146,7 @@ def test_only_a_ticket_in_force_is_accepted(seconds, version, is_handled) -> Non
     service = Service(
         srv.ReadLog, "/read_log", lambda *_: handled.append("ticket"), MemberSecurity(key)
     )
-    service.security.tickets_from = 7
+    service.security.note_beat(tickets_from=7)
     until = time.monotonic_ns() + int(seconds * 1e9)
     ticket = Ticket(until, version, "read_log", 0, "p", Principal("user", "ada"))
     bearer = MemberSecurity(key).bearer(ticket.text(), ticket.key(key.key), service.security.run)

@@ -21,12 +21,14 @@ from rosrm.core.master.commands import (
     Reply,
     SendOrder,
 )
+from rosrm.core.master.hosts.links import note_report
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.slave.events import AssignmentsReceived, TimePassed
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import PlacementPlugins
+from rosrm.model.links import Interface, LinkReport
 from rosrm.model.orders import seconds_of
 from rosrm.model.records import Intent, Record
 from rosrm.model.values import EMPTY, Assignment
@@ -77,6 +79,7 @@ class Simulation(World[Machine]):
     ) -> None:
         settings = replace(
             settings,
+            link_period=0.0,  # the links of a workload are known from the start
             max_hosts=max(settings.max_hosts, len(workload.hosts)),
             max_processes=max(settings.max_processes, len(workload.processes)),
         )
@@ -97,6 +100,9 @@ class Simulation(World[Machine]):
         self._patience = 2.0 + max(
             settings.settle, settings.hysteresis, settings.cooldown, settings.delivery_timeout,
             settings.lease, settings.order_retry,
+            settings.rebalance_after if settings.rebalance else 0.0,
+            *(one.spec.time_limit for one in workload.processes),
+            *(one.spec.reschedule.delay for one in workload.processes),
         )  # fmt: skip
 
     def run(self, progress: Callable[[Progress], None] | None = None) -> Outcome:
@@ -155,7 +161,22 @@ class Simulation(World[Machine]):
         )
         self.machines[plan.name] = machine
         self.join(machine, inf)  # no simulated host is cut off
+        self._measure_links(plan)
         self._read([machine])
+
+    def _measure_links(self, joined: SimulatedHost) -> None:
+        """Report the links of a host that has joined, and those of the others to it."""
+        table, plans = self.state.hosts, {one.name: one for one in self.workload.hosts}
+        others = [plans[host.name] for host in table.listed() if host.name != joined.name]
+        for one, peers in [(joined, others), *((other, [joined]) for other in others)]:
+            trips = {
+                table.by_name[peer.name].host_id: (0, one.link.round_trip + peer.link.round_trip)
+                for peer in peers if one.link is not None and peer.link is not None
+            }  # fmt: skip
+            if one.link is not None:
+                interfaces = (Interface(one.link.rate),)
+                report = LinkReport(limit=one.link.limit, interfaces=interfaces, peers=trips)
+                note_report(self.state, table.by_name[one.name], report)
 
     def _leave(self, plan: SimulatedHost) -> None:
         machine = self.machines[plan.name]

@@ -24,6 +24,7 @@ from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.orders import (
     DropReplica,
+    MeasureLinks,
     ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
@@ -151,6 +152,10 @@ class Host(ABC, Generic[ProgramT]):
         message = f"the simulation cannot carry out {order.executor!r}"
         return OrderAnswered(order_id, False, "failed", message)
 
+    def measure(self, order_id: OrderId, _order: MeasureLinks) -> OrderAnswered:
+        """Measure links, and answer; a simulated host does not."""
+        return OrderAnswered(order_id, False, "refused", "the simulation does not measure links")
+
     def replicate(self, order: ReplicateSnapshot | DropReplica) -> None:
         """Carry out an order about snapshots; here nodes publish none."""
 
@@ -269,6 +274,8 @@ class Host(ABC, Generic[ProgramT]):
         match order:
             case RunExecutor():
                 return self.execute(sent.order_id, order)
+            case MeasureLinks():
+                return self.measure(sent.order_id, order)
             case ReplicateSnapshot() | DropReplica():
                 self.replicate(order)
             case ReloadSettings():

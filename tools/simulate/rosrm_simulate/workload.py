@@ -38,6 +38,21 @@ class Model:
 
 
 @dataclass(frozen=True, slots=True)
+class SimulatedLink:
+    """The only network interface of a host, which all its links to other hosts share.
+
+    Attributes:
+        rate: bytes a second that it can carry.
+        round_trip: seconds from the host to the middle of the network and back.
+        limit: fraction of the rate that flows may use.
+    """
+
+    rate: float
+    round_trip: float = 0.0
+    limit: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class SimulatedHost:
     """One host.
 
@@ -48,6 +63,7 @@ class SimulatedHost:
         joins: time at which its slave registers.
         leaves: time at which it goes; inf: never.
         lost: it goes without a message, and its processes end with it; else its slave shuts down.
+        link: to the other hosts; None: not known.
     """
 
     name: str
@@ -59,6 +75,7 @@ class SimulatedHost:
     joins: float = 0.0
     leaves: float = inf
     lost: bool = False
+    link: SimulatedLink | None = None
 
     def capacity(self, resource: str) -> float:
         """Return the capacity in base units; 0 where it has no such resource."""

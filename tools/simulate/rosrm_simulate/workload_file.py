@@ -20,11 +20,27 @@ from rosrm.config.process import Labels, LabelsInFile, MigrationInFile
 from rosrm.config.rules import check_amounts, check_name, refuse_namesakes
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
-from rosrm.extensions.units import Amount, Count, Fraction, PositiveSeconds, Quantity, Seconds
+from rosrm.extensions.units import (
+    Amount,
+    ByteRate,
+    Count,
+    Fraction,
+    PositiveByteRate,
+    PositiveSeconds,
+    Quantity,
+    Seconds,
+)
 from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
 from rosrm.wording import counted
 from rosrm_simulate.variants import Variant, check_keys, load_variants, text_of, variants_of
-from rosrm_simulate.workload import Curve, Model, ProcessPlan, SimulatedHost, Workload
+from rosrm_simulate.workload import (
+    Curve,
+    Model,
+    ProcessPlan,
+    SimulatedHost,
+    SimulatedLink,
+    Workload,
+)
 
 _MODEL: Final = Model()
 _UNITS: Final = {"memory": "B", "cpu": "core", "disk": "B"}
@@ -77,6 +93,19 @@ class ModelInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkInFile:
+    """Network interface of a host."""
+
+    rate: PositiveByteRate
+    round_trip: Seconds = 0.0
+    limit: Fraction = 1.0
+
+    def simulated(self) -> SimulatedLink:
+        """Return the link of a simulated host."""
+        return SimulatedLink(self.rate, self.round_trip, self.limit)
+
+
+@dataclass(frozen=True, slots=True)
 class HostInFile:
     """One host."""
 
@@ -91,6 +120,7 @@ class HostInFile:
     joins: Seconds = 0.0
     leaves: Seconds | None = None
     lost: bool = False
+    link: LinkInFile | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +143,7 @@ class ProcessPlanInFile:
     priority: Annotated[int, Quantity(low=-(2**31), high=2**31 - 1, whole=True)] = 0
     labels: LabelsInFile = field(default_factory=LabelsInFile)
     migration: MigrationInFile = field(default_factory=MigrationInFile)
+    talks_to: Mapping[str, ByteRate] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,6 +272,7 @@ def _host(node: Node, problems: Problems) -> SimulatedHost | None:
     return SimulatedHost(
         host.name, resources, {**_LIMITS, **host.limits}, host.labels, host.max_processes,
         host.busy, host.joins, inf if host.leaves is None else host.leaves, host.lost,
+        host.link.simulated() if host.link is not None else None,
     )  # fmt: skip
 
 
@@ -284,6 +316,7 @@ def _spec(given: ProcessPlanInFile, needs: Mapping[str, float]) -> ProcessSpec:
         required_labels=given.labels.required, preferred_labels=given.labels.preferred,
         avoided_labels=given.labels.avoided, priority=given.priority,
         migration=MigrationPolicy(migration.strategy, migration.overlap, migration.options),
+        talks_to=given.talks_to,
     )  # fmt: skip
 
 

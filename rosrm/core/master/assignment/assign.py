@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
+from functools import reduce
 from math import inf
 from typing import Any, Final
 
 import numpy as np
 
+from rosrm.core.master.assignment.flows import joined, traffic_of
 from rosrm.core.master.assignment.neighbours import (
     awaited_neighbour,
     neighbours_of,
@@ -44,23 +46,24 @@ _FIRST_REQUEST: Final = 1.0
 def demand_of(state: MasterState, process: Process) -> Demand:
     """Return the demand of a process.
 
-    A change of the learned needs, of the hosts with a replica of its snapshot, or of the hosts of
-    its neighbours rebuilds it.
+    A change of the learned needs, of the hosts with a replica of its snapshot, of the hosts of its
+    neighbours, or of its flows rebuilds it.
     """
     version = state.learned.version
     near = state.replication.replicas.hosts_of(process.name, process.born)
-    neighbours = neighbours_of(state, process)
+    neighbours, traffic = neighbours_of(state, process), traffic_of(state, process)
     known = process.demand
     if (
         known is None
         or known[0] != version
         or known[1].near != near
         or known[1].neighbours != neighbours
+        or known[1].traffic != traffic
     ):
         needs = state.estimate(process.spec)
         demand = Demand(
             process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
-            neighbours=neighbours, plugins=state.placement,
+            neighbours=neighbours, traffic=traffic, plugins=state.placement,
         )  # fmt: skip
         # Equal processes share one demand, because thousands of them may wait.
         known = process.demand = (version, state.demands.setdefault(demand.key, demand))
@@ -84,7 +87,8 @@ def demand_to_move(
     amounts, guessed = demand_amounts(state, process, measured_need(state, seen))
     return Demand(
         process.spec, amounts, guessed, excluded, headroom,
-        neighbours=neighbours_of(state, process, together=together), plugins=state.placement,
+        neighbours=neighbours_of(state, process, together=together),
+        traffic=traffic_of(state, process, together=together), plugins=state.placement,
     )  # fmt: skip
 
 
@@ -97,7 +101,8 @@ def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, f
     """Return the demand of a process on the host of its image, where it is to be restored."""
     return Demand(
         process.spec, *demand_amounts(state, process, seen),
-        neighbours=neighbours_of(state, process), plugins=state.placement,
+        neighbours=neighbours_of(state, process), traffic=traffic_of(state, process),
+        plugins=state.placement,
     )  # fmt: skip
 
 
@@ -138,8 +143,9 @@ def joint_demand(state: MasterState, demands: Mapping[str, Demand]) -> Demand:
             amounts[resource] = amounts.get(resource, 0.0) + amount
     declared = frozenset[str]().union(*(one.declared for one in demands.values()))
     return replace(
-        demand, amounts=amounts, estimated=frozenset(amounts) - declared, excluded=excluded
-    )
+        demand, amounts=amounts, estimated=frozenset(amounts) - declared, excluded=excluded,
+        traffic=reduce(joined, (one.traffic for one in demands.values())),
+    )  # fmt: skip
 
 
 def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
@@ -161,9 +167,9 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
     ranking = state.rankings.get(demand.key)
     if ranking is not None:
         ranking.refresh()
-    elif demand.neighbours:
+    elif demand.key[1]:
         alone = state.rankings.get((demand.key[0], ()))
-        alone = ranking_of(state, alone.demand if alone else replace(demand, neighbours=()))
+        alone = ranking_of(state, alone.demand if alone else demand.alone())
         ranking = state.rankings[demand.key] = alone.beside(demand)
     else:
         ranking = Ranking(state.hosts, demand)
@@ -325,8 +331,10 @@ def _decide_jointly(
     names = {process.name, *(one.name for one in tied)}
     demands = {process.name: ranking.demand}
     for one in tied:
-        neighbours = neighbours_of(state, one, together=names)
-        demands[one.name] = replace(demand_of(state, one), neighbours=neighbours)
+        demands[one.name] = replace(
+            demand_of(state, one), neighbours=neighbours_of(state, one, together=names),
+            traffic=traffic_of(state, one, together=names),
+        )  # fmt: skip
     joint = ranking_of(state, joint_demand(state, demands))
     return decide(joint) if joint.best() >= 0 else None
 

@@ -51,6 +51,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         raise _refusal(state, event, taken, "name_taken", now)
     is_new = known is None or known.pruned
     host = state.hosts.register(description, now)
+    state.link_queries.begin(host.name, now)
     host.failing.clear()  # the slave reports the plugins that fail in this run
     state.ahead_since.pop(host.column, None)
     state.rebalancing.joined_at = now

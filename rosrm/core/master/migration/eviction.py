@@ -388,7 +388,8 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
     lasting = {**process.excluded, source.name: "it is there"}
     measured = measured_need(state, instance.measured)
     amounts, estimated = demand_amounts(state, process, measured)
-    possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
+    demand = Demand(process.spec, amounts, estimated, lasting, plugins=state.placement)
+    possible = may_ever_take(state.hosts, demand)
     if any(possible[host.column] for host in state.hosts.listed() if host is not source):
         return ""
     if _is_alone(state, source):

@@ -152,6 +152,7 @@ def _commit(state: MasterState, migration: Migration, step: Commit, now: float) 
         image_requests.commit_to_image(state, process, migration, step)
     else:
         process.owner = migration.destination.number
+        state.note_change(process.name)
         images.set_image(state, process, None)
     state.clear_left_behind(process)  # a source on a lost host has a successor now
     process.migrations += migration.aim is Aim.MOVE

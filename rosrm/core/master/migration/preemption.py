@@ -23,7 +23,7 @@ from rosrm.core.master.assignment.assign import demand_of, ranking_of
 from rosrm.core.master.assignment.neighbours import awaited_neighbour, running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
-from rosrm.core.master.migration.room import is_leaving, share_of, trial
+from rosrm.core.master.migration.room import is_leaving, share_of, trial, why_no_room
 from rosrm.core.master.migration.start import moves_under_way, why_immovable
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.recovery.journal_gap import why_no_work
@@ -77,20 +77,24 @@ class _Search:
     """The search for room for one process.
 
     Attributes:
+        tried: names of hosts on which room was made in vain.
         against: reasons why processes of lower priorities cannot make room.
+        stuck: names of processes that cannot leave their host, whichever others do.
     """
 
     process: Process
     ranking: Ranking
+    tried: frozenset[str]
     against: list[str] = field(default_factory=list)
+    stuck: set[str] = field(default_factory=set)
 
 
 def preempt(state: MasterState, now: float) -> None:
     """Make room for the first waiting processes that fit nowhere, or continue to make it."""
-    if not state.settings.preemption or now - state.preemption.reviewed < _EVERY:
+    if now - state.preemption.reviewed < _EVERY:
         return
     state.preemption.reviewed = now
-    waits = bool(len(state.queue)) and not why_no_work(state, now)
+    waits = state.settings.preemption and len(state.queue) and not why_no_work(state, now)
     waiting = list(_waiting(state, now)) if waits else []
     made = {one.name: _review(state, one, now) for one in waiting}
     state.preemption.room_made = {name: room for name, room in made.items() if room is not None}
@@ -128,12 +132,12 @@ def _review(state: MasterState, process: Process, now: float) -> RoomMade | None
     before = state.preemption.room_made.get(process.name)
     if before is not None and now < before.until and before.host is None:
         return before
-    search = _Search(process, ranking)
+    search = _Search(process, ranking, before.tried if before is not None else frozenset())
     if before is not None and before.host is not None:
         return _continue(state, search, before.host, before, now)
     for host, missing in _hosts_in_question(state, search):
         if (missing - _leaving(state, host) <= _CLOSE).all():  # also after a restart of the master
-            return _wait_for_room(state, host, now)
+            return _wait_for_room(state, search, host, now)
     return _make_room(state, search, _hosts_in_question(state, search), now)
 
 
@@ -145,24 +149,29 @@ def _continue(
     if not leaving.any() and not (before.partial and now >= before.until - _GRACE + _SHOWN):
         if now < before.until:
             return before
-        why = f"{host.name} has less room than expected, although {before.reason}"
-        return RoomMade(None, why, now + state.settings.cooldown)
+        return _in_vain(state, search, host, now)
     for one, missing in _hosts_in_question(state, search):
         if one is host:
             if (missing - leaving <= _CLOSE).all():
-                return _wait_for_room(state, host, now)
+                return _wait_for_room(state, search, host, now)
             if before.partial and leaving.any():
                 return replace(before, until=now + _GRACE)
             return _make_room(state, search, [(host, missing)], now)
-    return None  # the host takes no process any more
+    return _in_vain(state, search, host, now)
 
 
-def _wait_for_room(state: MasterState, host: Host, now: float) -> RoomMade:
-    names = sorted(
-        one.id.process for one in state.instances_of(host) if is_leaving(state, one)
-    )  # fmt: skip
+def _in_vain(state: MasterState, search: _Search, host: Host, now: float) -> RoomMade:
+    """Give up a host on which the process does not fit in spite of the room that was made."""
+    why = f"room was made on {host.name}, and the process does not fit there"
+    tried = search.tried | {host.name}
+    return RoomMade(None, why, now + state.settings.cooldown, tried=tried)
+
+
+def _wait_for_room(state: MasterState, search: _Search, host: Host, now: float) -> RoomMade:
+    names = sorted(one.id.process for one in state.instances_of(host) if is_leaving(state, one))
     leave = "leaves" if len(names) == 1 else "leave"
-    return RoomMade(host, f"{listed(names)} {leave} {host.name} to make room", now + _GRACE)
+    why = f"{listed(names)} {leave} {host.name} to make room"
+    return RoomMade(host, why, now + _GRACE, tried=search.tried)
 
 
 def _hosts_in_question(state: MasterState, search: _Search) -> list[tuple[Host, FloatArray]]:
@@ -180,7 +189,9 @@ def _hosts_in_question(state: MasterState, search: _Search) -> list[tuple[Host, 
     )[:, columns]  # fmt: skip
     missing = np.where(np.isnan(missing), -1.0, missing)  # no such resource
     order = np.argsort(np.maximum(missing, 0.0).sum(axis=0), kind="stable")
-    return [(table.hosts[columns[at]], missing[:, at]) for at in order]
+    found = [(table.hosts[columns[at]], missing[:, at]) for at in order]
+    # Nothing is missing where a policy has a veto.
+    return [one for one in found if (one[1] > _CLOSE).any() and one[0].name not in search.tried]
 
 
 def _leaving(state: MasterState, host: Host) -> FloatArray:
@@ -209,14 +220,19 @@ def _make_room(
         for host, missing in islice(_with_groups(state, search, hosts), _MOST_HOSTS)
         for chosen in _sets_on(state, search, host, missing, now)
     ]
-    sets.sort(key=lambda one: one[0])
-    for _, host, chosen in sets[:_MOST_TRIALS]:
+    trials = 0
+    for _, host, chosen in sorted(sets, key=lambda one: one[0]):
+        if trials == _MOST_TRIALS:
+            break
+        if any(group.processes[0].name in search.stuck for group in chosen):
+            continue
+        trials += 1
         moves = _planned(state, search, chosen, now)
         if moves is not None:
             return _begin(state, search, host, chosen, moves, now)
     against = few(dict.fromkeys(search.against), _MOST_REASONS)
     why = f"no process of a lower priority can make room{': ' * bool(against)}{'; '.join(against)}"
-    return RoomMade(None, why, now + _GRACE)
+    return RoomMade(None, why, now + _GRACE, tried=search.tried)
 
 
 def _with_groups(
@@ -271,20 +287,18 @@ def _why_it_stays(state: MasterState, search: _Search, process: Process, now: fl
         return f"{process.name} is protected"
     if process.wanted is not DesiredState.RUN or process.name in state.migrations:
         return f"{process.name} is being moved or stopped"
-    return "" if state.settings.preemption == "requeue" else _why_it_cannot_move(
-        state, process, now
-    )  # fmt: skip
+    if state.settings.preemption == "requeue":
+        return ""
+    return _why_it_cannot_move(state, process, now)
 
 
 def _why_it_cannot_move(state: MasterState, process: Process, now: float) -> str:
     if now - process.moved_at < state.settings.cooldown:
         return f"{process.name} is in its cool-down of {state.settings.cooldown:g} s after a move"
-    return why_immovable(state, process)
+    return why_immovable(state, process) or why_no_room(state, process)
 
 
-def covering_sets(
-    groups: Sequence[Group], missing: FloatArray
-) -> Iterator[tuple[Group, ...]]:  # fmt: skip
+def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tuple[Group, ...]]:
     """Yield the sets of groups that free what is missing, the smallest first.
 
     A set with a superfluous group is left out. Of many groups only the first combinations of each
@@ -319,19 +333,27 @@ def _planned(
     beside the others.
     """
     moves: list[PlannedMoves | None] = []
+    rejected: Process | None = None
     with trial(state) as reserve:
         for group in chosen:
-            process = group.processes[0]
-            planned = _plan(state, search.process, process, now)
-            if isinstance(planned, Rejected):
-                if state.settings.preemption != "requeue":
-                    search.against.append(planned.reason)
-                    return None
-                moves.append(None)
-            else:
+            planned = _plan(state, search.process, group.processes[0], now)
+            if not isinstance(planned, Rejected):
                 reserve(planned)
-                moves.append(planned)
-    return moves
+            elif state.settings.preemption != "requeue":
+                rejected = group.processes[0]
+                break
+            moves.append(None if isinstance(planned, Rejected) else planned)
+    if rejected is None:
+        return moves
+    alone = _plan(state, search.process, rejected, now) if moves else planned
+    if isinstance(alone, Rejected):
+        search.stuck.add(rejected.name)
+        search.against.append(alone.reason)
+    else:
+        search.against.append(
+            f"no hosts have room for all that would have to leave with {rejected.name}"
+        )
+    return None
 
 
 def _plan(
@@ -371,9 +393,9 @@ def _begin(
         phrases.append(f"{names} move{'s' * (number == 1)} to {planned.destination.name}")
     if not phrases:
         why = "other moves are under way (`migration.max_in_flight`)"
-        return RoomMade(None, f"no process can make room yet: {why}", now)
+        return RoomMade(None, f"no process can make room yet: {why}", now, tried=search.tried)
     why = f"room is made on {host.name}: {'; '.join(phrases)}"
-    return RoomMade(host, why, now + _GRACE, partial)
+    return RoomMade(host, why, now + _GRACE, partial, search.tried)
 
 
 def _requeue(

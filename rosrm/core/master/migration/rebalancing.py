@@ -17,7 +17,7 @@ import numpy as np
 from rosrm.core.master.assignment.neighbours import running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, plan_moves, try_move
-from rosrm.core.master.migration.room import is_leaving, share_of, trial
+from rosrm.core.master.migration.room import is_leaving, share_of, trial, why_no_room
 from rosrm.core.master.migration.start import moves_under_way, why_immovable
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
@@ -168,9 +168,10 @@ def _takes_work(state: MasterState) -> BoolArray:
 def _loads(state: MasterState, freed: FloatArray) -> FloatArray:
     """Return the load, (H,), of each host without what planned moves free on it, (R, H)."""
     table = state.hosts
-    used = np.where(table.limit < 1.0, (table.busy - freed) / table.limit, np.nan)
-    used = np.where(np.isfinite(used), used, 0.0)
-    loads: FloatArray = used.max(axis=0, initial=0.0)
+    is_limited = (table.limit > 0.0) & (table.limit < 1.0)
+    used = np.zeros_like(table.busy)
+    np.divide(table.busy - freed, table.limit, out=used, where=is_limited)
+    loads: FloatArray = np.nan_to_num(used).max(axis=0, initial=0.0)
     return loads
 
 
@@ -195,9 +196,7 @@ def _best_shift(state: MasterState, planned: Round, now: float) -> Shift | None:
     return None
 
 
-def _shifts_from(
-    state: MasterState, source: Host, planned: Round, now: float
-) -> Iterator[Shift]:  # fmt: skip
+def _shifts_from(state: MasterState, source: Host, planned: Round, now: float) -> Iterator[Shift]:
     """Yield each further move from a host that gains enough."""
     for instance in state.instances_of(source):
         process = state.owned_by(instance)
@@ -220,9 +219,7 @@ def _plan(state: MasterState, process: Process, now: float) -> PlannedMoves | Re
     return plan_moves(state, process, _CAUSE, now, headroom=state.settings.headroom)
 
 
-def _shift(
-    state: MasterState, planned: PlannedMoves, source: Host, freed: FloatArray
-) -> Shift:  # fmt: skip
+def _shift(state: MasterState, planned: PlannedMoves, source: Host, freed: FloatArray) -> Shift:
     """Return planned moves with the loads of their hosts before and after."""
     columns, then = [source.column, planned.destination.column], freed.copy()
     for process, _, own, _ in planned.steps:
@@ -237,4 +234,4 @@ def _why_it_stays(state: MasterState, process: Process, now: float) -> str:
         return f"{process.name} is protected"
     if now - process.moved_at < state.settings.cooldown:
         return f"{process.name} is in its cool-down of {state.settings.cooldown:g} s after a move"
-    return why_immovable(state, process)
+    return why_immovable(state, process) or why_no_room(state, process)

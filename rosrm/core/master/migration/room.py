@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Final
 
 import numpy as np
 
+from rosrm.core.master.assignment.assign import demand_amounts, measured_need
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves
-from rosrm.core.master.state.host_arrays import FloatArray
-from rosrm.core.master.state.process import Instance
+from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
+from rosrm.core.master.state.process import Instance, Process
 from rosrm.model.plan import Aim
+
+#: Tolerance in comparisons of sums of fractions.
+_CLOSE: Final = 1e-9
 
 
 def share_of(state: MasterState, instance: Instance) -> FloatArray:
@@ -39,6 +44,19 @@ def is_leaving(state: MasterState, instance: Instance) -> bool:
         and not migration.stuck
     )
     return moves or instance.stopping
+
+
+def why_no_room(state: MasterState, process: Process) -> str:
+    """Return why no other host has room for a running process; "": one may have.
+
+    It is a quick check of the largest part of all refusals, before a move is planned.
+    """
+    table, owner = state.hosts, state.instances[process.owner]
+    need = table.fractions(*demand_amounts(state, process, measured_need(state, owner.measured)))
+    limit = table.limit - state.settings.headroom + _CLOSE
+    full: BoolArray = np.logical_or.reduce(table.busy + need > limit)
+    full[owner.host.column] = True
+    return f"no host has room for {process.name}" if full.all() else ""
 
 
 @contextmanager

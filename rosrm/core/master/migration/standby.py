@@ -121,7 +121,7 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
                 excluded.setdefault(host.name, why)
     return Demand(
         process.spec, own.amounts, own.estimated, excluded, neighbours=neighbours,
-        plugins=state.placement,
+        traffic=own.traffic, plugins=state.placement,
     )  # fmt: skip
 
 

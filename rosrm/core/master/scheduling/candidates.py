@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rosrm.core.master.scheduling.traffic import flow_view
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.extensions.link_views import FlowView
 from rosrm.model.values import EMPTY, ProcessSpec
 
 Columns = slice | IntArray
@@ -29,6 +31,7 @@ class Candidates:
         busy: (R, n) reading plus reservations.
         processes: (n,) number of processes on the host or reserved for it.
         bound: (n,) highest number of processes.
+        flows: flows of the process on each host; None: it has none, or no policy reads them.
         empty: True if the arrays are those of hosts without processes.
         tenants: (n,) name to spec of each process on the host; None: as the table has them now.
         tenants_read: True if a plugin has read which processes run on one of the hosts.
@@ -43,6 +46,7 @@ class Candidates:
     busy: FloatArray
     processes: IntArray
     bound: IntArray
+    flows: FlowView | None = None
     empty: bool = False
     tenants: tuple[Mapping[str, ProcessSpec], ...] | None = None
     tenants_read: bool = False
@@ -56,7 +60,7 @@ class Candidates:
             return self.tenants[row]
         if self.empty:
             return EMPTY
-        return {spec.name: spec for spec in self.host(row).instances.values()}
+        return dict(self.host(row).instances.values())
 
     def keep_tenants(self) -> None:
         """Copy the current processes of each host, because they change before they are read."""
@@ -87,7 +91,15 @@ def candidates(
     return Candidates(
         table=table, demand=demand, columns=columns, resources=table.resources, need=need,
         cells=cells, busy=busy, processes=processes, bound=table.bound[columns],
+        flows=_flows(table, demand, columns),
     )  # fmt: skip
+
+
+def _flows(table: HostTable, demand: Demand, columns: Columns) -> FlowView | None:
+    if not demand.traffic.flows or not demand.scores_flows:
+        return None
+    at = np.arange(len(table))[columns] if isinstance(columns, slice) else columns
+    return flow_view(table.links, demand.traffic, at)
 
 
 def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:

@@ -11,6 +11,7 @@ from rosrm.core.master.scheduling.candidates import Candidates, as_if_empty
 from rosrm.core.master.scheduling.filters import (
     EXCLUSION,
     FILTERS,
+    LINKS,
     NEIGHBOURS,
     Filter,
     Lasts,
@@ -88,7 +89,7 @@ def _fit_empty(hosts: Candidates) -> BoolArray:
 def _possible(table: HostTable, demand: Demand) -> BoolArray:
     """Return a mask, (H,), of the hosts that may take a demand before a lasting change."""
     hosts = _every(table, demand)
-    possible = _fit_empty(hosts) & passing([EXCLUSION, NEIGHBOURS], hosts)
+    possible = _fit_empty(hosts) & passing([EXCLUSION, NEIGHBOURS, LINKS], hosts)
     there = passing(_AWAY, hosts)
     return possible & there if there.any() else possible
 

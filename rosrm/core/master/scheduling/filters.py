@@ -16,6 +16,7 @@ import numpy as np
 
 from rosrm.core.master.scheduling import plugin_filters, proximity
 from rosrm.core.master.scheduling.candidates import Candidates
+from rosrm.core.master.scheduling.traffic import flow_view, keeping_limits
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.wording import amount, by_reason, counted, listed
@@ -48,7 +49,7 @@ class Filter:
             the limiting setting if there is one. Called only for rows where `mask` is False.
         lasts: how long a host fails the filter. A process is set aside, and does not block the
             queue, if each host fails a permanent filter even as an empty host, or a rule on
-            neighbours. A host that is away counts as failing, unless all hosts are away.
+            neighbours or links. A host that is away counts as failing, unless all hosts are away.
         by_assignment: True if an assignment changes the mask. Mask and reason then may read only
             the demand and the arrays of the candidates, because a decision copies those alone and
             formats the reason later.
@@ -188,6 +189,21 @@ def _why_not_kept(hosts: Candidates, row: int) -> str:
     )
 
 
+# --- links of the host ------------------------------------------------------------------------
+
+
+def _keeps_link_limits(hosts: Candidates) -> BoolArray | None:
+    table = hosts.table
+    kept = keeping_limits(table.links, hosts.demand.traffic, len(table), empty=hosts.empty)
+    return None if kept is None else kept[hosts.columns]
+
+
+def _why_over_link(hosts: Candidates, row: int) -> str:
+    column = np.array([hosts.host(row).column])
+    view = flow_view(hosts.table.links, hosts.demand.traffic, column, empty=hosts.empty)
+    return view.describe(0, int(view.is_over()[0].argmax()))
+
+
 # --- presence of the host ---------------------------------------------------------------------
 
 
@@ -305,6 +321,7 @@ def _why_no_room(hosts: Candidates, row: int) -> str:
 
 EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
 NEIGHBOURS: Final = Filter("neighbours", _keeps_neighbours, _why_not_kept, Lasts.NEIGHBOURS)
+LINKS: Final = Filter("links", _keeps_link_limits, _why_over_link, Lasts.NEIGHBOURS)
 #: In order: if a host fails several, the first one gives the reason.
 FILTERS: Final = (
     EXCLUSION,
@@ -312,6 +329,7 @@ FILTERS: Final = (
     Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
     Filter("enforcement", _can_enforce, _why_not_enforced, Lasts.PERMANENT),
     NEIGHBOURS,
+    LINKS,
     Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
     Filter("expected", _is_not_expected, _why_not_up, Lasts.RETURN),
     Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),

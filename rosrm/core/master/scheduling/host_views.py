@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -10,10 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.scheduling.candidates import Candidates
-from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray
+from rosrm.core.master.scheduling.traffic import rates, round_trips
+from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray, IntArray
+from rosrm.core.master.state.links import LinkTable
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
-from rosrm.extensions.declared_fields import declared_spec
+from rosrm.extensions.declared_fields import FLOWS_FIELD, declared_spec
+from rosrm.extensions.link_views import NO_FLOWS
 from rosrm.extensions.plugin_calls import given, required
 from rosrm.model.values import ProcessSpec
 
@@ -25,7 +28,7 @@ def host_view(hosts: Candidates) -> HostView:
     return _View(
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
-        _read_only(hosts.processes[:]), _Labels(hosts), _Tenants(hosts),
+        _read_only(hosts.processes[:]), _Labels(hosts), _Links(hosts), _Tenants(hosts),
     )  # fmt: skip
 
 
@@ -44,7 +47,8 @@ def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
     `reads`: fields of the spec that the offer of the plugin declares.
     """
     spec = declared_spec(hosts.demand.spec, reads)
-    return ProcessView(spec, _read_only(hosts.need.T))
+    flows = hosts.flows if FLOWS_FIELD in reads and hosts.flows else NO_FLOWS
+    return ProcessView(spec, _read_only(hosts.need.T), flows)
 
 
 def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -105,6 +109,34 @@ def checked_mask(mask: object, count: int) -> BoolArray:
     if found.shape != (count,):
         raise PluginError(f"a mask of shape {found.shape} for {count} hosts")
     return found
+
+
+class _Links:
+    """`LinkView` of some hosts; computed when it is read, because few policies read it."""
+
+    def __init__(self, hosts: Candidates) -> None:
+        self._hosts = hosts
+
+    @property
+    def hosts(self) -> Sequence[str]:
+        return [host.name for host in self._hosts.table.hosts]
+
+    @property
+    def round_trip(self) -> FloatArray:
+        return self._read(round_trips, 0.0)
+
+    @property
+    def rate(self) -> FloatArray:
+        return self._read(rates, np.inf)
+
+    def _read(
+        self, values: Callable[[LinkTable, IntArray, IntArray], FloatArray], own: float
+    ) -> FloatArray:
+        every, at = np.arange(len(self._hosts.table)), self._hosts.columns
+        columns = every[at] if isinstance(at, slice) else at
+        found = values(self._hosts.table.links, columns, every)
+        found[columns[:, None] == every] = own
+        return _read_only(found)
 
 
 def checked_scores(

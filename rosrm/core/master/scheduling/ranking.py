@@ -28,6 +28,7 @@ from rosrm.core.master.scheduling.filters import (
 )
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.scheduling.proximity import keeping_all, preference
+from rosrm.core.master.scheduling.traffic import keeping_limits
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
@@ -89,24 +90,25 @@ class Ranking:
         return f"{name} ({self.failure})" if name else self.failure
 
     def beside(self, demand: Demand) -> Ranking:
-        """Return this ranking for a demand that differs by its neighbours alone.
+        """Return this ranking for a demand that differs by its neighbours and flows alone.
 
-        Neighbours change with each assignment, so that few demands share a ranking with them. The
-        scores of the policy do not depend on them.
+        These change with each assignment, so that few demands share a ranking with them. The scores
+        of the policy do not depend on them.
         """
         found = copy(self)
-        found._set_neighbours(demand, self)  # noqa: SLF001 - it is of this class
+        found._set_surroundings(demand, self)  # noqa: SLF001 - it is of this class
         return found
 
-    def _set_neighbours(self, demand: Demand, alone: Ranking) -> None:
+    def _set_surroundings(self, demand: Demand, alone: Ranking) -> None:
         self.demand, self._alone, self._lowest = demand, alone, None
         self._refusals, self._ahead = {}, {}
         self._preference = preference(self.table, demand)
         self.value = self.value + (0.0 if self._preference is None else self._preference)
-        kept = keeping_all(self.table, demand)
-        if kept is not None:
-            self._standing = self._standing & kept
-            self.value[~kept] = np.inf
+        limits = keeping_limits(self.table.links, demand.traffic, len(self.table))
+        for kept in (keeping_all(self.table, demand), limits):
+            if kept is not None:
+                self._standing = self._standing & kept
+                self.value[~kept] = np.inf
 
     def note_assignment(self) -> None:
         """Note that the newest change of the table was an assignment of this demand."""

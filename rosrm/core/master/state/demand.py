@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, Final
 
-from rosrm.extensions.declared_fields import STANDARD_FIELDS
+from rosrm.core.master.state.links import Crossing
+from rosrm.extensions.declared_fields import FLOWS_FIELD, STANDARD_FIELDS
 from rosrm.extensions.placement import NO_PLUGINS, PlacementPlugins
 from rosrm.model.values import EMPTY, ProcessSpec, Relation
 
@@ -35,8 +36,43 @@ class Neighbour:
     absent: str = ""
 
 
-#: Values that decide about a ranking: those of the process alone, and its neighbours.
-RankingKey = tuple[tuple[Any, ...], tuple[Neighbour, ...]]
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """A flow between the process and another one, which has a host.
+
+    Attributes:
+        process: name of the other process.
+        host, column: of the other process.
+        rate: bytes a second.
+        incoming: the process receives it from the other one, or declares it.
+    """
+
+    process: str
+    host: str
+    column: int
+    rate: float
+    incoming: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """The flows of a process, and their part in the load of the links.
+
+    Attributes:
+        flows: to all processes with a host.
+        counted: flows of the process between hosts that the load of the links includes now.
+        version: of the links.
+    """
+
+    flows: tuple[Flow, ...] = ()
+    counted: tuple[Crossing, ...] = ()
+    version: int = 0
+
+
+NO_TRAFFIC: Final = Traffic()
+
+#: Values that decide about a ranking: those of the process alone, and its neighbours and flows.
+RankingKey = tuple[tuple[Any, ...], tuple[Neighbour | Traffic, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +86,10 @@ class Demand:
         headroom: fraction by which a host must stay under each limit.
         near: hosts with a replica of its snapshot; each counts as one more preferred label.
         neighbours: rules on its hosts, relative to other processes.
+        traffic: flows between it and other processes.
         plugins: the policies and filters that judge hosts.
         key: equal for demands with equal rankings; its first part, for demands that differ by
-            their neighbours alone.
+            their neighbours alone, or by their flows, unless the policies read them.
     """
 
     spec: ProcessSpec
@@ -62,17 +99,35 @@ class Demand:
     headroom: float = 0.0
     near: tuple[str, ...] = ()
     neighbours: tuple[Neighbour, ...] = ()
+    traffic: Traffic = NO_TRAFFIC
     plugins: PlacementPlugins = field(default=NO_PLUGINS, compare=False)
     key: RankingKey = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        without_neighbours = (
+        scored, added = self._traffic_keys()
+        alone = (
             *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
             # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
-            *(repr(getattr(self.spec, name)) for name in self.plugins.reads),
+            *(repr(getattr(self.spec, name)) for name in self.plugins.reads), *scored,
         )  # fmt: skip
-        object.__setattr__(self, "key", (without_neighbours, self.neighbours))
+        object.__setattr__(self, "key", (alone, (*self.neighbours, *added)))
+
+    def _traffic_keys(self) -> tuple[tuple[Traffic, ...], tuple[Traffic, ...]]:
+        """Return the flows as a part of the first and of the second part of the key."""
+        if not self.traffic.flows:
+            return (), ()
+        return ((self.traffic,), ()) if self.scores_flows else ((), (self.traffic,))
+
+    @property
+    def scores_flows(self) -> bool:
+        """Return True if the scores of the policies may depend on the flows."""
+        return FLOWS_FIELD in self.plugins.reads
+
+    def alone(self) -> Demand:
+        """Return the demand without what the second part of its key contains."""
+        traffic = self.traffic if self.scores_flows else NO_TRAFFIC
+        return replace(self, neighbours=(), traffic=traffic)
 
     @property
     def declared(self) -> frozenset[str]:

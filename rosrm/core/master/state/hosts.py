@@ -23,6 +23,7 @@ from rosrm.core.master.state.host_arrays import (
     HostColumns,
     IntArray,
 )
+from rosrm.core.master.state.links import LinkTable
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.values import HostDescription, ProcessSpec
 
@@ -67,8 +68,8 @@ class Host:
     Attributes:
         column: column of this host in the arrays of `HostTable`.
         attributed, shared: resources with this accounting on the host.
-        instances: number of each instance that runs on the host or is assigned to it, to the spec
-            of its process.
+        instances: number of each instance that runs on the host or is assigned to it, to the name
+            and the read-only spec of its process.
         over_since: resource name to the time since when the host is over this limit.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
@@ -91,7 +92,7 @@ class Host:
     pruned: bool = False
     attributed: frozenset[str] = frozenset()
     shared: frozenset[str] = frozenset()
-    instances: dict[int, ProcessSpec] = field(default_factory=dict)
+    instances: dict[int, tuple[str, ProcessSpec]] = field(default_factory=dict)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
     recorded_at: dict[str, float] = field(default_factory=dict)
@@ -124,6 +125,7 @@ class HostTable(HostColumns):
 
     Attributes:
         version: counter of changes that concern many hosts.
+        links: measured links between hosts, and the flows across them.
         claims: column of a host on which room is made for a process -> priority of the process.
         touched: columns that assignments and ends have changed since `version` grew.
     """
@@ -132,6 +134,7 @@ class HostTable(HostColumns):
         super().__init__()
         self.by_name: dict[str, Host] = {}
         self.hosts: list[Host] = []
+        self.links = LinkTable()
         self.version = 0
         self.touched: list[int] = []
         self.claims: dict[int, int] = {}
@@ -182,6 +185,7 @@ class HostTable(HostColumns):
         self.incarnation[column] = description.incarnation
         self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
         self.refused_since[column] = np.inf
+        self.links.forget(column)
         self._labelled.clear()
         self._enforcing.clear()
         self.changed()
@@ -206,6 +210,7 @@ class HostTable(HostColumns):
         for known in (host.over_since, host.over_at, host.recorded_at, host.blocked, host.failing):
             known.clear()
         self.incarnation[host.column] = 0
+        self.links.forget(host.column)
         self._labelled.clear()
         self._enforcing.clear()
         self.set_closed(host, cordoned=False, draining=False)

@@ -50,20 +50,36 @@ class PeriodicCheckpoint:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkMeasurement:
+    """The order measures the links of a host."""
+
+    host: str
+
+
+@dataclass(frozen=True, slots=True)
 class Reload:
     """The order reloads the settings of a host."""
 
     host: str
 
 
-Purpose = MigrationStep | ImageRemoval | Replication | CapabilityQuery | PeriodicCheckpoint | Reload
+Purpose = (
+    MigrationStep
+    | ImageRemoval
+    | Replication
+    | CapabilityQuery
+    | PeriodicCheckpoint
+    | LinkMeasurement
+    | Reload
+)
 
-#: Purposes with their own series of numbers, because they depend on optional plugins: a replay
-#: without such a plugin must give all other orders the same numbers.
-_SERIES: Final[dict[type, Literal["replication", "capability", "periodic"]]] = {
+#: Purposes with their own series of numbers, because they depend on optional plugins or are
+#: no decisions: a replay without them must give all other orders the same numbers.
+_SERIES: Final[dict[type, Literal["replication", "capability", "periodic", "links"]]] = {
     Replication: "replication",
     CapabilityQuery: "capability",
     PeriodicCheckpoint: "periodic",
+    LinkMeasurement: "links",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from rosrm.core.master import events as happened
 from rosrm.core.master.state.process import ProcessPhase
 from rosrm.model.values import InstanceState
-from rosrm_simulate.workload import Curve
+from rosrm_simulate.workload import Curve, SimulatedLink
 
 from .workloads import MIB, host, plan, run, simulation
 
@@ -277,6 +278,24 @@ def test_progress_is_told():
     assert told[-1].ended <= 400 == told[-1].processes
 
 
+def test_flows_stay_within_the_limits_of_simulated_links():
+    """The detector runs behind the fast link, although the host of the slow one is emptier."""
+    hosts = [
+        host("robot", 100.0, link=SimulatedLink(100e6, 0.01)),
+        host("slow", 4096.0, link=SimulatedLink(5e6, 0.03)),
+        host("fast", link=SimulatedLink(100e6, 0.01)),
+    ]
+    robot = {"needs": {"memory": 70 * MIB}, "required_labels": {"name": "robot"}}
+    hosts[0] = replace(hosts[0], labels={"name": "robot"})
+    plans = [plan("camera", **robot), plan("detector", at=1.0, talks_to={"camera": 20e6})]
+    simulated = simulation(hosts, plans, until=5.0)
+    simulated.run()
+    processes = simulated.state.processes
+    assert simulated.state.instances[processes["detector"].owner].host.name == "fast"
+    links = simulated.state.hosts.links
+    assert links.round_trip[0, 1] == links.round_trip[1, 0] == pytest.approx(0.04)
+
+
 # --- moves for more than limits -----------------------------------------------------------------
 
 
@@ -301,6 +320,8 @@ def test_the_load_is_evened_out_on_virtual_time():
 
 
 def test_a_job_is_stopped_after_its_time_limit_on_virtual_time():
-    """It has not finished."""
-    plans = [plan("p", duration=50.0, time_limit=10.0), plan("q", duration=5.0, time_limit=10.0)]
-    assert run([host("a")], plans, until=100.0).finished == 1
+    """It has not finished; nothing else happens for much longer than the other times last."""
+    plans = [plan("p", duration=900.0, time_limit=90.0), plan("q", duration=5.0, time_limit=90.0)]
+    outcome = run([host("a")], plans)
+    assert (outcome.finished, outcome.ended_otherwise) == (1, 1)
+    assert outcome.ends["p"] == pytest.approx(90.0, abs=1.0)

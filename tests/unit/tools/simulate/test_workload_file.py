@@ -16,6 +16,7 @@ from rosrm.model.values import Kind
 from rosrm_simulate import workload_file as in_file
 from rosrm_simulate.runs import run
 from rosrm_simulate.variants import variant_in_text
+from rosrm_simulate.workload import SimulatedLink
 from rosrm_simulate.workload_file import load_workload
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -65,6 +66,21 @@ def test_a_workload_says_all_that_is_simulated(load):
     assert job.spec.migration.strategy == "relaunch"
     assert [job.memory.at(age) for age in (0, 10, 25)] == [1e7, 2e7, 3e7]
     assert (service.duration, made.until, made.model.start) == (inf, 300.0, 1.0)
+
+
+def test_a_workload_has_links_and_flows(load):
+    made = load(
+        "hosts: [{name: a, memory: 1GiB, cpu: 2, link: {rate: 5MB/s, round_trip: 20ms}}]\n"
+        "processes: [{name: p, memory: 1MB, talks_to: {q: 1MB/s}}]\n"
+    ).workload
+    assert made.hosts[0].link == SimulatedLink(5e6, 0.02)
+    assert made.processes[0].spec.talks_to == {"q": 1e6}
+
+
+@pytest.mark.parametrize("rate", [".nan", "0", "fast", "-1", ".inf"])
+def test_a_link_rate_that_is_no_positive_number_is_refused(load, rate):
+    with pytest.raises(ConfigError, match=r"link\.rate: "):
+        load(f"hosts: [{{name: a, memory: 1GiB, cpu: 2, link: {{rate: {rate}}}}}]\n{PROCESS}")
 
 
 def test_what_is_drawn_lies_within_its_bounds_and_is_the_seeds(load):

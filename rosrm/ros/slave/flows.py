@@ -1,0 +1,171 @@
+"""Rates of the topics that the nodes of this host receive, sampled one at a time.
+
+A sample subscribes to a topic until two messages have come: their numbers and time stamps give the
+rate, their sizes the bytes. So a topic of 30 MB/s costs a few messages, once in `_RENEWED` seconds.
+After a sample the next one waits until the CPU time of the slave in it is a hundredth of the time.
+
+Left out are services, topics with several publishers, and types that are not installed here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from rclpy.node import Node
+
+from rosrm.ros import qos
+from rosrm.ros.polling import message_type, polled_subscription, waiting
+
+#: Largest part of a core that the slave uses for samples.
+SHARE: Final = 0.01
+#: Seconds of a sample at most, between two samples at least, and until a topic is sampled again.
+_WINDOW: Final = 3.0
+_PAUSE: Final = 5.0
+_RENEWED: Final = 300.0
+#: Messages that DDS keeps between two looks: their number bounds the memory of a sample.
+_DEPTH: Final = 2
+#: Significant digits of a rate, so that a steady flow stays the same.
+_DIGITS: Final = 2
+#: Topics that every node has, and that of simulated time.
+_OF_EVERY_NODE: Final = ("/parameter_events", "/rosout", "/clock")
+
+#: Number of an instance and a topic.
+_Key = tuple[int, str]
+
+
+@dataclass(slots=True)
+class _Sample:
+    """One topic that is being sampled.
+
+    Attributes:
+        seen: number of the publisher, time stamp in seconds and size of each message.
+    """
+
+    key: _Key
+    publisher: str
+    subscription: Any
+    began: float
+    cpu: float
+    seen: list[tuple[int, float, int]] = field(default_factory=list)
+
+    def rate(self, now: float) -> float:
+        """Return the bytes a second; of a single message, its size over the time of the sample."""
+        if not self.seen:
+            return 0.0
+        size = sum(size for *_, size in self.seen) / len(self.seen)
+        (first, began, _), (last, ended, _) = self.seen[0], self.seen[-1]
+        if last > first and ended > began:
+            return size * (last - first) / (ended - began)
+        return size * len(self.seen) / max(now - self.began, _WINDOW)
+
+
+class FlowSampler:
+    """Samples the topics that nodes of this host subscribe to.
+
+    Args:
+        node: returns a node outside the executor; called once, when the first topic is sampled.
+        clock: monotonic seconds.
+        cpu: CPU seconds of this process.
+    """
+
+    def __init__(
+        self, node: Callable[[], Node], clock: Callable[[], float] = time.monotonic,
+        cpu: Callable[[], float] = time.process_time,
+    ) -> None:  # fmt: skip
+        self._make_node, self._clock, self._cpu = node, clock, cpu
+        self._node: Node | None = None
+        self._sample: _Sample | None = None
+        self._next_at = 0.0
+        self._rates: dict[_Key, tuple[str, float]] = {}
+        self._sampled_at: dict[_Key, float] = {}
+
+    def rates(self) -> dict[int, dict[str, float]]:
+        """Return what each instance receives, bytes a second by the full name of the publisher."""
+        found: dict[int, dict[str, float]] = {}
+        for (number, _), (publisher, rate) in self._rates.items():
+            received = found.setdefault(number, {})
+            received[publisher] = received.get(publisher, 0.0) + rate
+        return {
+            number: {node: float(f"{rate:.{_DIGITS}g}") for node, rate in rates.items()}
+            for number, rates in found.items()
+        }
+
+    def look(self, nodes: Mapping[int, str]) -> None:
+        """Take the next step of a sample, or begin the next one.
+
+        Args:
+            nodes: number of each instance to the full name of its node.
+        """
+        for key in [key for key in self._sampled_at if key[0] not in nodes]:
+            self._rates.pop(key, None)
+            del self._sampled_at[key]
+        if self._sample is not None:
+            self._go_on(self._sample)
+        elif self._clock() >= self._next_at and nodes:
+            began, cpu = self._clock(), self._cpu()
+            self._begin(nodes, began, cpu)
+            if self._sample is None:
+                self._wait(cpu)
+
+    def close(self) -> None:
+        """End the sample."""
+        if self._sample is not None and self._node is not None:
+            self._node.destroy_subscription(self._sample.subscription)
+            self._sample = None
+
+    def _wait(self, cpu: float) -> None:
+        """Let the next sample begin when the CPU time since `cpu` is a small part of the time."""
+        self._next_at = self._clock() + max(_PAUSE, (self._cpu() - cpu) / SHARE)
+
+    def _begin(self, nodes: Mapping[int, str], now: float, cpu: float) -> None:
+        """Begin a sample of the topic that was sampled longest ago, if it is due."""
+        self._node = self._node or self._make_node()
+        due = [
+            (self._sampled_at.get((number, topic), -_RENEWED), number, topic, kind)
+            for number, name in nodes.items()
+            for topic, kind in self._subscribed(name)
+        ]
+        at, number, topic, kind = min(due, default=(now, 0, "", ""))
+        if now - at < _RENEWED:
+            return
+        key = (number, topic)
+        self._sampled_at[key] = now
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        if len(publishers) != 1:
+            self._rates.pop(key, None)
+            return
+        publisher = f"{publishers[0].node_namespace.rstrip('/')}/{publishers[0].node_name}"
+        try:
+            profile = qos.best_effort(depth=_DEPTH)
+            subscription = polled_subscription(self._node, message_type(kind), topic, profile)
+        except Exception:  # noqa: BLE001 - whatever a package or the middleware raises
+            return  # the type is not installed on this host
+        self._sample = _Sample(key, publisher, subscription, now, cpu)
+
+    def _subscribed(self, full_name: str) -> Iterator[tuple[str, str]]:
+        """Yield the topics to which a node subscribes, with their types."""
+        assert self._node is not None
+        namespace, _, name = full_name.rpartition("/")
+        try:
+            found = self._node.get_subscriber_names_and_types_by_node(name, namespace or "/")
+        except Exception:  # noqa: BLE001 - rclpy's error for a node that is not in the graph
+            return
+        for topic, kinds in found:
+            if topic not in _OF_EVERY_NODE and len(kinds) == 1:
+                yield topic, kinds[0]
+
+    def _go_on(self, sample: _Sample) -> None:
+        for content, info in waiting(sample.subscription, _DEPTH):
+            number, stamp = info["publication_sequence_number"], info["source_timestamp"]
+            sample.seen.append((int(number), stamp * 1e-9, len(content)))
+        now = self._clock()
+        if len(sample.seen) >= _DEPTH or now - sample.began >= _WINDOW:
+            assert self._node is not None
+            self._node.destroy_subscription(sample.subscription)
+            self._sample = None
+            if sample.key in self._sampled_at:  # the instance has not ended meanwhile
+                self._rates[sample.key] = (sample.publisher, sample.rate(now))
+            self._wait(sample.cpu)
