@@ -14,9 +14,10 @@ master's runtime, without the transport and the journal:
 - `constrained`: 1,000 processes submitted at once to 1,000 hosts. `plain`: ten different demands by
   turns; `applications`: the same demands with labels and neighbours, in applications of ten
   processes that belong together; `spread`: the same demands, in groups of 150 processes that keep
-  apart; `links`: `applications` with a flow from each member to its driver, on hosts with measured
-  links; `network`: the same with the policy `network` in the chain. Assignments a second, and how
-  many times as long as `plain` each takes.
+  apart; `devices`: the same demands, half of them with a camera or a share of a GPU; `links`:
+  `applications` with a flow from each member to its driver, on hosts with measured links;
+  `network`: the same with the policy `network` in the chain. Assignments a second, and how many
+  times as long as `plain` each takes.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.placement import PlacementPlugins, ScoringLink
+from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.links import Interface
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -58,6 +60,7 @@ _RACKS = 50
 _APPLICATION = 10
 _GROUP = 150
 _DEMANDS = 10
+_DEVICES = (Device("camera", "front", "/dev/video0"), Device("gpu", "0"), Device("gpu", "1"))
 
 #: Returns the spec of a process by its number.
 SpecOf = Callable[[int], ProcessSpec]
@@ -90,7 +93,7 @@ class Bench:
         for number in range(hosts):
             labels = {"rack": f"r{number % _RACKS}", "arch": "arm64" if number % 4 else "x86_64"}
             description = HostDescription(
-                f"h{number}", number + 1, labels=labels, resources=described
+                f"h{number}", number + 1, labels=labels, resources=described, devices=_DEVICES
             )
             self.step(happened.HostRegistered(number, description))
         for number in range(hosts) if links else ():
@@ -158,10 +161,10 @@ def rate_once(hosts: int, spec_of: SpecOf, count: int, **bench_options: bool) ->
 
 
 def constrained(runs: int) -> dict[str, dict[str, float]]:
-    """Return the rates with labels, neighbours and links, by turns with the plain one."""
+    """Return the rates with labels, neighbours, devices and links, by turns with the plain one."""
     cases: dict[str, tuple[SpecOf, dict[str, bool]]] = {
         "plain": (mixed, {}), "applications": (of_application, {}), "spread": (spread, {}),
-        "links": (with_flow, {"links": True}),
+        "devices": (on_device, {}), "links": (with_flow, {"links": True}),
         "network": (with_flow, {"links": True, "network": True}),
     }  # fmt: skip
     rates: dict[str, list[float]] = {name: [] for name in cases}
@@ -213,6 +216,14 @@ def with_flow(number: int) -> ProcessSpec:
 def spread(number: int) -> ProcessSpec:
     rule = NeighbourRule("apart", group=f"group {number // _GROUP}")
     return replace(mixed(number), neighbours=(rule,))
+
+
+def on_device(number: int) -> ProcessSpec:
+    spec = mixed(number)
+    if number % 2:
+        return spec
+    need = DeviceNeed("camera") if number % 4 else DeviceNeed("gpu", 0.25)
+    return replace(spec, devices=(need,))
 
 
 def _spec(number: int, needs: dict[str, float]) -> ProcessSpec:
