@@ -9,6 +9,7 @@ discovery.py         import of the installed plugins, call of their hooks
 registry.py          selection of plugins by name, creation of their objects
 made.py              created objects, and checks of them
 declared_fields.py   fields of a spec that an offer declares to read
+link_views.py        links and flows as policies read them
 placement.py         selected policies and filters, for the core
 plugin_calls.py      guard of every call of a plugin
 time_limit.py        time-out of a call
