@@ -12,5 +12,6 @@ ros_settings.py         ROS settings of a part: domain, discovery, transports, i
 codec.py                conversion of values to JSON and back
 durations.py            bound of all times
 limits.py               rules for limits and scheduling of a process
+links.py                measurements of links between hosts, as slaves report them
 description_checks.py   checks of the description of a host
 """
