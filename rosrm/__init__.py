@@ -22,13 +22,13 @@ A plugin marks its hooks with `hookimpl` and returns offers::
 The public names, by purpose:
 
 Client          Client, load_work, RosSettings; its results: Listing, ProcessRow, HostRow,
-                HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
+                HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
-                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule,
+                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
                 ReschedulePolicy
 Plugins         hookimpl, NoOptions, SkipPlugin
-  probes        ProbeOffer, Probe, ProcessMeasuring, ProbeContext, Sessions,
-                ResourceDescription, Accounting, Reading, HostLabelling
+  probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
+                Sessions, ResourceDescription, Accounting, Reading, Device
   scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, LinkView, FlowView,
                 FloatArray, BoolArray
   filters       FilterOffer, PlacementFilter
@@ -77,6 +77,7 @@ if TYPE_CHECKING:
         CheckpointOffer,
         CheckpointPolicy,
         CheckpointView,
+        DeviceFinding,
         FilterOffer,
         FloatArray,
         GraphDepartureLauncher,
@@ -121,6 +122,7 @@ if TYPE_CHECKING:
         ResourceName,
         Seconds,
     )
+    from rosrm.model.devices import Device, DeviceNeed
     from rosrm.model.plan import (
         AwaitReady,
         AwaitReleased,
@@ -137,6 +139,7 @@ if TYPE_CHECKING:
     )
     from rosrm.model.ros_settings import RosSettings
     from rosrm.model.rows import (
+        DeviceRow,
         EventRow,
         HostRow,
         Listing,
@@ -169,6 +172,7 @@ __all__ = [
     "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
+    "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
     "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
     "GraphDepartureLauncher", "HandoffPhase", "Health", "HostChecking", "HostDescription",
     "HostLabelling", "HostLossPolicy",
@@ -193,8 +197,8 @@ _NAMES: Final = {
     "config.work": "load_work",
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
     "extensions.contracts": (
-        "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy "
-        "CheckpointView FilterOffer FloatArray GraphDepartureLauncher HostChecking HostLabelling "
+        "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
+        "DeviceFinding FilterOffer FloatArray GraphDepartureLauncher HostChecking HostLabelling "
         "HostView ImageLauncher Imaging Launch Launcher LauncherContext LauncherOffer "
         "MemoryPacing MemoryView MigrationOffer MigrationStrategy NoOptions PeriodicImaging "
         "PlacementFilter Probe ProbeContext ProbeOffer ProcessMeasuring ProcessTreeLauncher "
@@ -206,12 +210,13 @@ _NAMES: Final = {
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
     ),
+    "model.devices": "Device DeviceNeed",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "
         "SetRestart Start Step Stop"
     ),
     "model.ros_settings": "RosSettings",
-    "model.rows": "EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
+    "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
         "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "

@@ -9,6 +9,7 @@ from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 
 from hypothesis import strategies as st
 
+from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
 from rosrm.model.values import Enforcement, Limits, NeighbourRule, ProcessSpec, Realtime
@@ -31,13 +32,30 @@ _PLAIN: Final = st.recursive(
     max_leaves=6,
 )
 _INT32: Final = st.integers(-(2**31), 2**31 - 1)
+_UNITS: Final = st.lists(PROPER_NAMES, max_size=3, unique=True).map(tuple)
+_SHARES: Final = st.floats(0.0, 1.0, exclude_min=True)
+_ASKED: Final = st.one_of(
+    st.builds(DeviceNeed, PROPER_NAMES, st.floats(0.001, 1.0) | st.integers(1, 256).map(float)),
+    st.builds(
+        lambda kind, units: DeviceNeed(kind, float(len(units) or 1), units), PROPER_NAMES, _UNITS
+    ),
+)
+_DEVICES: Final = st.builds(
+    Device, PROPER_NAMES, PROPER_NAMES, PRINTABLE.map(lambda text: f"/{text}"),
+    st.integers(1, 1000), PRINTABLE, PRINTABLE,
+)  # fmt: skip
 _BY_TYPE: Final[Mapping[Any, Drawn]] = {
     str: WORDS,
     int: st.integers(0, 2**31 - 1),
     float: st.floats(0.0, 3e8),
     str | None: st.none() | NAMES,
     Any: _PLAIN,
-}
+    HeldDevice: st.builds(HeldDevice, PROPER_NAMES, PROPER_NAMES, _SHARES),
+    tuple[DeviceNeed, ...]: st.lists(_ASKED, max_size=3, unique_by=lambda one: one.kind).map(tuple),
+    tuple[Device, ...]: st.lists(
+        _DEVICES, max_size=3, unique_by=lambda one: (one.kind, one.unit)
+    ).map(tuple),
+}  # fmt: skip
 #: Fields with another range than other fields of their type.
 _BY_NAME: Final[Mapping[str, Drawn]] = {
     "name": PROPER_NAMES,

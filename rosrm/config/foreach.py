@@ -5,7 +5,7 @@
 
 In every text of the entry `{i}` is replaced by the value, and `{i:02d}` by the value in Python's
 format. A text that consists of `{i}` alone becomes the value itself, number or text. `{{` is a
-plain brace.
+plain brace. `{device.camera}` stays for the host that runs the process.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Final
 
 from rosrm.config.checking import described, near
 from rosrm.config.documents import Node, Problems
+from rosrm.model.devices import PLACEHOLDER
 
 #: Highest number of processes to which one entry may expand.
 MOST: Final = 10_000
@@ -161,6 +162,8 @@ def _piece(found: re.Match[str], row: Row) -> str:
         return found[0][0]
     if found[1] is None:
         raise ValueError(f"a single brace; write {found[0] * 2} for a plain one")
+    if PLACEHOLDER.fullmatch(found[0]):
+        return found[0]  # the host fills it in
     name, _, form = found[1].partition(":")
     if name not in row:
         hint = "" if name.isidentifier() else "; write {{ and }} for plain braces"

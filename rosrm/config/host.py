@@ -12,6 +12,7 @@ from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import Registry
+from rosrm.model.devices import device_fault
 
 #: Resources whose budget is required for the scope "slice".
 _OF_A_SLICE = ("memory", "cpu")
@@ -33,6 +34,10 @@ def checked_host(root: Node, path: str | Path, registry: Registry | None) -> Hos
     check_kind(root, "host")
     config = validated(HostConfig, root, problems)
     _check_rules(root, problems)
+    for kind, units in config.devices.items() if config is not None else ():
+        fault = device_fault(units)
+        if fault:
+            problems.add(root.deepest(("devices", kind)).place, f"devices: {fault}")
     chosen = root.get("probes")
     plugins = PluginCheck(registry, problems)
     probes = plugins.by_name("probe", chosen)

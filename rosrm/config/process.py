@@ -6,12 +6,14 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Final, Literal, TypeVar
 
+from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
 from rosrm.model.description_checks import is_namespace, name_fault
+from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.values import (
     EMPTY,
@@ -213,6 +215,7 @@ class ProcessInFile:
     cpus: tuple[_CpuNumber, ...] = ()
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
+    devices: AskedByKind = field(default_factory=lambda: EMPTY)
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -241,6 +244,7 @@ class ProcessInFile:
             reschedule=_same(ReschedulePolicy, self.reschedule),
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
+            devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
             given=(),
         )
 
@@ -340,6 +344,21 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
                 fault = f"{name} names itself; only other processes are allowed"
             if fault:
                 yield Complaint((key,), f"{key}: {fault}")
+
+
+def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
+    for need in spec.devices:
+        fault = need_fault((need,))
+        if fault:
+            yield Complaint(("devices", need.kind), f"devices: {fault}")
+    kinds = [need.kind for need in spec.devices]
+    for key in ("arguments", "parameters"):
+        for kind in unknown_placeholders(repr(getattr(spec, key)), kinds):
+            yield Complaint(
+                (key,),
+                f"{key}: {{device.{kind}}} needs a device of the kind {kind!r}, which the process "
+                f"does not ask for; its `devices:` are {listed(kinds)}",
+            )
 
 
 def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -450,6 +469,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
+    (_about_devices, ("devices", "arguments", "parameters")),
     (_about_flows, ("name", "talks_to")),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),
 )

@@ -15,7 +15,7 @@ OF_CLUSTER: Final = (
     "quotas", "defaults", "delivery_timeout", "max_hosts",
 )  # fmt: skip
 #: The same of a slave.
-OF_HOST: Final = ("labels", "limits")
+OF_HOST: Final = ("labels", "limits", "devices")
 #: Sections with other keys in a file than as a value.
 _AS_A_WHOLE: Final = ("ros",)
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
+from rosrm.config.device_forms import OfferedByKind, with_kinds
 from rosrm.config.markers import (
     NullIsEmpty,
     OneOrMore,
@@ -469,6 +470,8 @@ class HostConfig:
         max_processes: highest number of running processes; 0: no limit.
         max_starting: highest number of processes that are starting and not ready; 0: no limit.
         logs: logs of the processes.
+        devices: units of devices by kind, which the host gives to its processes; of a kind that is
+            not here, those that the probes find.
         control: times of requests.
         keep: snapshots and replicas.
         links: links to other hosts.
@@ -496,9 +499,11 @@ class HostConfig:
     keep: KeepSettings = field(default_factory=KeepSettings)
     links: LinkSettings = field(default_factory=LinkSettings)
     on_stop: Literal["stop", "keep"] = "stop"
+    devices: OfferedByKind = field(default_factory=lambda: EMPTY)
 
     def __post_init__(self) -> None:
-        """Set the defaults of the state directory, which depends on the name, and of the limits."""
+        """Set the default of `state`, which depends on the name, limits, and kinds of devices."""
+        object.__setattr__(self, "devices", with_kinds(self.devices))
         if self.state == Path():
             object.__setattr__(self, "state", default_state(self.host, "slave"))
         object.__setattr__(self, "limits", {**DEFAULT_LIMITS, **self.limits})

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.extensions.link_views import NO_FLOWS, NO_LINKS, FlowView, LinkView
+from rosrm.model.devices import Device
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
     EMPTY,
@@ -67,6 +68,17 @@ class ProcessMeasuring(Protocol):
         Called after each `read`, in the same thread. The answer has each attributed resource of the
         probe, and may have others: eviction then moves the process with the largest usage. Pids
         outside of the slave's sessions have no effect.
+        """
+
+
+class DeviceFinding(Protocol):
+    """A probe that also finds devices of its host."""
+
+    def devices(self) -> Iterable[Device]:
+        """Return every device, also one that is `missing` now, with the reason; units are fixed.
+
+        Called after each `read`, in the same thread, also if `read` raised. The settings of the
+        host take precedence: they choose the units of a kind.
         """
 
 
@@ -157,6 +169,8 @@ class HostView:
         links: links between the hosts and all hosts of the cluster.
         tenants: (N,) read-only mappings, for each host: name to spec of each process with an
             instance there, assigned ones included. A spec is as at the start of the instance.
+        devices: (N,) mappings, the number of free units of each kind of devices; shares of units
+            count. A kind that the host lacks is absent.
 
     Arrays are read-only, too. `labels` and `tenants` are made when they are read, host by host.
     """
@@ -170,6 +184,7 @@ class HostView:
     labels: Sequence[Mapping[str, str]] = ()
     links: LinkView = NO_LINKS
     tenants: Sequence[Mapping[str, ProcessSpec]] = ()
+    devices: Sequence[Mapping[str, float]] = ()
 
     def labelled(self, key: str, value: str) -> BoolArray:
         """Return the mask, (N,), of the hosts with a label of this value, as a new array."""
@@ -197,8 +212,8 @@ class ProcessView:
 
     Attributes:
         spec: as submitted. A plugin gets the standard fields (program, `namespace`, `kind`,
-            `priority`, `needs` and labels) and those that its offer declares in `reads`; any other
-            field raises `UndeclaredField`.
+            `priority`, `needs`, `devices` and labels) and those that its offer declares in
+            `reads`; any other field raises `UndeclaredField`.
         need: (N, R) demand of the process on each host, fractions of that host's capacity; inf
             where a host lacks a needed resource, never NaN.
         flows: flows between the process and others, declared and learned ones; empty unless the

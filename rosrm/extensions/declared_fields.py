@@ -19,6 +19,7 @@ from rosrm.wording import listed
 STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
     "required_labels", "preferred_labels", "avoided_labels", "limits", "cpus", "realtime", "nice",
+    "devices",
 )  # fmt: skip
 #: Field that gives the policy the flows of the process, also the learned ones.
 FLOWS_FIELD: Final = "talks_to"

@@ -1,6 +1,7 @@
 """Values that all parts share, and their conversion to JSON.
 
 values.py               processes, hosts, instances, resources
+devices.py              devices of hosts, needs of processes, and what a process gets
 plan.py                 plans of migrations: steps, undo, commit
 orders.py               orders of the master to a slave
 event_kinds.py          the kinds of events in the event record

@@ -6,6 +6,7 @@ import math
 import re
 from typing import Final, get_args
 
+from rosrm.model.devices import device_fault
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Accounting,
@@ -76,6 +77,8 @@ def description_fault(description: HostDescription) -> str:
     if unprintable is not None:
         return f"{description.name} has {unprintable!r:.200} in its description: no printable text"
     fault = next(filter(None, map(resource_fault, resources)), "")
+    if not fault and (wrong := device_fault(description.devices)):
+        fault = f"has devices that no host can have: {wrong}"
     return fault and f"{description.name} {fault}"
 
 

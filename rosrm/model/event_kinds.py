@@ -69,7 +69,7 @@ class EventKind(str, Enum):
 
     # --- hosts ---------------------------------------------------------------------------
 
-    HOST_REGISTERED = "host_registered", "a host registered; facts: labels and resources"
+    HOST_REGISTERED = "host_registered", "a host registered; facts: labels, resources and devices"
     HOST_CHANGED = "host_changed", "the slave reports other labels of the host; facts: labels"
     HOST_REFUSED = "host_refused", "a host was not registered, with the reason"
     HOST_SUSPECT = "host_suspect", "the host is silent and gets no new work"
@@ -86,6 +86,8 @@ class EventKind(str, Enum):
     OVER_LIMIT = "over_limit", "the host reached a limit; facts: the resource"
     UNDER_LIMIT = "under_limit", "the host is under all its limits again"
     NOTHING_MOVES = "nothing_moves", "no process can leave the host, with the reasons"
+    DEVICE_MISSING = "device_missing", "a device of the host is missing, with the reason"
+    DEVICE_FOUND = "device_found", "a device that was missing is there again"
     REBALANCING = "rebalancing", "processes move to even out the load of the hosts; facts: moves"
 
     # --- migration -----------------------------------------------------------------------

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from rosrm.model.devices import Device
 from rosrm.model.values import EMPTY, HostDescription
 
 #: Kinds of offers; "plugin": a plugin that failed before its offers were known.
@@ -32,6 +33,19 @@ class ResourceRow:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceRow(Device):
+    """One device of a host.
+
+    Attributes:
+        free: share of the unit that no instance holds, 0..1; 0 while it is missing.
+        holders: instances that hold the unit, "slam#12".
+    """
+
+    free: float = 0.0
+    holders: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class HostRow:
     """One host.
 
@@ -41,6 +55,7 @@ class HostRow:
         accepting: the slave is under all its limits and has requested work.
         reading_age: seconds since the newest `resource_info`.
         drained: the host is draining, and no process that can leave is left on it.
+        devices: devices of the host, and who holds them.
     """
 
     description: HostDescription
@@ -53,6 +68,7 @@ class HostRow:
     resources: tuple[ResourceRow, ...]
     processes: int
     drained: bool = False
+    devices: tuple[DeviceRow, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,8 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
+from rosrm.model.devices import Device, DeviceNeed, HeldDevice
+
 #: Slots of a `resource_info` message: highest number of resources of one host.
 RESOURCE_SLOTS: Final = 16
 #: A usage above this is an error, not a measurement (a CPU reading of 1.2 can be real).
@@ -269,6 +271,7 @@ class ProcessSpec:
             restarts and moves; its return to the queue begins them again. 0: no limit.
         cpus: numbers of the CPUs that it may use; (): all.
         nice: its niceness, -20..19; 0: that of the slave.
+        devices: devices that it holds while it runs, each kind once.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -308,6 +311,7 @@ class ProcessSpec:
     cpus: tuple[int, ...] = ()
     realtime: Realtime = Realtime()
     nice: int = 0
+    devices: tuple[DeviceNeed, ...] = ()
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -388,6 +392,7 @@ class Assignment:
             restarted until an order to its slave allows restarts.
         state_key: key by which slaves encrypt the replicas of the process's snapshots; b"": they
             are not encrypted.
+        devices: units of its host that it holds while it runs.
     """
 
     instance: InstanceId
@@ -400,6 +405,7 @@ class Assignment:
     snapshots_from: int = 0
     restored: bool = False
     state_key: bytes = field(default=b"", repr=False)
+    devices: tuple[HeldDevice, ...] = ()
 
     @property
     def has_snapshots(self) -> bool:
@@ -455,6 +461,7 @@ class InstanceStatus:
         run_time: seconds from start to end of the last run.
         message: text on why it failed or was refused, or runs without its limits.
         enforced: names of the limits and scheduling settings that hold in this run.
+        devices: devices of its host that it holds.
     """
 
     instance: InstanceId
@@ -468,6 +475,7 @@ class InstanceStatus:
     run_time: float = 0.0
     message: str = ""
     enforced: tuple[str, ...] = ()
+    devices: tuple[HeldDevice, ...] = ()
 
     @property
     def known_exit(self) -> int | None:
@@ -540,7 +548,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class HostDescription:
-    """Facts about a host that do not change while its slave runs.
+    """Facts about a host that do not change while its slave runs, except its devices.
 
     Attributes:
         name: unique among live slaves.
@@ -553,6 +561,7 @@ class HostDescription:
         unenforced: name of a limit or scheduling setting (`ProcessSpec.enforcement`) to the reason
             why this host cannot enforce it.
         cpus: numbers of the CPUs that processes may use; (): unknown.
+        devices: devices that the host gives to its processes.
     """
 
     name: str
@@ -568,6 +577,7 @@ class HostDescription:
     absent: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     unenforced: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     cpus: tuple[int, ...] = ()
+    devices: tuple[Device, ...] = ()
 
     def accounted(self, accounting: Accounting) -> frozenset[str]:
         """Return the names of the resources with this accounting."""

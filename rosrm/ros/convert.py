@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import is_dataclass, replace
 from functools import cache, partial
 from operator import attrgetter
-from typing import Any, Final, TypeVar, get_args, get_type_hints
+from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
 from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
@@ -18,6 +18,14 @@ from rosrm.model.description_checks import (
     is_namespace,
     is_resource_name,
     name_fault,
+)
+from rosrm.model.devices import (
+    Device,
+    DeviceNeed,
+    HeldDevice,
+    device_fault,
+    held_fault,
+    need_fault,
 )
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import limits_fault
@@ -109,6 +117,13 @@ _known_fields: Final[Callable[[Any], tuple[tuple[str, str, _Convert, _Convert], 
 def _forms(hint: Any) -> tuple[_Convert, _Convert]:
     if isinstance(hint, type) and is_dataclass(hint):
         return partial(_to_msg, getattr(msg, hint.__name__)), partial(_from_msg, hint)
+    inner = get_args(hint)[0] if get_origin(hint) is tuple else None
+    if isinstance(inner, type) and is_dataclass(inner) and hasattr(msg, inner.__name__):
+        there, back = _forms(inner)
+        return (
+            lambda items: [there(item) for item in items],
+            lambda items: tuple(back(item) for item in items),
+        )
     return _FORMS.get(hint, (_unchanged, _unchanged))
 
 
@@ -152,7 +167,6 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
         migration=_to_msg(
             msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
         ),
-        neighbours=[_to_msg(msg.NeighbourRule, rule) for rule in spec.neighbours],
         talks_to=[
             msg.ProcessFlow(process=name, rate=float(rate)) for name, rate in spec.talks_to.items()
         ],
@@ -175,7 +189,6 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
             values.MigrationPolicy, message.migration,
             options=json_object(message.migration.options, "migration options"),
         ),
-        neighbours=tuple(_from_msg(values.NeighbourRule, rule) for rule in message.neighbours),
         talks_to={flow.process: flow.rate for flow in message.talks_to},
     )  # fmt: skip
     fault = limits_fault(spec)
@@ -199,6 +212,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _needs_fault(message)
         or _times_fault(message)
         or _neighbours_fault(message)
+        or _devices_fault(message)
         or _flows_fault(message)
     )
 
@@ -236,6 +250,20 @@ def _neighbours_fault(message: msg.ProcessSpec) -> str:
             if fault:
                 return f"neighbours: {fault}"
     return ""
+
+
+def _devices_fault(message: msg.ProcessSpec) -> str:
+    fault = need_fault(_from_msg(DeviceNeed, need) for need in message.devices)
+    return f"devices: {fault}" if fault else ""
+
+
+def _held(message: msg.Assignment | msg.ProcessStatus) -> tuple[HeldDevice, ...]:
+    """Return the devices of an instance; raises `Refused`."""
+    held = tuple(_from_msg(HeldDevice, one) for one in message.devices)
+    fault = held_fault(held)
+    if fault:
+        raise Refused(f"{message.instance.process!r:.250}: {fault}")
+    return held
 
 
 def _flows_fault(message: msg.ProcessSpec) -> str:
@@ -330,6 +358,7 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
         snapshot_hosts=list(assignment.snapshot_hosts), snapshots_from=assignment.snapshots_from,
         restored=assignment.restored, state_key=array("B", assignment.state_key),
         spec=spec_to_msg(assignment.spec),
+        devices=[_to_msg(msg.HeldDevice, one) for one in assignment.devices],
     )  # fmt: skip
 
 
@@ -349,7 +378,7 @@ def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
     return values.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
         message.node_name, message.shadow, fence, tuple(message.snapshot_hosts),
-        message.snapshots_from, message.restored, bytes(message.state_key),
+        message.snapshots_from, message.restored, bytes(message.state_key), _held(message),
     )  # fmt: skip
 
 
@@ -389,6 +418,20 @@ def _description(
     return _from_msg(values.HostDescription, message, resources=described)
 
 
+def devices_to_msg(devices: Iterable[Device]) -> list[msg.Device]:
+    """Return the devices of a host as messages."""
+    return [_to_msg(msg.Device, one) for one in devices]
+
+
+def devices_from_msg(message: Iterable[msg.Device]) -> tuple[Device, ...]:
+    """Return the inverse of `devices_to_msg`; raises `Refused` for invalid devices."""
+    devices = tuple(_from_msg(Device, one) for one in message)
+    fault = device_fault(devices)
+    if fault:
+        raise Refused(fault)
+    return devices
+
+
 def status_to_msg(status: values.InstanceStatus) -> msg.ProcessStatus:
     """Return an instance's status as a message."""
     return _to_msg(msg.ProcessStatus, status, message=sendable(status.message)[:MOST_LETTERS])
@@ -407,8 +450,9 @@ def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
             raise Refused(f"{process}: {name} is {getattr(message, name)}; at most {most:g}")
     lines = message.message.split("\n")
     return _from_msg(
-        values.InstanceStatus, message, message="\n".join(sanitized(line) for line in lines)
-    )
+        values.InstanceStatus, message, message="\n".join(sanitized(line) for line in lines),
+        devices=_held(message),
+    )  # fmt: skip
 
 
 def snapshot_to_msg(snapshot: values.SnapshotReport) -> msg.SnapshotReport:
@@ -439,6 +483,7 @@ def host_row_to_msg(row: HostRow) -> msg.HostState:
         reading_age=row.reading_age, usage=[r.usage for r in row.resources],
         in_flight=[r.in_flight for r in row.resources], limit=[r.limit for r in row.resources],
         stale=[r.stale for r in row.resources], processes=row.processes, drained=row.drained,
+        devices=[_to_msg(msg.DeviceRow, one) for one in row.devices],
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Memos that the supervisor stores for a later run of the slave: readiness and health checks."""
+"""Memos that the supervisor stores for a later run of the slave, which knows no specs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ def to_memo(memo: Memo) -> str:
     """Return a memo as text, its parts as lists of their fields; "" if it is empty."""
     if memo == Memo():
         return ""
-    awaited, watch = astuple(memo)
-    return json.dumps({"awaited": awaited, "watch": watch})
+    awaited, watch, devices = astuple(memo)
+    plain = {"awaited": awaited, "watch": watch}
+    return json.dumps({**plain, "devices": devices} if devices else plain)
 
 
 def from_memo(text: str) -> Memo | None:

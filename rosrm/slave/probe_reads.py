@@ -9,6 +9,7 @@ from typing import Any
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Probe
 from rosrm.extensions.plugin_calls import given, required
+from rosrm.model.devices import Device, device_fault
 from rosrm.model.values import (
     ABSURD_USAGE,
     EMPTY,
@@ -76,6 +77,25 @@ def read_processes(probe: Probe, resources: Sequence[ResourceDescription]) -> Us
         which = "announces no" if unknown else "lacks the attributed"
         raise PluginError(f"by_process() {which} {', '.join(map(str, unknown or missing))}")
     return {name: _amounts(name, _mapping(used)) for name, used in answer.items()}
+
+
+def read_devices(probe: Probe) -> tuple[Device, ...]:
+    """Return the devices that a probe finds; () for a probe that finds none.
+
+    Raises:
+        PluginError: the answer is invalid.
+    """
+    find = getattr(probe, "devices", None)
+    if find is None:
+        return ()
+    answer: object = find()
+    if not isinstance(answer, Iterable):
+        raise PluginError(f"devices() answered {given(answer)}; a list of Devices is required")
+    devices = tuple(required(one, Device) for one in answer)
+    fault = device_fault(devices)
+    if fault:
+        raise PluginError(f"devices(): {fault}")
+    return devices
 
 
 def _mapping(answer: object) -> Mapping[Any, Any]:

@@ -20,7 +20,7 @@ import numpy as np
 from rosrm.config.reloading import OF_HOST, reloaded
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
-from rosrm.core.slave.events import Event, Registered, TimePassed
+from rosrm.core.slave.events import DevicesMissed, Event, Registered, TimePassed
 from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
@@ -51,6 +51,8 @@ from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveSer
 from rosrm.runtime.bootstrap import handle_signals
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
+from rosrm.slave.devices import LOOK_PERIOD as LOOK_AT_DEVICES
+from rosrm.slave.devices import DeviceWatch
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
@@ -135,6 +137,8 @@ class SlaveRuntime:
             self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
             self._absent = self._open_probes(registry, sessions, opened)
             first = self._sampler.first().reports
+            self._devices = DeviceWatch(config.devices)
+            self._devices.look(self._sampler.devices)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_signals(self._stop, self._hang_up)
             opened.callback(self._settings_check.close)
@@ -247,6 +251,7 @@ class SlaveRuntime:
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=self._executors.names, absent=self._absent,
             unenforced=self._supervisor.unenforced, cpus=tuple(sorted(os.sched_getaffinity(0))),
+            devices=self._devices.devices,
         )  # fmt: skip
 
     def _adopt(self) -> None:
@@ -311,7 +316,7 @@ class SlaveRuntime:
     def _serve(self, condition: Callable[[], bool]) -> None:
         now = time.monotonic()
         guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
-        next_sample = next_usage = next_graph = next_health = now
+        next_sample = next_usage = next_graph = next_health = next_devices = now
         logged_at = now - _LOG_PERIOD
         while condition():
             if now >= next_sample:
@@ -325,6 +330,9 @@ class SlaveRuntime:
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
                 guard.call(self._starter.look_at_graph, awaited)
+            if now >= next_devices:
+                next_devices = now + LOOK_AT_DEVICES
+                self._look_at_devices()
             guard.call(self._links.turn, now)
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
@@ -341,6 +349,13 @@ class SlaveRuntime:
             self._work(now)
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
+
+    def _look_at_devices(self) -> None:
+        """Report changes of the devices to the master, and lost ones to the core."""
+        if self._devices.look(self._sampler.devices):
+            self._endpoint.set_devices(self._devices.devices)
+        if self._devices.lost:
+            self._take(DevicesMissed(self._devices.lost))
 
     def _look_at_health(self, now: float) -> None:
         self._events.extend(self._health.look(self._state.watched(), now))
@@ -368,6 +383,8 @@ class SlaveRuntime:
         read = reloaded(self._config, new, OF_HOST)
         self._config = read.config
         self._limit = self._limits()
+        self._devices.configured = read.config.devices
+        self._look_at_devices()
         description = self._description()
         if description != self._endpoint.description:
             self._endpoint.describe_again(description)

@@ -29,17 +29,20 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.model.devices import Device
 from rosrm.model.values import EMPTY, MOST_USED, RESOURCE_SLOTS
-from rosrm.slave.probe_reads import UsageByProcess, read_processes, read_values
+from rosrm.slave.probe_reads import UsageByProcess, read_devices, read_processes, read_values
 
 if TYPE_CHECKING:
     from rosrm.extensions.made import MadeProbe
+
+_T = TypeVar("_T")
 
 #: A read that takes longer, in seconds, is too slow to share a thread.
 QUICK: Final = 0.05
@@ -101,6 +104,7 @@ class _Outcome:
     Attributes:
         values: in the order of the probe's resources; () after a failure.
         by_process: usage of single processes, as measured after that.
+        devices: devices that the probe found; None: that failed.
         reason: of a failure; "" otherwise.
         seconds: duration of the read.
         age: seconds since the read was queued, which can be much longer on a busy machine.
@@ -108,6 +112,7 @@ class _Outcome:
 
     values: tuple[float, ...]
     by_process: UsageByProcess
+    devices: tuple[Device, ...] | None
     reason: str
     seconds: float
     age: float
@@ -133,6 +138,7 @@ class Sampler:
         self._watched: list[_Watched] = []
         self._usage = [0.0] * RESOURCE_SLOTS
         self._by_process: dict[int, Mapping[int, float]] = {}
+        self._devices: dict[str, tuple[Device, ...]] = {}
         first = 0
         for made in probes:
             watched = _Watched(made, first, clock, self._progress)
@@ -149,6 +155,11 @@ class Sampler:
     def by_process(self) -> Mapping[int, Mapping[int, float]]:
         """Return slot to pid to amount, measured for the newest readings, but cpu and memory."""
         return self._by_process
+
+    @property
+    def devices(self) -> Mapping[str, tuple[Device, ...]]:
+        """Return the name of each probe to the devices that it found last."""
+        return self._devices
 
     def latest(self, now: float) -> Sample:
         """Return the newest readings, and queue a read of each probe that is due. Never waits."""
@@ -214,6 +225,8 @@ class Sampler:
     def _take_outcome(self, watched: _Watched, outcome: _Outcome) -> None:
         """Store the values of a finished read, and choose the thread of the next read."""
         watched.outcome, watched.measured = None, True
+        if outcome.devices is not None:
+            self._devices[watched.name] = outcome.devices
         if outcome.values:
             self._usage[watched.slots] = outcome.values
             for name, amounts in outcome.by_process.items():
@@ -381,19 +394,26 @@ class _Watched:
     def _read(self) -> None:
         started = self._clock()
         self._started = started
-        values: tuple[float, ...] = ()
-        by_process: UsageByProcess = EMPTY
-        reason = ""
-        try:
-            values, by_process = (
-                read_values(self._probe, self.names), read_processes(self._probe, self._resources)
-            )  # fmt: skip
-        except PluginError as nonsense:
-            reason = str(nonsense)
-        except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
-            # SystemExit, makes its readings stale and harms nothing else.
-            reason = f"read() raised {describe_plugin_fault(error)}"
+        measured, reason = _guarded("read", self._measure)
+        devices, fault = _guarded("devices", lambda: read_devices(self._probe))
+        values, by_process = measured or ((), EMPTY)
         ended = self._clock()
-        self.outcome = _Outcome(values, by_process, reason, ended - started, ended - self.asked)
+        self.outcome = _Outcome(
+            values, by_process, devices, reason or fault, ended - started, ended - self.asked
+        )
         self.busy = False
         self._progress.set()
+
+    def _measure(self) -> tuple[tuple[float, ...], UsageByProcess]:
+        return read_values(self._probe, self.names), read_processes(self._probe, self._resources)
+
+
+def _guarded(name: str, call: Callable[[], _T]) -> tuple[_T | None, str]:
+    """Return the result of a call of a plugin, or None and why it failed."""
+    try:
+        return call(), ""
+    except PluginError as nonsense:
+        return None, str(nonsense)
+    except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
+        # SystemExit, makes its readings stale and harms nothing else.
+        return None, f"{name}() raised {describe_plugin_fault(error)}"

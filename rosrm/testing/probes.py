@@ -14,7 +14,7 @@ from rosrm.extensions.made import MadeProbe, fault_of_labels, unmeasured
 from rosrm.extensions.plugin_calls import implements
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.values import EMPTY, Reading, ResourceDescription
-from rosrm.slave.probe_reads import read_processes, read_values
+from rosrm.slave.probe_reads import read_devices, read_processes, read_values
 from rosrm.testing.calls import call, made
 
 
@@ -166,6 +166,16 @@ class ProbeContract:
         probe = self.make()
         for _ in range(5):
             self._read(probe)
+        probe.close()
+
+    def test_devices_are_well_described(self) -> None:
+        """Devices, if the probe finds any, are valid; no unit comes or goes."""
+        probe = self.make()
+        units = []
+        for _ in range(3):
+            self._read(probe)
+            units.append([(one.kind, one.unit) for one in read_devices(probe)])
+        assert units[0] == units[1] == units[2], f"the units were {units}; use `missing` instead"
         probe.close()
 
     def test_resources_stay(self) -> None:

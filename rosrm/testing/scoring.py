@@ -23,6 +23,7 @@ from rosrm.extensions.declared_fields import FLOWS_FIELD, SPEC_FIELDS, declared_
 from rosrm.extensions.link_views import NO_FLOWS, FlowView
 from rosrm.extensions.plugin_calls import required
 from rosrm.extensions.time_limit import CALL_LIMIT
+from rosrm.model.devices import DeviceNeed
 from rosrm.model.values import EMPTY, Kind, MigrationPolicy, ProcessSpec
 from rosrm.testing.calls import call, made
 
@@ -34,6 +35,7 @@ def host_view(
     capacity: float = 1.0,
     processes: Sequence[int] = (),
     labels: Sequence[Mapping[str, str]] = (),
+    devices: Sequence[Mapping[str, float]] = (),
     tenants: Sequence[Sequence[str]] = (),
 ) -> HostView:
     """Return hosts h0, h1, ... for a scoring policy.
@@ -44,6 +46,7 @@ def host_view(
         capacity: of every resource on every host, base units.
         processes: number of processes by host; (): 0 on every host.
         labels: by host; (): no labels.
+        devices: number of free units by kind, by host; (): no devices.
         tenants: names of the processes by host; (): none.
     """
     # The core stores one row for each resource, and a policy gets the transpose, as here.
@@ -58,6 +61,7 @@ def host_view(
         capacity=np.where(missing, np.nan, capacity).T,
         processes=np.array(processes or [0] * hosts, np.int64),
         labels=labels or [EMPTY] * hosts,
+        devices=devices or [EMPTY] * hosts,
         tenants=[{name: ProcessSpec(name) for name in names} for names in tenants or [()] * hosts],
     )
 
@@ -137,7 +141,7 @@ _SPECS: Final[Sequence[Mapping[str, Any]]] = (
         "migration": MigrationPolicy("relaunch", options={"settle": "2s"}),
     },
     {"name": "9.lives-", "command": (), "module": "pkg.main", "needs": {"gpu": 1.0}},
-    {"command": (), "package": "demo", "executable": "talker"},
+    {"command": (), "package": "demo", "executable": "talker", "devices": (DeviceNeed("gpu"),)},
 )  # fmt: skip
 
 
@@ -157,6 +161,7 @@ def placements(reads: Sequence[str]) -> Sequence[tuple[HostView, ProcessView]]:
             processes=[n % 3 for n in range(count)],
             labels=[{"rack": str(n % 3)} if n % 4 else {} for n in range(count)],
             tenants=[[f"q{n}_{k}" for k in range(n % 3)] for n in range(count)],
+            devices=[{"gpu": n / 2} if n % 3 else {} for n in range(count)],
         )
         cases += [(hosts, process_view(hosts, reads=tuple(reads), **spec)) for spec in _SPECS]
     for resource in ("memory", "something"):
@@ -285,7 +290,16 @@ def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, 
     one = slice(row, row + 1)
     parts = {
         name: getattr(hosts, name)[one]
-        for name in ("names", "usage", "limit", "capacity", "processes", "labels", "tenants")
+        for name in (
+            "names",
+            "usage",
+            "limit",
+            "capacity",
+            "processes",
+            "labels",
+            "tenants",
+            "devices",
+        )
     }
     flows = process.flows
     if len(flows.rate):

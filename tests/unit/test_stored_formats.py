@@ -81,7 +81,7 @@ STATUS = InstanceStatus(InstanceId("a", 7), InstanceState.EXITED, 0, 1, 9, 2, 1e
 STATUS_TEXT = (
     '{"instance":{"process":"a","number":7},"state":"exited","pid":0,"exit_code":1,'
     '"exit_signal":9,"restarts":2,"peak_memory":1000000.0,"cpu_time":0.5,"run_time":3.0,'
-    '"message":"end","enforced":[]}'
+    '"message":"end","enforced":[],"devices":[]}'
 )
 EVENTS: list[tuple[happened.Event, str]] = [
     (happened.TimePassed(), '{"kind":"TimePassed"}'),
@@ -111,7 +111,7 @@ EVENTS: list[tuple[happened.Event, str]] = [
         (
             '{"kind":"StatusesReceived","host_id":1,"incarnation":2,"sequence":3,"complete":true,'
             f'"statuses":[{STATUS_TEXT}],"failing":{{"gpu":"gone"}},"failing_strategies":{{}},'
-            '"failing_launchers":{}}'
+            '"failing_launchers":{},"devices":[]}'
         ),
     ),
     (
@@ -125,7 +125,7 @@ EVENTS: list[tuple[happened.Event, str]] = [
             '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5,'
             '"hostname":"","pid":0,"software_version":"","labels":{"arm":"yes"},"resources":'
             '[{"name":"cpu","unit":"core","capacity":4.0,"scope":"machine","accounting":"countable"'
-            '}],"max_processes":0,"period":0.1,"executors":[],"absent":{},"unenforced":{},"cpus":[]},"instances":[],'
+            '}],"max_processes":0,"period":0.1,"executors":[],"absent":{},"unenforced":{},"cpus":[],"devices":[]},"instances":[],'
             '"journal_seen":0,"snapshots":[]}'
         ),
     ),

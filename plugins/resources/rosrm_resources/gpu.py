@@ -1,17 +1,28 @@
-"""Probe `gpu`: utilisation (`gpu`) and memory usage (`gpu_memory`) of NVIDIA GPUs."""
+"""Probe `gpu`: utilisation (`gpu`) and memory usage (`gpu_memory`) of NVIDIA GPUs.
+
+The probe also offers each GPU as a device, and adds labels with their model and memory.
+"""
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Ge
 
-from rosrm import Accounting, ConfigError, ProbeContext, Reading, ResourceDescription, SkipPlugin
+from rosrm import (
+    Accounting,
+    ConfigError,
+    Device,
+    ProbeContext,
+    Reading,
+    ResourceDescription,
+    SkipPlugin,
+)
 
 _LIBRARY: Final = "libnvidia-ml.so.1"
 #: Inode of the first pid namespace (`PROC_PID_INIT_INO` of the kernel).
@@ -83,6 +94,12 @@ class GpuProbe:
             max if options.combine == "max" else sum
         )
         self._handles = _handles(nvml, options.devices)
+        self._devices = [
+            Device("gpu", str(index), about=self._about(handle))
+            for index, handle in zip(
+                options.devices or range(len(self._handles)), self._handles, strict=True
+            )
+        ]
         self._reads: dict[str, Callable[[Any], float]] = {}
         self._resources: list[ResourceDescription] = []
         # A GPU in MIG mode reports no utilisation, and one that is part of a SoC reports no memory.
@@ -122,6 +139,23 @@ class GpuProbe:
             }
         }
 
+    @property
+    def labels(self) -> Mapping[str, str]:
+        """Return model and memory of the GPUs, unless they differ between them."""
+        labels = {}
+        for name, read in (("gpu.model", self._model), ("gpu.memory", self._size)):
+            values = {self._told(read, handle) for handle in self._handles}
+            if len(values) == 1 and (value := values.pop()):
+                labels[name] = value
+        return labels
+
+    def devices(self) -> Sequence[Device]:
+        """Return each GPU; one about which the driver raises an error is missing."""
+        return [
+            replace(device, missing=self._fault(handle))
+            for device, handle in zip(self._devices, self._handles, strict=True)
+        ]
+
     def close(self) -> None:
         """Shut down the connection to the driver."""
         self._nvml.nvmlShutdown()
@@ -132,6 +166,32 @@ class GpuProbe:
     ) -> None:  # fmt: skip
         self._resources.append(ResourceDescription(name, unit, capacity, "machine", accounting))
         self._reads[name] = usage
+
+    def _fault(self, handle: Any) -> str:
+        """Return the error of the driver about a GPU, such as one that fell off its bus."""
+        try:
+            self._nvml.nvmlDeviceGetUUID(handle)
+        except self._nvml.NVMLError as error:
+            return f"NVML: {error}"
+        return ""
+
+    def _about(self, handle: Any) -> str:
+        told = (self._told(self._model, handle), self._told(self._size, handle))
+        return ", ".join(filter(None, told))
+
+    def _told(self, read: Callable[[Any], str], handle: Any) -> str:
+        """Return a text about a GPU; "" if the driver does not tell it."""
+        try:
+            return read(handle)
+        except self._nvml.NVMLError:
+            return ""
+
+    def _model(self, handle: Any) -> str:
+        name = self._nvml.nvmlDeviceGetName(handle)
+        return name.decode() if isinstance(name, bytes) else str(name)
+
+    def _size(self, handle: Any) -> str:
+        return f"{self._nvml.nvmlDeviceGetMemoryInfo(handle).total / 2**30:.0f} GiB"
 
     def _can(self, usage: Callable[[Any], object]) -> bool:
         try:

@@ -39,7 +39,7 @@ def register_probes() -> Sequence[ProbeOffer]:
             name="gpu",
             create=gpu.create,
             options=gpu.GpuOptions,
-            summary="NVIDIA GPUs: utilisation (gpu) and memory (gpu_memory)",
+            summary="NVIDIA GPUs: utilisation (gpu), memory (gpu_memory), devices and labels",
             period=0.5,
             deadline=2.0,
             default=True,

@@ -13,8 +13,18 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
-from rosrm.wording import amount, counted, duration, percent, printable, size, standing, words
+from rosrm.model.rows import DeviceRow, EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.wording import (
+    amount,
+    counted,
+    duration,
+    listed,
+    percent,
+    printable,
+    size,
+    standing,
+    words,
+)
 
 #: Width of tables in a file or pipe, large enough that no line is cut or wrapped.
 _PIPE_WIDTH: Final = 100_000
@@ -147,12 +157,27 @@ def hosts(rows: Sequence[HostRow]) -> Table:
     """Return the table of `rosrm hosts`: usage and limit, in percent of the capacity."""
     resources = list(dict.fromkeys(r.name for row in rows for r in row.resources))
     numbers = ("RUNS", *(f"{name} %" for name in resources))
-    made = table("HOST", "STATE", *numbers, right=numbers)
+    free = ("FREE DEVICES",) if any(row.devices for row in rows) else ()
+    made = table("HOST", "STATE", *numbers, *free, right=numbers)
     for row in rows:
         by_name = {resource.name: resource for resource in row.resources}
         cells = [usage(by_name[name]) if name in by_name else Text("-") for name in resources]
+        cells += [Text(free_devices(row.devices)) for _ in free]
         made.add_row(Text(row.description.name), host_state(row), str(row.processes), *cells)
     return made
+
+
+def free_devices(devices: Iterable[DeviceRow]) -> str:
+    """Return how many units of each kind are free, e.g. `camera 0/1 (front missing), gpu 1.5/2`."""
+    kinds: dict[str, list[DeviceRow]] = {}
+    for one in devices:
+        kinds.setdefault(one.kind, []).append(one)
+    parts = []
+    for kind, units in kinds.items():
+        missing = [one.unit for one in units if one.missing]
+        note = f" ({listed(missing)} missing)" if missing else ""
+        parts.append(f"{kind} {sum(one.free for one in units):.3g}/{len(units)}{note}")
+    return ", ".join(parts)
 
 
 def host_state(row: HostRow) -> Text:

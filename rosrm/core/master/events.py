@@ -17,6 +17,7 @@ from rosrm.core.master.commands import OrderId
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.placement import PolicySettings
 from rosrm.extensions.plugin_calls import Plugin
+from rosrm.model.devices import Device
 from rosrm.model.plan import ReportPhase
 from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.rows import PluginKind
@@ -111,13 +112,14 @@ class ReadingsReceived:
 
 @dataclass(frozen=True, slots=True)
 class StatusesReceived:
-    """A slave reported statuses of its instances, and every plugin that fails on its host.
+    """A slave reported statuses of its instances, failing plugins and devices of its host.
 
     Attributes:
         complete: True if `statuses` has all instances on the host, not only the changed ones.
         failing: resource to the reason why its probe gives no readings.
         failing_strategies: migration strategy to the reason why its executors fail.
         failing_launchers: launcher to the reason why it could not be created.
+        devices: all devices of the host.
     """
 
     host_id: int
@@ -128,6 +130,7 @@ class StatusesReceived:
     failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     failing_strategies: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     failing_launchers: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    devices: tuple[Device, ...] = ()
 
     def failing_plugins(self) -> dict[Plugin, str]:
         """Return the kind and name of each failing plugin with the reason."""

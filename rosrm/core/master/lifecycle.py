@@ -10,6 +10,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
 from rosrm.core.master.assignment.reservations import learn_from, settle_reservation
 from rosrm.core.master.hosts import readoption
+from rosrm.core.master.hosts.devices import note_devices
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover
 from rosrm.core.master.plugin_failures import note_on_host
@@ -71,6 +72,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     if place in ("late", "far ahead"):
         return
     note_on_host(state, host, event.failing_plugins(), now)
+    note_devices(state, host, event.devices, now)
     if event.complete:
         state.missing_since.pop(host.column, None)
         state.hosts.set_report_due(host, report_due=False)
@@ -133,6 +135,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
     instance.enforced = status.enforced
     _note_load(state, instance, before, now)
+    state.note_held(instance, status.devices)
     if status.state.ended:
         _ended(state, instance, status, before, now)
     review_slots(state, host, now)
@@ -214,6 +217,7 @@ def _handle_unknown_instance(
         process=status.instance.process, host=host.name,
     )  # fmt: skip
     unknown = adopt_to_stop(state, status.instance, host, now)
+    state.note_held(unknown, status.devices)
     unknown.state, unknown.pid = status.state, status.pid
     unknown.at_once = followed
     stop_instance(state, unknown, now)

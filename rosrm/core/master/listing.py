@@ -13,10 +13,11 @@ from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.process_defaults import defaulted_values
+from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.limits import limits_in_words
-from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
+from rosrm.model.rows import DeviceRow, HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy, qualified_name
 from rosrm.wording import amount
 
@@ -59,8 +60,22 @@ def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
         host.description, host.host_id, _CONDITION[condition], host.cordoned,
         host.draining, table.is_accepting(host) and condition is HostCondition.UP,
         now - float(table.last_contact[column]), tuple(rows), int(table.processes[column]),
-        host.drained,
+        host.drained, _device_rows(table.devices[column]),
     )  # fmt: skip
+
+
+def _device_rows(inventory: Inventory) -> tuple[DeviceRow, ...]:
+    rows = []
+    for device in inventory.devices:
+        key = (device.kind, device.unit)
+        free = min(max(inventory.free.get(key, 0.0), 0.0), 1.0)
+        holders = tuple(str(one) for one in inventory.holders_of(key))
+        row = DeviceRow(
+            device.kind, device.unit, device.path, device.shareable, device.about, device.missing,
+            free, holders,
+        )  # fmt: skip
+        rows.append(row)
+    return tuple(rows)
 
 
 def process_rows(state: MasterState, now: float) -> list[ProcessRow]:

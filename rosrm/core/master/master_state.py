@@ -36,6 +36,7 @@ from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import SPEC_FIELDS, Declared, declared_spec
 from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.model.codec import to_plain
+from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record
@@ -216,12 +217,18 @@ class MasterState:
             for number in process.instances
             if (alias := self.instances[number].node_name)
         }
+        devices = {
+            str(number): to_plain(given)
+            for number in process.instances
+            if (given := self.instances[number].devices)
+        }
         return Intent(
             "process", process.name,
             {
                 "spec": process.plain, "phase": phase.value, "since": began,
                 "host": owner.host.name if owner else process.ended_on, "instances": held,
-                "node_names": aliases, "standby": standby and migration_to_dict(standby, ()),
+                "node_names": aliases, "devices": devices,
+                "standby": standby and migration_to_dict(standby, ()),
                 "left_behind": left and astuple(left),
                 "image": process.image and to_plain(process.image),
                 **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
@@ -239,6 +246,7 @@ class MasterState:
     def end_migration(self, migration: Migration) -> None:
         """Remove a migration that has ended."""
         del self.migrations[migration.process]
+        self.release_ended(migration.process, migration.source_host)
         self._unsaved_migrations.pop(migration.process, None)
         self.emit(Intent("migration", migration.process, None))
 
@@ -410,16 +418,19 @@ class MasterState:
 
     def add_instance(
         self, instance: InstanceId, host: Host, now: float, needs: Estimate | Demand,
-        fractions: FloatArray | None = None,
+        fractions: FloatArray | None = None, *, devices: tuple[HeldDevice, ...] = (),
     ) -> Instance:  # fmt: skip
-        """Add an instance, and reserve its needs on its host.
+        """Add an instance, and reserve its needs and devices on its host.
 
         `fractions`, (R,): the needs as shares of the host's capacity, where they are known already.
         """
         if fractions is None:
             fractions = self.hosts.fractions_of(host, needs.amounts, needs.estimated)
         reserved = np.where(fractions < np.inf, fractions, 0.0)
-        added = Instance(instance, host, now, needs.amounts, needs.estimated, reserved)
+        added = Instance(
+            instance, host, now, needs.amounts, needs.estimated, reserved, devices=devices
+        )
+        self.hosts.hold(host, instance, devices)
         self.instances[instance.number] = added
         process = self.processes.get(instance.process)
         spec = process.spec if process is not None else ProcessSpec(instance.process)
@@ -431,7 +442,40 @@ class MasterState:
 
     def reserve(self, instance: InstanceId, host: Host, now: float, ranking: Ranking) -> None:
         """Add an instance on the host that a ranking has chosen."""
-        self.add_instance(instance, host, now, ranking.demand, ranking.need[:, host.column])
+        demand = ranking.demand
+        # Without devices the slave refuses the instance, and the process is placed elsewhere.
+        devices = self.hosts.devices[host.column].choose(demand.spec.devices) or ()
+        need = ranking.need[:, host.column]
+        self.add_instance(instance, host, now, demand, need, devices=devices)
+
+    def note_held(self, instance: Instance, devices: tuple[HeldDevice, ...]) -> None:
+        """Note the devices that an instance holds by the report of its slave.
+
+        A slave releases no device of a running instance, so an empty report means "unknown".
+        """
+        if devices and instance.devices != devices:
+            instance.devices = devices
+            self.hosts.hold(instance.host, instance.id, devices)
+            self.hosts.touch(instance.host)
+            process = self.processes.get(instance.id.process)
+            if process is not None:
+                self.save(process)
+
+    def release_ended(self, name: str, host: Host) -> None:
+        """Release the devices that stay reserved for ended instances of a process on a host."""
+        for one in list(self.hosts.devices[host.column].held):
+            if one.process == name and one.number not in self.instances:
+                self.hosts.hold(host, one, ())
+                self.hosts.touch(host)
+
+    def _may_return(self, instance: Instance) -> bool:
+        """Return True if a migration may start its source again in place of an ended instance."""
+        migration = self.migrations.get(instance.id.process)
+        return (
+            migration is not None
+            and not migration.committed
+            and migration.source_host is instance.host
+        )
 
     def note_change(self, name: str) -> None:
         """Note that the instances of a process, or the one that owns its name, have changed."""
@@ -446,6 +490,8 @@ class MasterState:
         self._numbers_of(name).discard(instance.id.number)
         if not self.unowned_instances.get(name, True):
             del self.unowned_instances[name]
+        if instance.devices and not self._may_return(instance):
+            self.hosts.hold(instance.host, instance.id, ())
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)
         self.note_change(name)
 
@@ -460,6 +506,7 @@ class MasterState:
     ) -> Assignment:  # fmt: skip
         """Return the assignment by which a slave runs an instance of a known process."""
         fence = fence_of(spec, self.settings)
+        known = self.instances.get(instance.number)
         snapshot_hosts: tuple[str, ...] = ()
         snapshots_from = 0
         if self.declared.has_snapshots(spec):
@@ -469,7 +516,7 @@ class MasterState:
                 snapshot_hosts = self.replication.in_reach(spec.name, first_instance, self.hosts)
         return Assignment(
             instance, spec, self.epoch, node_name or spec.name, shadow, fence, snapshot_hosts,
-            snapshots_from, restored,
+            snapshots_from, restored, devices=known.devices if known else (),
         )  # fmt: skip
 
     def note_decision(

@@ -142,6 +142,17 @@ class LookedAt:
 
 
 @dataclass(frozen=True, slots=True)
+class DevicesMissed:
+    """Devices of this host are missing.
+
+    Attributes:
+        missing: kind and unit of each missing device to the reason.
+    """
+
+    missing: Mapping[tuple[str, str], str]
+
+
+@dataclass(frozen=True, slots=True)
 class TimePassed:
     """Time passed without another event; deadlines are checked."""
 
@@ -162,5 +173,6 @@ Event = (
     | SupervisorReplaced
     | SeenInGraph
     | LookedAt
+    | DevicesMissed
     | TimePassed
 )

@@ -11,6 +11,7 @@ from rosrm.core.slave import commands, events, fencing
 from rosrm.core.slave.health import InstanceHealth, watch_of
 from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph
 from rosrm.core.slave.watches import Awaited, Memo
+from rosrm.model.devices import title_of
 from rosrm.model.values import (
     Assignment,
     InstanceId,
@@ -23,6 +24,9 @@ from rosrm.model.values import (
 REMEMBER_END: Final = 60.0
 #: Highest number of tombstones.
 _TOMBSTONES: Final = 10_000
+
+#: States in which an instance has a process.
+_RUNS: Final = (InstanceState.RUNNING, InstanceState.READY)
 
 _Commands = list[commands.Command]
 
@@ -91,7 +95,9 @@ def _waiting(assignment: Assignment) -> HeldInstance:
         awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)
     watch, fenced = watch_of(assignment), assignment.fence is not None
-    return HeldInstance(status, spec, awaited, watch=watch, fenced=fenced)
+    return HeldInstance(
+        status, spec, awaited, watch=watch, fenced=fenced, devices=assignment.devices
+    )
 
 
 def _start_waiting(state: SlaveState, now: float) -> _Commands:
@@ -279,7 +285,7 @@ def _follow(
     if held is None:
         known = memo or Memo()
         held = state.held[reported.instance] = HeldInstance(
-            reported, awaited=known.awaited, watch=known.watch
+            reported, awaited=known.awaited, watch=known.watch, devices=known.devices
         )
         if reported.state is InstanceState.RUNNING:
             held.status = _running(held, reported, now)
@@ -337,6 +343,21 @@ def _looked_at(state: SlaveState, event: events.LookedAt, now: float) -> _Comman
     return [commands.Fail(event.instance, event.pid, reason, kill=event.look.stopped)]
 
 
+def _devices_missed(state: SlaveState, event: events.DevicesMissed, now: float) -> _Commands:
+    """Fail each run that holds a missing device."""
+    commands_: _Commands = []
+    for instance, held in state.held.items():
+        reasons = [
+            f"{title_of(one.kind, one.unit)} is missing: {event.missing[one.kind, one.unit]}"
+            for one in held.devices
+            if (one.kind, one.unit) in event.missing
+        ]
+        if reasons and held.status.state in _RUNS:
+            reason = f"unhealthy: {'; '.join(reasons)}"
+            commands_.append(commands.Fail(instance, held.status.pid, reason, kill=False))
+    return commands_
+
+
 def _may_be_discarded(state: SlaveState, held: HeldInstance, now: float) -> bool:
     return state.registered and now - held.ended_at >= REMEMBER_END
 
@@ -383,6 +404,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.SupervisorReplaced: _supervisor_replaced,
         events.SeenInGraph: _seen,
         events.LookedAt: _looked_at,
+        events.DevicesMissed: _devices_missed,
         events.TimePassed: _time_passed,
     }
 )

@@ -22,6 +22,7 @@ SupervisorReplaced      the same; drops the instances that the new supervisor do
                         reports all instances, and repeats orders that may be lost
 SeenInGraph             marks the instance as ready, also for a later run of this slave
 LookedAt                ends an instance as failed if it has been unhealthy for too long
+DevicesMissed           ends each running instance as failed that holds a missing device
 TimePassed              stops an instance that is not ready in time, refuses an instance whose fence
                         expired before its start, and drops old ends
 ======================  =========================================================================
@@ -42,7 +43,7 @@ def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
 
     `now` is the slave's monotonic clock, in seconds; never less than before.
     """
-    commands = HANDLERS[type(event)](state, event, now)
+    commands = [_with_devices(state, one) for one in HANDLERS[type(event)](state, event, now)]
     if not state.registered and any(isinstance(command, Report) for command in commands):
         state.report_unconfirmed = True
     return commands
@@ -62,3 +63,10 @@ def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Com
 
 def _without_dropped(state: SlaveState, launch: Launch) -> Launch:
     return Launch(tuple(one for one in launch.assignments if one.instance in state.held))
+
+
+def _with_devices(state: SlaveState, command: Command) -> Command:
+    """Return a report with the devices of the instances; another command unchanged."""
+    if not isinstance(command, Report):
+        return command
+    return Report(state.with_devices(command.statuses), command.complete)

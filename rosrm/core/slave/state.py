@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Final
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from rosrm.core.slave.health import InstanceHealth
 from rosrm.core.slave.watches import Awaited, Memo, Watch
+from rosrm.model.devices import HeldDevice
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Assignment,
@@ -41,6 +42,7 @@ class HeldInstance:
         unsettled: restart policies that the master has set and the supervisor has not recorded
             yet, in order.
         ended_at: time of its end, or of the report of the end to a newly registered master.
+        devices: devices that it holds.
     """
 
     status: InstanceStatus
@@ -53,11 +55,12 @@ class HeldInstance:
     unready: str = ""
     unsettled: tuple[RestartPolicy, ...] = ()
     ended_at: float = 0.0
+    devices: tuple[HeldDevice, ...] = ()
 
     @property
     def memo(self) -> Memo:
         """Return the facts that a later run of this slave needs."""
-        return Memo(self.awaited, self.watch)
+        return Memo(self.awaited, self.watch, self.devices)
 
     @property
     def watched(self) -> Watch | None:
@@ -115,7 +118,16 @@ class SlaveState:
 
     def statuses(self) -> tuple[InstanceStatus, ...]:
         """Return the status of every instance, including ended ones that may still be reported."""
-        return tuple(held.status for held in self.held.values())
+        return self.with_devices(held.status for held in self.held.values())
+
+    def with_devices(self, statuses: Iterable[InstanceStatus]) -> tuple[InstanceStatus, ...]:
+        """Return the statuses with the devices that the instances hold."""
+        return tuple(
+            replace(status, devices=held.devices)
+            if (held := self.held.get(status.instance)) is not None and held.devices
+            else status
+            for status in statuses
+        )
 
     def has_slot(self) -> bool:
         """Return True if one more process may run."""

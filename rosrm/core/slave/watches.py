@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from rosrm.model.devices import HeldDevice
 from rosrm.model.values import Health
 
 
@@ -73,7 +74,9 @@ class Memo:
     Attributes:
         awaited: None: the instance is ready as soon as it runs.
         watch: None: the instance has no health checks.
+        devices: devices that the instance holds.
     """
 
     awaited: Awaited | None = None
     watch: Watch | None = None
+    devices: tuple[HeldDevice, ...] = ()

@@ -106,14 +106,17 @@ class SlaveSubscriptions:
             self._strangers.note(topics, message.strangers)
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
+            devices = convert.devices_from_msg(message.devices)
         except Refused as refusal:
             self._refuse("process_status", who, str(refusal))
             return
-        failing = (_failing(message, one) for one in ("probe", "migration", "launcher"))
+        probes, strategies, launchers = (
+            _failing(message, kind) for kind in ("probe", "migration", "launcher")
+        )
         self._handle(
             happened.StatusesReceived(
                 message.host_id, message.incarnation, message.sequence, message.complete, statuses,
-                *failing,
+                probes, strategies, launchers, devices,
             )
         )  # fmt: skip
 

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from enum import Enum
 from typing import Final
 
@@ -19,6 +20,7 @@ from rosrm.core.slave.state import SlaveState
 from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.keys.security import Member
+from rosrm.model.devices import Device
 from rosrm.model.values import HostDescription, InstanceStatus, SnapshotReport
 from rosrm.ros import convert, names, qos
 from rosrm.ros.bounds import MOST_LETTERS
@@ -296,6 +298,11 @@ class SlaveEndpoint:
         found = any(not status.state.ended for status in self._state.statuses())
         return _NAME_TAKEN_BY_FORMER if found and not self.host_id else _NAME_TAKEN
 
+    def set_devices(self, devices: tuple[Device, ...]) -> None:
+        """Describe the devices of this host as they are now."""
+        self.description = replace(self.description, devices=devices)
+        self.publish_statuses((), complete=False)
+
     def describe_again(self, description: HostDescription) -> None:
         """Register again, with another description of the same run of this slave."""
         self.description = description
@@ -438,6 +445,7 @@ class SlaveEndpoint:
                     )
                     for (kind, name), reason in self.failing.items()
                 ],
+                devices=convert.devices_to_msg(self.description.devices),
             )
         )  # fmt: skip
         self._strangers = 0

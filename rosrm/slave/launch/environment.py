@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm.model.devices import DEVICE_VARIABLE, Device, device_environment, device_values
 from rosrm.model.values import Assignment, InstanceId, qualified_name
 from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
@@ -46,6 +47,7 @@ class ProcessLocation:
         keep_every: seconds by which a snapshot may be behind the state.
         epoch_file: file with the newest epoch of the master; None: there is none.
         instance_key: returns the key of an instance; None: with `security: none`.
+        devices: devices of the host.
     """
 
     host: str
@@ -55,6 +57,7 @@ class ProcessLocation:
     keep_every: float = 1.0
     epoch_file: Path | None = None
     instance_key: Callable[[InstanceId], bytes | None] = no_key
+    devices: tuple[Device, ...] = ()
 
 
 def snapshot_directory(snapshots: Path, process: str) -> Path:
@@ -66,7 +69,7 @@ def process_environment(
     assignment: Assignment, base: Mapping[str, str], where: ProcessLocation,
     not_inherited: Sequence[str] = (),
 ) -> dict[str, str]:  # fmt: skip
-    """Return all variables of an instance; those of its spec take precedence.
+    """Return all variables of an instance; those of its spec take precedence, except its devices.
 
     Args:
         base: environment of the slave, with its ROS settings (ROS_DOMAIN_ID, ...).
@@ -74,7 +77,8 @@ def process_environment(
     """
     spec = assignment.spec
     environment = without_bootstrapper(base)
-    for name in (*_IDENTITY, *not_inherited):
+    own = [name for name in environment if name.startswith(DEVICE_VARIABLE)]
+    for name in (*_IDENTITY, *own, *not_inherited):
         environment.pop(name, None)
     environment["ROSRM_PROCESS"] = assignment.instance.process
     environment["ROSRM_INSTANCE"] = str(assignment.instance)
@@ -97,6 +101,8 @@ def process_environment(
         environment[INSTANCE_KEY] = base64.b64encode(key).decode()
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
+    values = device_values(assignment.devices, where.devices)
+    environment.update(device_environment(assignment.devices, values))
     if assignment.shadow:  # a migration waits for the end of its discovery
         environment.update(announcements(environment, "steady", udp=False))
     return environment

@@ -147,4 +147,5 @@ class Starter:
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
             self.snapshots, config.keep.every, config.state / EPOCH_NOTE, self.instance_key,
+            self.endpoint.description.devices,
         )  # fmt: skip

@@ -11,7 +11,7 @@ import pytest
 
 from rosrm.cli.output import explain, tables
 from rosrm.errors import NoMaster, Refused
-from rosrm.model.rows import PluginRow
+from rosrm.model.rows import DeviceRow, PluginRow
 
 from .conftest import (
     EVENTS,
@@ -36,6 +36,27 @@ def test_status_shows_the_cluster_on_half_a_page(rosrm, client):
     assert lines[2] == "processes  1 running, 1 queued, 1 failed, 1 finished"
     assert "crashed has failed" in result.out
     assert "talker goes to alpha" in result.out
+
+
+def test_hosts_with_devices_show_the_free_ones(rosrm, client):
+    """Shares of units count; missing units are named, and only listed in a column of their own."""
+    assert "DEVICES" not in rosrm("hosts").out
+    devices = (
+        DeviceRow("camera", "front", free=1.0),
+        DeviceRow("camera", "rear", missing="gone"),
+        DeviceRow("gpu", "0", free=0.25, holders=("p#1",)),
+        DeviceRow("gpu", "1", free=1.0),
+    )
+    client.hosts = [replace(host("alpha"), devices=devices), host("beta")]
+    lines = rosrm("hosts").out.splitlines()
+    assert lines[0].endswith("FREE DEVICES")
+    assert "camera 1/2 (rear missing), gpu 1.25/2" in lines[2]
+    (alpha, beta) = json.loads(rosrm("hosts", "--json").out)
+    assert alpha["devices"][2] == {
+        "kind": "gpu", "unit": "0", "path": "", "shareable": 1, "about": "", "missing": "",
+        "free": 0.25, "holders": ["p#1"],
+    }  # fmt: skip
+    assert beta["devices"] == []
 
 
 def test_status_json_counts_states(rosrm, client):

@@ -395,7 +395,13 @@ class Cluster(World[Machine]):
         machine.batches += 1
         self.tell(
             happened.StatusesReceived(
-                machine.host_id, machine.incarnation, machine.batches, False, statuses, **failing
+                machine.host_id,
+                machine.incarnation,
+                machine.batches,
+                False,
+                statuses,
+                devices=machine.devices,
+                **failing,
             )
         )
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from rosrm.core.master.assignment.neighbours import locate
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
 
 
@@ -51,6 +52,19 @@ def the_books_balance(state: MasterState) -> None:
             total[: len(instance.reserved)] += instance.reserved
         assert np.allclose(state.hosts.load[:, host.column], total, atol=1e-6)
         assert (state.hosts.load[:, host.column] >= 0.0).all()
+        _devices_balance(state, host)
+
+
+def _devices_balance(state: MasterState, host: Host) -> None:
+    """Check that only instances hold devices, and sources that a migration may start again."""
+    held = state.hosts.devices[host.column].held
+    for number in host.instances:
+        instance = state.instances[number]
+        assert held.get(instance.id, ()) == instance.devices
+    for one in held:
+        migration = state.migrations.get(one.process)
+        returns = migration is not None and migration.source_host is host
+        assert one.number in host.instances or (returns and not migration.committed), one
 
 
 def known_places_are_current(state: MasterState) -> None:

@@ -11,6 +11,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import OrderId, SendOrder
 from rosrm.core.slave import events, reducer
 from rosrm.core.slave.state import SlaveState
+from rosrm.core.slave.watches import Memo
 from rosrm.model.orders import DropReplica, MeasureLinks, ReplicateSnapshot, RunExecutor
 from rosrm.model.values import (
     Assignment,
@@ -212,7 +213,19 @@ class Machine(Host[Program]):
         """Kill the supervisor; the next one adopts what runs and remembers what ended."""
         fenced = {one for one, it in self.programs.items() if it.assignment.fence is not None}
         statuses = (*self.ends.values(), *self._running())
-        self.tell(events.SupervisorReplaced(statuses, {}, frozenset(fenced)), now)
+        self.tell(events.SupervisorReplaced(statuses, self._memos(), frozenset(fenced)), now)
+
+    def report_devices(self) -> None:
+        """Report the devices of the host as they are now."""
+        self.batches += 1
+        self.say(
+            happened.StatusesReceived(
+                self.host_id, self.incarnation, self.batches, False, (), devices=self.devices
+            )
+        )
+
+    def _memos(self) -> dict[InstanceId, Memo]:
+        return {one: Memo(devices=it.assignment.devices) for one, it in self.programs.items()}
 
     def _running(self) -> list[InstanceStatus]:
         return [
@@ -240,4 +253,4 @@ class Machine(Host[Program]):
         self.polled.clear()
         self.slave = SlaveState(max_processes=self.max_processes)
         found = (*self.ends.values(), *self._running())
-        reducer.step(self.slave, events.SupervisorReported(found), now)
+        reducer.step(self.slave, events.SupervisorReplaced(found, self._memos()), now)

@@ -17,7 +17,14 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.declared_fields import declared_spec
 from rosrm.extensions.placement import PlacementPlugins, SelectedFilter
-from rosrm.model.values import HostDescription, Limits, ProcessSpec, ResourceDescription
+from rosrm.model.devices import Device, DeviceNeed
+from rosrm.model.values import (
+    HostDescription,
+    InstanceId,
+    Limits,
+    ProcessSpec,
+    ResourceDescription,
+)
 
 RESOURCES = ("memory", "cpu", "gpu")
 
@@ -29,6 +36,22 @@ labels = st.dictionaries(st.just("arm"), st.sampled_from(["yes", "no"]), max_siz
 resources = st.sampled_from([RESOURCES, RESOURCES[:2], RESOURCES[1:], ()]).map(
     lambda names: tuple(ResourceDescription(name, "", 10.0) for name in names)
 )
+devices = st.lists(
+    st.builds(
+        Device, st.sampled_from(["gpu", "camera"]), st.sampled_from("012"),
+        shareable=st.sampled_from([1, 1, 3]), missing=st.sampled_from(["", "", "", "gone"]),
+    ),
+    max_size=4, unique_by=lambda one: (one.kind, one.unit),
+).map(tuple)  # fmt: skip
+device_needs = st.lists(
+    st.one_of(
+        st.builds(
+            DeviceNeed, st.sampled_from(["gpu", "camera"]), st.sampled_from([0.4, 0.5, 1.0, 2.0])
+        ),
+        st.builds(DeviceNeed, st.just("gpu"), st.just(1.0), st.sampled_from([("0",), ("1",)])),
+    ),
+    max_size=2, unique_by=lambda need: need.kind,
+).map(tuple)  # fmt: skip
 conditions = st.sampled_from([HostCondition.UP] * 9 + [*HostCondition])
 rarely = st.sampled_from([False] * 7 + [True])
 usually = st.sampled_from([True] * 7 + [False])
@@ -86,6 +109,7 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
             max_processes=draw(st.sampled_from([0, 1, 2])),
             unenforced={"limits.cpu": "no group"} if draw(rarely) else {},
             cpus=draw(st.sampled_from([(), (0, 1), (0, 1, 2, 3)])),
+            devices=draw(devices),
         )  # fmt: skip
         host = table.register(description, 0.0)
         column = host.column
@@ -102,6 +126,10 @@ def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
         table.set_condition(host, draw(conditions))
         load = np.array([draw(fractions) / 4 for _ in table.resources])
         table.add_reservation(host, load, processes=draw(st.sampled_from([0, 0, 1])))
+        inventory = table.devices[column]
+        for other in draw(device_needs):
+            held = inventory.choose((other,))
+            table.hold(host, InstanceId("other", number), held or ())
         if draw(rarely):
             table.prune(host)
     table.set_claims({0: draw(st.integers(0, 2))} if draw(rarely) else {})
@@ -118,6 +146,7 @@ def demands(draw: st.DrawFn) -> Demand:
     spec = ProcessSpec(
         "p", command=("run",), required_labels=required, limits=limits,
         cpus=draw(st.sampled_from([(), (1,), (1, 3)])), priority=draw(st.integers(0, 2)),
+        devices=draw(device_needs),
     )  # fmt: skip
     read = declared_spec(spec, ())  # a filter may read only what makes rankings differ
     plugins = PlacementPlugins(filters=draw(filters_of_plugins))
@@ -183,11 +212,34 @@ def test_a_refreshed_ranking_equals_a_new_one(
         host = (fitting or table.hosts)[number % len(fitting or table.hosts)]
         own = bool(fitting) and number % 3 > 0
         need = ranking.need[:, host.column] if own else np.full(len(table.resources), 0.1)
+        if own:
+            held = table.devices[host.column].choose(demand.spec.devices)
+            assert held is not None
+            table.hold(host, InstanceId("own", len(table.touched)), held)
         table.add_reservation(host, need, processes=1)
         if own:
             ranking.note_assignment()
         ranking.refresh()
         assert ranking.value.tolist() == ranked(table, demand).value.tolist()
+
+
+@given(tables(), st.lists(device_needs, min_size=1, max_size=3), st.data())
+def test_counts_of_devices_follow_every_change(
+    table: HostTable, needs: list[tuple[DeviceNeed, ...]], data: st.DataObject
+) -> None:
+    """They are cached by needs, and equal to those of a new table."""
+    for number in range(data.draw(st.integers(0, 4))):
+        host = table.hosts[data.draw(st.integers(0, len(table) - 1))]
+        wanted = data.draw(st.sampled_from(needs))
+        before = table.devices.counts(wanted)[host.column]
+        held = table.devices[host.column].choose(wanted)
+        assert (held is not None) == (before > 0)
+        table.hold(host, InstanceId("p", number), held or ())
+        for one in needs:
+            inventories = table.devices.at(slice(0, len(table)))
+            assert table.devices.counts(one).tolist() == [it.count(one) for it in inventories]
+            empty = [it.emptied().count(one) for it in inventories]
+            assert table.devices.counts(one, empty=True).tolist() == empty
 
 
 @given(tables(most=3), demands())
@@ -196,5 +248,5 @@ def test_no_process_is_set_aside_if_a_host_takes_it_now(table: HostTable, demand
     never = why_never(table, demand)
     if (ranked(table, demand).value < np.inf).any():
         assert never == ""
-    if never and "no host reports" not in never:
+    if never and "no host reports" not in never and "no host has" not in never:
         assert all(host.name in never for host in table.listed())

@@ -7,7 +7,9 @@ that really run, independently of the core's state. After every step the invaria
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import strategies as st
@@ -21,6 +23,7 @@ from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
 from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
+from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
@@ -51,6 +54,19 @@ ways = st.sampled_from(
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
+asked = st.sampled_from(["", "", "camera", "gpu", "half gpu", "half gpu"])
+NEEDS = {
+    "": (),
+    "camera": (DeviceNeed("camera"),),
+    "gpu": (DeviceNeed("gpu"), DeviceNeed("lidar")),
+    "half gpu": (DeviceNeed("gpu", 0.5),),
+}
+GPU = Device("gpu", "0")
+DEVICES = {
+    "a": (Device("camera", "front"), GPU),
+    "b": (Device("camera", "rear"), GPU, Device("gpu", "1"), Device("lidar", "x", shareable=2)),
+    "c": (GPU, Device("lidar", "x")),
+}
 HOST_CHANGES = [
     "cut", "mended", "killed", "killed", "leaves", "stops unreachable", "is detached",
     "loses power", "loses a poll", "full", "over", "empty", "another supervisor",
@@ -70,7 +86,7 @@ def is_open(hosts: HostTable, column: int) -> bool:
 
 def spec(
     name: str, kind: str, memory: int, moves: str, special: bool, priority: int,
-    loss: str = "wait",
+    loss: str = "wait", devices: str = "",
 ) -> ProcessSpec:  # fmt: skip
     """Draw one of a few sorts of process."""
     word = moves.partition(",")[0]
@@ -87,6 +103,7 @@ def spec(
         standby=standby, reschedule=ReschedulePolicy(int(loss == "elsewhere"), 1.0),
         time_limit=6.0 if kind == "job" and memory == 100 else 0.0,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
+        devices=NEEDS[devices],
     )  # fmt: skip
 
 
@@ -104,10 +121,11 @@ class Play(RuleBasedStateMachine):
     @initialize(
         backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2), first=ways, second=ways,
         loss=losses, preemption=st.sampled_from(["move", "requeue", False]), rebalance=chance,
+        devices=asked,
     )  # fmt: skip
     def begin(
         self, backfill: bool, most: int, slots: int, first: str, second: str, loss: str,
-        preemption: str | bool, rebalance: bool,
+        preemption: str | bool, rebalance: bool, devices: str,
     ) -> None:  # fmt: skip
         self.cluster = Cluster(
             backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
@@ -123,7 +141,7 @@ class Play(RuleBasedStateMachine):
         for name in HOSTS:
             labels = {"arm": "yes"} if name == LABELLED else {}
             machine = Portable(
-                name, memory=1000 * MIB, cpu=4.0, labels=labels,
+                name, memory=1000 * MIB, cpu=4.0, labels=labels, devices=DEVICES[name],
                 max_processes=slots if name == "b" else 0,
             )  # fmt: skip
             self.cluster.add(machine)
@@ -146,7 +164,7 @@ class Play(RuleBasedStateMachine):
         self.cluster.watch = self.look
         # Processes that run from the beginning.
         for name, moves in (("p0", first), ("p1", second)):
-            self.cluster.submit(spec(name, "node", 100, moves, False, 0, loss))
+            self.cluster.submit(spec(name, "node", 100, moves, False, 0, loss, devices))
             for machine, running in self.programs():
                 machine.seen_in_graph(running, self.cluster.now)
         self.cluster.settle()
@@ -201,7 +219,7 @@ class Play(RuleBasedStateMachine):
                 if awaits_states(state, waits, self.cluster.now) or name in state.queue.delayed:
                     continue
                 ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
-                alike = demand_of(state, waits).key[4:] == demand_of(state, chosen).key[4:]
+                alike = demand_of(state, waits).key == demand_of(state, chosen).key
                 assert not (ahead and (alike or not state.settings.backfill)), "passed"
 
     def machine(self, name: str) -> Machine:
@@ -258,14 +276,17 @@ class Play(RuleBasedStateMachine):
         name=names, kind=st.sampled_from(["service", "job", "node", "node"]),
         memory=st.sampled_from([0, 100, 100, 300]),
         moves=ways | st.just(""),
-        special=chance, urgent=chance, twin=names, loss=losses,
+        special=chance, urgent=chance, twin=names, loss=losses, devices=asked,
     )  # fmt: skip
     def submit(
         self, name: str, kind: str, memory: int, moves: str, special: bool, urgent: bool,
-        twin: str, loss: str = "wait",
+        twin: str, loss: str = "wait", devices: str = "",
     ) -> None:  # fmt: skip
         special = special and memory == 300
-        specs = [spec(one, kind, memory, moves, special, int(urgent), loss) for one in (name, twin)]
+        specs = [
+            spec(one, kind, memory, moves, special, int(urgent), loss, devices)
+            for one in (name, twin)
+        ]
         before = set(self.cluster.state.processes)
         if self.ask(happened.SubmissionReceived, tuple(specs)):
             for one in (name, twin):
@@ -575,6 +596,17 @@ class Play(RuleBasedStateMachine):
                 self.failed.add(instance.process)
             machine.finish(instance.process, self.cluster.now, code=-1)
 
+    @rule(host=hosts, which=which_one)
+    def device_goes_or_returns(self, host: str, which: int) -> None:
+        """Take away a device of a host, or bring it back; its slave reports that if it can."""
+        machine = self.machine(host)
+        chosen = self.pick(machine.devices, which)
+        changed = replace(chosen, missing="" if chosen.missing else "gone")
+        machine.devices = tuple(changed if one is chosen else one for one in machine.devices)
+        if self.known(machine):
+            machine.report_devices()
+        self.flow()
+
     @rule()
     def all_is_well(self) -> None:
         """Connect and open every host and let it request work."""
@@ -712,6 +744,18 @@ class Play(RuleBasedStateMachine):
     def the_books_balance(self) -> None:
         invariants.the_books_balance(self.cluster.state)
 
+    @invariant()
+    def no_device_is_given_twice(self) -> None:
+        """Check the units of all processes that really run, on lost hosts and in moves, too."""
+        for machine in self.cluster.machines.values():
+            shares: dict[tuple[str, str], float] = defaultdict(float)
+            for program in machine.programs.values():
+                for held in program.assignment.devices:
+                    shares[held.kind, held.unit] += held.share
+                asked = program.assignment.spec.devices
+                assert bool(asked) == bool(program.assignment.devices)
+            assert all(share < 1.0 + 1e-9 for share in shares.values()), (machine.name, shares)
+
     def given_up(self) -> set[int]:
         """Return instances that may run on lost hosts, unaware of their successors.
 
@@ -826,6 +870,7 @@ class Play(RuleBasedStateMachine):
             for quirks in machine.quirks.values():
                 quirks.clear()
             machine.busy["memory"] = 0.05
+            machine.devices = DEVICES[machine.name]
             self.tame(machine, {*NAMES, *TWINS})
             machine.restart_slave(cluster.now)
         cluster.now += 2.0
@@ -869,6 +914,10 @@ class Play(RuleBasedStateMachine):
         assert not cluster.state.standbys
         assert not len(cluster.state.queue)
         assert np.allclose(cluster.state.hosts.load, 0.0, atol=1e-6)
+        for host in cluster.state.hosts.hosts:
+            inventory = cluster.state.hosts.devices[host.column]
+            assert inventory.devices == DEVICES[host.name]
+            assert not inventory.held
         assert not cluster.intents["migration"]
 
 

@@ -147,6 +147,8 @@ def test_every_process_is_written_back_as_it_was_read(state: MasterState, name: 
     again = written(state)["process", name]
     before = {**again, **INTENTS["process", name]}  # older journals lack some fields
     before["spec"] = {**again["spec"], **before["spec"]}
+    if before["standby"]:
+        before["standby"] = {"source_devices": [], **before["standby"]}
     changed = {field: (before[field], value) for field, value in again.items()
                if before[field] != value}  # fmt: skip
     if process.phase not in WAITING:
@@ -160,7 +162,8 @@ def test_every_migration_is_taken_up_where_it_was(state: MasterState, name: str)
     state.take()
     run = state.migrations[name]
     state.save_migration(run)
-    assert written(state)["migration", name] == INTENTS["migration", name]
+    before = {"source_devices": [], **INTENTS["migration", name]}  # absent in older journals
+    assert written(state)["migration", name] == before
     in_hand = run.current_step
     assert in_hand is not None
     steps = {

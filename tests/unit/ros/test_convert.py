@@ -188,6 +188,12 @@ def neighbour(**fields: object) -> list[msg.NeighbourRule]:
 
 
 NAN, INF = float("nan"), float("inf")
+
+
+def asked(**fields):
+    return [msg.DeviceNeed(**{"kind": "gpu", "amount": 1.0, **fields})]
+
+
 NONSENSE_IN_SPECS = {
     "no name": lambda m: setattr(m, "name", ""),
     "a name with an escape": lambda m: setattr(m, "name", "p\x1b[2J"),
@@ -215,6 +221,8 @@ NONSENSE_IN_SPECS = {
     "readiness": lambda m: setattr(m.readiness, "kind", "soon"),
     "a readiness without end": lambda m: setattr(m.readiness, "timeout", NAN),
     "a grace without end": lambda m: setattr(m.stop, "interrupt_grace", INF),
+    "a time limit without end": lambda m: setattr(m, "time_limit", NAN),
+    "a delay before another host": lambda m: setattr(m.reschedule, "delay", -1.0),
     "a loss of centuries": lambda m: setattr(m.host_loss, "delay", 1e9),
     "an isolation of centuries": lambda m: setattr(m.isolation, "after", 1e9),
     "a rate without end": lambda m: setattr(m.health, "rate", INF),
@@ -241,6 +249,12 @@ NONSENSE_IN_SPECS = {
     ),
     "many flows": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="q")] * 257),
     "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
+    "a device of no kind": lambda m: setattr(m, "devices", asked(kind="")),
+    "a share that is no number": lambda m: setattr(m, "devices", asked(amount=NAN)),
+    "a share of two units": lambda m: setattr(m, "devices", asked(amount=1.5)),
+    "units and another number": lambda m: setattr(m, "devices", asked(units=["a", "b"])),
+    "a unit twice": lambda m: setattr(m, "devices", asked(amount=2.0, units=["a", "a"])),
+    "a kind twice": lambda m: setattr(m, "devices", asked() * 2),
 }
 
 
@@ -347,3 +361,30 @@ def test_only_a_json_object_is_one(text) -> None:
     with pytest.raises(Refused, match="the options"):
         convert.json_object(text, "the options")
     assert convert.json_object("", "the options") == {}
+
+
+@pytest.mark.parametrize(
+    "held", [{"share": NAN}, {"share": 0.0}, {"share": 1.5}, {"kind": ""}, {"unit": "../x"}]
+)
+def test_a_held_device_that_is_none_is_refused(held) -> None:
+    """A slave cannot hold more than a unit, and a master cannot assign it."""
+    device = msg.HeldDevice(**{"kind": "gpu", "unit": "0", "share": 1.0, **held})
+    status = values.InstanceStatus(values.InstanceId("p", 1), values.InstanceState.READY)
+    message = convert.status_to_msg(status)
+    message.devices = [device]
+    with pytest.raises(Refused, match="'p': "):
+        convert.status_from_msg(message)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"shareable": 0}, {"path": "video0"}, {"about": "\x1b"}, {"kind": "a b"}]
+)
+def test_a_host_with_a_device_that_is_none_is_refused(wrong) -> None:
+    """Also in a later report of its devices."""
+    device = msg.Device(**{"kind": "gpu", "unit": "0", "shareable": 1, **wrong})
+    with pytest.raises(Refused):
+        convert.devices_from_msg([device])
+    message = convert.host_to_msg(values.HostDescription("h", 1))
+    message.devices = [device]
+    with pytest.raises(Refused, match="h has devices that no host can have: "):
+        convert.host_from_msg(message)

@@ -80,8 +80,8 @@ def test_policies_are_those_of_the_model():
 
 
 def test_status_is_that_of_the_model():
-    """Statuses have the fields and the state names of the model."""
-    assert messages.Status._fields == tuple(
+    """Statuses have the fields and the state names of the model; the slave adds the devices."""
+    assert (*messages.Status._fields, "devices") == tuple(
         field.name for field in dataclasses.fields(values.InstanceStatus)
     )
     ours = {STARTING, RUNNING, BACKOFF, STOPPING, *ENDED}

@@ -225,7 +225,7 @@ def _host_plan(seen: _Host) -> SimulatedHost:
     return SimulatedHost(
         described.name, described.resources, seen.limits, described.labels,
         described.max_processes, {name: _middle(v, 0.0) for name, v in seen.others.items()},
-        seen.joins, seen.leaves, seen.lost,
+        seen.joins, seen.leaves, seen.lost, devices=described.devices,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
@@ -22,6 +22,7 @@ from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.slave import commands, events, reducer
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
+from rosrm.model.devices import Device
 from rosrm.model.orders import (
     DropReplica,
     MeasureLinks,
@@ -88,6 +89,7 @@ class Host(ABC, Generic[ProgramT]):
     Attributes:
         limits: upper limits, fractions by resource.
         busy: usage by other programs, fractions by resource.
+        devices: devices of the host.
         start_time, stop_time: seconds that a program takes to start and to stop.
         incarnation: of its slave.
         host_id: assigned by the master; 0: not registered.
@@ -111,6 +113,7 @@ class Host(ABC, Generic[ProgramT]):
     start_time: float = 0.0
     stop_time: float = 0.0
     incarnation: int = 0
+    devices: tuple[Device, ...] = ()
 
     host_id: int = 0
     slave: SlaveState = field(default_factory=SlaveState)
@@ -182,7 +185,7 @@ class Host(ABC, Generic[ProgramT]):
         """Return the description with which its slave registers."""
         return HostDescription(
             self.name, self.incarnation, labels=self.labels, resources=self.resources,
-            max_processes=self.max_processes, period=self.period,
+            max_processes=self.max_processes, period=self.period, devices=self.devices,
         )  # fmt: skip
 
     def usage(self, now: float) -> dict[str, float]:
@@ -244,11 +247,10 @@ class Host(ABC, Generic[ProgramT]):
         match command:
             case commands.Report(statuses, complete):
                 self.batches += 1
-                self.say(
-                    StatusesReceived(
-                        self.host_id, self.incarnation, self.batches, complete, statuses
-                    )
+                batch = StatusesReceived(
+                    self.host_id, self.incarnation, self.batches, complete, statuses
                 )
+                self.say(replace(batch, devices=self.devices))
             case commands.Launch(assignments):
                 for assignment in assignments:
                     self._launch(assignment, now)

@@ -64,7 +64,8 @@ class Machine(Host[Work]):
     ) -> None:  # fmt: skip
         super().__init__(
             plan.name, resources=plan.resources, limits=plan.limits, labels=plan.labels,
-            max_processes=plan.max_processes, busy=plan.busy, period=model.period,
+            devices=plan.devices, max_processes=plan.max_processes, busy=plan.busy,
+            period=model.period,
             start_time=model.start, stop_time=model.stop, incarnation=incarnation,
         )  # fmt: skip
         self.up = True

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from math import inf
 
 from rosrm.core.master.events import Event
+from rosrm.model.devices import Device
 from rosrm.model.values import EMPTY, ProcessSpec, ResourceDescription
 
 
@@ -60,6 +61,7 @@ class SimulatedHost:
         resources: with their capacities.
         limits: upper limits, fractions by resource.
         busy: usage by other programs, fractions by resource, all the time.
+        devices: devices of the host.
         joins: time at which its slave registers.
         leaves: time at which it goes; inf: never.
         lost: it goes without a message, and its processes end with it; else its slave shuts down.
@@ -76,6 +78,7 @@ class SimulatedHost:
     leaves: float = inf
     lost: bool = False
     link: SimulatedLink | None = None
+    devices: tuple[Device, ...] = ()
 
     def capacity(self, resource: str) -> float:
         """Return the capacity in base units; 0 where it has no such resource."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 
 from rosrm.config.checking import near, validated
+from rosrm.config.device_forms import AskedByKind, OfferedByKind, with_kinds
 from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import expanded
 from rosrm.config.kinds import SIMULATION_KEYS, check_kind
@@ -30,6 +31,7 @@ from rosrm.extensions.units import (
     Quantity,
     Seconds,
 )
+from rosrm.model.devices import DeviceNeed, device_fault, need_fault
 from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
 from rosrm.wording import counted
 from rosrm_simulate.variants import Variant, check_keys, load_variants, text_of, variants_of
@@ -121,6 +123,7 @@ class HostInFile:
     leaves: Seconds | None = None
     lost: bool = False
     link: LinkInFile | None = None
+    devices: OfferedByKind = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +145,13 @@ class ProcessPlanInFile:
     namespace: str = ""
     priority: Annotated[int, Quantity(low=-(2**31), high=2**31 - 1, whole=True)] = 0
     labels: LabelsInFile = field(default_factory=LabelsInFile)
+    devices: AskedByKind = field(default_factory=dict)
     migration: MigrationInFile = field(default_factory=MigrationInFile)
     talks_to: Mapping[str, ByteRate] = field(default_factory=dict)
+
+    def devices_asked(self) -> tuple[DeviceNeed, ...]:
+        """Return the devices that the process asks for."""
+        return tuple(replace(need, kind=kind) for kind, need in self.devices.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,10 +277,15 @@ def _host(node: Node, problems: Problems) -> SimulatedHost | None:
         for name, unit in _UNITS.items()
         if getattr(host, name) > 0.0
     )
+    devices = tuple(one for units in with_kinds(host.devices).values() for one in units)
+    fault = device_fault(devices)
+    if fault:
+        problems.add(node.deepest(("devices",)).place, f"devices: {fault}")
     return SimulatedHost(
         host.name, resources, {**_LIMITS, **host.limits}, host.labels, host.max_processes,
         host.busy, host.joins, inf if host.leaves is None else host.leaves, host.lost,
         host.link.simulated() if host.link is not None else None,
+        devices,
     )  # fmt: skip
 
 
@@ -292,6 +305,9 @@ def _process(
         plugins.choice(
             "migration", strategy, named, node.get("migration", "options"), part="own_options"
         )
+    fault = need_fault(given.devices_asked())
+    if fault:
+        problems.add(node.deepest(("devices",)).place, f"devices: {fault}")
     _check_fits(node, given, hosts, problems)
 
     def draw(span: Span) -> float:
@@ -316,6 +332,7 @@ def _spec(given: ProcessPlanInFile, needs: Mapping[str, float]) -> ProcessSpec:
         required_labels=given.labels.required, preferred_labels=given.labels.preferred,
         avoided_labels=given.labels.avoided, priority=given.priority,
         migration=MigrationPolicy(migration.strategy, migration.overlap, migration.options),
+        devices=given.devices_asked(),
         talks_to=given.talks_to,
     )  # fmt: skip
 

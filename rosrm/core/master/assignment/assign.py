@@ -138,12 +138,14 @@ def joint_demand(state: MasterState, demands: Mapping[str, Demand]) -> Demand:
         why = f"it accepts no {counted(len(demands), 'more process', 'more processes')} now"
         excluded.setdefault(table.hosts[column].name, why)
     amounts: dict[str, float] = {}
+    devices = tuple(need for one in demands.values() for need in one.spec.devices)
     for one in demands.values():
         for resource, amount in one.amounts.items():
             amounts[resource] = amounts.get(resource, 0.0) + amount
     declared = frozenset[str]().union(*(one.declared for one in demands.values()))
     return replace(
         demand, amounts=amounts, estimated=frozenset(amounts) - declared, excluded=excluded,
+        spec=replace(demand.spec, devices=devices),
         traffic=reduce(joined, (one.traffic for one in demands.values())),
     )  # fmt: skip
 
@@ -352,9 +354,12 @@ def _assign(
     process.queue_delay = 0.0
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
+    devices = [str(one) for one in state.instances[instance.number].devices]
     state.record(
-        now, EventKind.ASSIGNED, f"{process.name} is assigned to {host.name}", process=process.name,
-        host=host.name, facts={"number": instance.number, "decision": process.decision},
+        now, EventKind.ASSIGNED,
+        f"{process.name} is assigned to {host.name}" + (f" with {listed(devices)}" * bool(devices)),
+        process=process.name, host=host.name,
+        facts={"number": instance.number, "decision": process.decision, "devices": devices},
     )  # fmt: skip
     state.save(process)
     state.emit(Assign(host.host_id, state.assignment(instance, process.spec)))

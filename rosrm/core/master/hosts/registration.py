@@ -14,6 +14,7 @@ from rosrm.core.master.assignment.reservations import settle_reservation
 from rosrm.core.master.checkpoint import replication
 from rosrm.core.master.commands import RefusalCode, Reply
 from rosrm.core.master.hosts import loss
+from rosrm.core.master.hosts.devices import note_devices
 from rosrm.core.master.hosts.liveness import lease_end, mark_up
 from rosrm.core.master.hosts.readings import take_readings
 from rosrm.core.master.master_state import RECORD_PERIOD, MasterState
@@ -22,6 +23,7 @@ from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Instance, ProcessPhase
+from rosrm.model.codec import to_plain
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import ReportInstances
@@ -63,7 +65,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         facts={
             "host_id": host.host_id, "labels": dict(description.labels),
             "resources": {r.name: r.capacity for r in description.resources},
-            "absent": dict(description.absent),
+            "absent": dict(description.absent), "devices": to_plain(description.devices),
         },
     )  # fmt: skip
     note_seen(state, host.name, event.journal_seen, now)
@@ -133,6 +135,7 @@ def _registered_again(
     master orders a full report in sequence.
     """
     state.hosts.last_contact[host.column] = now
+    note_devices(state, host, event.description.devices, now)
     replication.note_states(state, host, event.snapshots, now)
     if state.hosts.redescribe(host, event.description):
         labels = dict(host.description.labels)

@@ -11,9 +11,11 @@ import numpy as np
 from rosrm.core.master.assignment.assign import demand_amounts, measured_need
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves
+from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
 from rosrm.core.master.state.process import Instance, Process
 from rosrm.model.plan import Aim
+from rosrm.model.values import InstanceId
 
 #: Tolerance in comparisons of sums of fractions.
 _CLOSE: Final = 1e-9
@@ -61,22 +63,28 @@ def why_no_room(state: MasterState, process: Process) -> str:
 
 @contextmanager
 def trial(state: MasterState) -> Iterator[Callable[[PlannedMoves], None]]:
-    """Yield a function that reserves the room of planned moves until the end of the block."""
+    """Yield a function that reserves the room of planned moves until the end of the block.
+
+    The devices of the moves are a part of their room.
+    """
     table = state.hosts
-    before: dict[int, tuple[FloatArray, int]] = {}
+    before: dict[int, tuple[FloatArray, int, Inventory]] = {}
 
     def reserve(planned: PlannedMoves) -> None:
         host = planned.destination
         column = host.column
-        saved = table.cells[:, :, column].copy(), int(table.processes[column])
-        before.setdefault(column, saved)
-        for _, _, own, _ in planned.steps:
+        cells, devices = table.cells[:, :, column].copy(), table.devices[column]
+        before.setdefault(column, (cells, int(table.processes[column]), devices))
+        for process, _, own, _ in planned.steps:
+            held = table.devices[column].choose(own.demand.spec.devices)
+            table.hold(host, InstanceId(process.name, 0), held or ())
             table.add_reservation(host, own.need[:, column], processes=1)
 
     try:
         yield reserve
     finally:
-        for column, (cells, processes) in before.items():
+        for column, (cells, processes, devices) in before.items():
+            table.devices[column] = devices
             table.cells[:, :, column] = cells
             table.processes[column] = processes
             table.touched.append(column)

@@ -82,10 +82,11 @@ def planned(
     if isinstance(plan, Rejected):
         return plan
     hosts = state.hosts.by_name
+    source = state.instances.get(move.source.number)
     return Migration(
         move.spec.name, plan, strategy, move.source, hosts[move.source_host], move.destination,
         hosts[move.destination_host], cause, now, move.source_node, _destination_node(plan, move),
-        state.wall, aim=aim,
+        state.wall, aim=aim, source_devices=source.devices if source else (),
     )  # fmt: skip
 
 

@@ -150,7 +150,10 @@ def _start(state: MasterState, migration: Migration, step: Start, now: float) ->
         migration.suspended.add(number)
     state.save_migration(migration)
     if number not in state.instances and number not in migration.ended:
-        state.add_instance(step.instance, state.hosts.by_name[step.host], now, state.estimate(spec))
+        host, needs = state.hosts.by_name[step.host], state.estimate(spec)
+        state.release_ended(process.name, host)
+        devices = migration.source_devices if host is migration.source_host else ()
+        state.add_instance(step.instance, host, now, needs, devices=devices)
         state.save(process)
     instance = state.instances.get(number)
     if instance is not None and instance.node_name != step.node_name:

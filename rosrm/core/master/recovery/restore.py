@@ -19,6 +19,7 @@ from rosrm.core.master.state import process as processes
 from rosrm.core.master.state.migration import Migration, end_from_dict, undo_steps
 from rosrm.core.master.state.process import DesiredState, Image, LeftBehind, Process, ProcessPhase
 from rosrm.model.codec import fields_from_plain, from_plain
+from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Plan
 from rosrm.model.records import Intent
@@ -100,6 +101,7 @@ def _restore_instances(
 ) -> None:  # fmt: skip
     """Add the instances that may still run: owner, source, destination, and others to stop."""
     aliases, standby = item.get("node_names", {}), item.get("standby")
+    given = item.get("devices", {})  # absent in older journals
     moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
     ended = move.get("ended", {}) if move is not None else {}
     for number, host_name in item["instances"].items():
@@ -108,7 +110,9 @@ def _restore_instances(
             continue
         instance = InstanceId(process.name, int(number))
         if instance.number == item["owner"] or instance.number in moving:
-            held = state.add_instance(instance, host, now, state.estimate(process.spec))
+            devices = from_plain(tuple[HeldDevice, ...], given.get(number, []))
+            needs = state.estimate(process.spec)
+            held = state.add_instance(instance, host, now, needs, devices=devices)
             held.node_name = str(aliases.get(number, ""))
         else:
             adopt_to_stop(state, instance, host, now)
@@ -168,6 +172,8 @@ def _restore_move(
         return False
     process.owner = int(item["owner"])
     state.migrations[process.name] = restored
+    if not restored.committed and restored.source.number not in state.instances:
+        state.hosts.hold(restored.source_host, restored.source, restored.source_devices)
     for number in process.instances.intersection(move["stopping"]):
         state.instances[number].stopping = True
     state.set_phase(process, ProcessPhase.MIGRATING, now, restored.progress_text)

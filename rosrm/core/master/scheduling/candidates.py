@@ -9,6 +9,7 @@ import numpy as np
 
 from rosrm.core.master.scheduling.traffic import flow_view
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.extensions.link_views import FlowView
@@ -31,6 +32,10 @@ class Candidates:
         busy: (R, n) reading plus reservations.
         processes: (n,) number of processes on the host or reserved for it.
         bound: (n,) highest number of processes.
+        inventories: (n,) devices of each host.
+        sets: (n,) number of further processes of this demand for which the host has devices; at
+            most COUNTED.
+        more: (n,) number of processes of this demand that were added to each host; None: none.
         flows: flows of the process on each host; None: it has none, or no policy reads them.
         empty: True if the arrays are those of hosts without processes.
         tenants: (n,) name to spec of each process on the host; None: as the table has them now.
@@ -46,6 +51,9 @@ class Candidates:
     busy: FloatArray
     processes: IntArray
     bound: IntArray
+    inventories: list[Inventory]
+    sets: IntArray | None = None
+    more: IntArray | None = None
     flows: FlowView | None = None
     empty: bool = False
     tenants: tuple[Mapping[str, ProcessSpec], ...] | None = None
@@ -88,11 +96,16 @@ def candidates(
     busy, processes = cells[BUSY], table.processes[columns]
     if more is not None:
         busy, processes = busy + need * more, processes + more
-    return Candidates(
+    hosts = Candidates(
         table=table, demand=demand, columns=columns, resources=table.resources, need=need,
         cells=cells, busy=busy, processes=processes, bound=table.bound[columns],
+        inventories=table.devices.at(columns), more=more,
         flows=_flows(table, demand, columns),
     )  # fmt: skip
+    if demand.spec.devices:
+        sets = table.devices.counts(demand.spec.devices)[columns]
+        hosts.sets = sets if more is None else sets - more
+    return hosts
 
 
 def _flows(table: HostTable, demand: Demand, columns: Columns) -> FlowView | None:
@@ -108,4 +121,6 @@ def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidate
     hosts = candidates(table, demand, need, columns)
     hosts.busy, hosts.processes = np.zeros_like(hosts.busy), np.zeros_like(hosts.processes)
     hosts.empty = True
+    if demand.spec.devices:
+        hosts.sets = table.devices.counts(demand.spec.devices, empty=True)[columns]
     return hosts

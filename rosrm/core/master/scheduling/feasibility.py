@@ -21,7 +21,7 @@ from rosrm.core.master.scheduling.filters import (
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BoolArray
 from rosrm.core.master.state.hosts import HostCondition, HostTable
-from rosrm.wording import by_reason, counted, first_line, get_close_matches
+from rosrm.wording import by_reason, counted, first_line, get_close_matches, listed
 
 #: Largest number of hosts that a reason names.
 _NAMED_HOSTS: Final = 16
@@ -40,9 +40,9 @@ def why_never(table: HostTable, demand: Demand) -> str:
     """
     if not len(table) or _possible(table, demand).any():
         return ""
-    unmeasured = _unmeasured(table, demand)
-    if unmeasured:
-        return unmeasured
+    unknown = _unmeasured(table, demand) or _unknown_device(table, demand)
+    if unknown:
+        return unknown
     alone = "; there is no other host" if len(table.listed()) == 1 else ""
     return _host_by_host(_LASTING, table, demand) + alone
 
@@ -116,4 +116,15 @@ def _unmeasured(table: HostTable, demand: Demand) -> str:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         there = ", ".join(sorted(table.resources)) or "none"
         return f"no host reports the resource {resource!r}{hint} (reported: {there})"
+    return ""
+
+
+def _unknown_device(table: HostTable, demand: Demand) -> str:
+    """Return a sentence on a kind of devices that no host has, with a near name; "": none."""
+    there = table.devices.kinds()
+    for need in demand.spec.devices:
+        if need.kind not in there:
+            near = get_close_matches(need.kind, there, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            return f"no host has a {need.kind!r} among its devices{hint} (there: {listed(there)})"
     return ""

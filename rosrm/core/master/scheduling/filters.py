@@ -35,7 +35,7 @@ class Lasts(Enum):
     RETURN = "until the slave reports to this run of the master, which is expected"
     AWAY = "until the host registers or rejoins, or a user uncordons it"
     NEIGHBOURS = "until an instance of another process starts, moves or ends"
-    PERMANENT = "until the host registers with other labels, resources or plugins"
+    PERMANENT = "until the host reports other labels, resources, plugins or devices"
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +293,15 @@ def _why_no_slot(hosts: Candidates, row: int) -> str:
     return f"it accepts no more than {most} now"
 
 
+def _has_devices(hosts: Candidates) -> BoolArray | None:
+    return None if hosts.sets is None else hosts.sets > 0
+
+
+def _why_no_devices(hosts: Candidates, row: int) -> str:
+    inventory = hosts.inventories[row]
+    return (inventory.emptied() if hosts.empty else inventory).why_not(hosts.demand.spec.devices)
+
+
 def _has_room(hosts: Candidates) -> BoolArray:
     # A host without a resource has NaN there, which exceeds no limit.
     limits = hosts.cells[LIMIT] - (hosts.demand.headroom - _CLOSE)
@@ -339,6 +348,14 @@ FILTERS: Final = (
     Filter("limits", _is_accepting, _why_not_accepting),
     Filter("report", _has_reported, _why_not_reported),
     Filter("request", _has_asked, _why_not_asked),
+    Filter(
+        "devices",
+        _has_devices,
+        _why_no_devices,
+        Lasts.PERMANENT,
+        by_assignment=True,
+        verdict="full",
+    ),
     Filter("claim", _is_unclaimed, _why_claimed),
     Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
     Filter(

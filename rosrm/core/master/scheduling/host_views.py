@@ -29,6 +29,7 @@ def host_view(hosts: Candidates) -> HostView:
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
         _read_only(hosts.processes[:]), _Labels(hosts), _Links(hosts), _Tenants(hosts),
+        _FreeDevices(hosts),
     )  # fmt: skip
 
 
@@ -98,6 +99,17 @@ class _Tenants(_PerHost[Mapping[str, ProcessSpec]]):
     def _of(self, row: int) -> Mapping[str, ProcessSpec]:
         self._hosts.tenants_read = True
         return MappingProxyType(self._hosts.tenants_of(row))
+
+
+class _FreeDevices(_PerHost[Mapping[str, float]]):
+    """The free units of each host by kind."""
+
+    def _of(self, row: int) -> Mapping[str, float]:
+        hosts = self._hosts
+        inventory = hosts.inventories[row]
+        if hosts.more is not None:
+            inventory = inventory.after(hosts.demand.spec.devices, int(hosts.more[row]))
+        return MappingProxyType(inventory.free_by_kind())
 
 
 def checked_mask(mask: object, count: int) -> BoolArray:

@@ -30,6 +30,7 @@ from rosrm.core.master.scheduling.host_views import checked_scores, host_view, p
 from rosrm.core.master.scheduling.proximity import keeping_all, preference
 from rosrm.core.master.scheduling.traffic import keeping_limits
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.devices import COUNTED
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
 from rosrm.errors import PluginError
@@ -41,7 +42,7 @@ TIE: Final = 1e-9
 #: Number of runners-up that an explanation names beside the chosen host, if there are many hosts.
 _RUNNERS_UP: Final = 3
 #: Number of equal processes for which one call of the policy scores a host ahead.
-_AT_A_TIME: Final = 8
+_AT_A_TIME: Final = COUNTED
 
 #: Largest size of one policy's score in the sum of a chain, so that the sum is finite.
 _LARGEST_SCORE: Final = 1e300

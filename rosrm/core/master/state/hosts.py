@@ -13,6 +13,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from rosrm.core.master.state.devices import DeviceTable
 from rosrm.core.master.state.host_arrays import (
     BUSY,
     LOAD,
@@ -25,7 +26,8 @@ from rosrm.core.master.state.host_arrays import (
 )
 from rosrm.core.master.state.links import LinkTable
 from rosrm.extensions.plugin_calls import Failing, Plugin
-from rosrm.model.values import HostDescription, ProcessSpec
+from rosrm.model.devices import Device, HeldDevice
+from rosrm.model.values import HostDescription, InstanceId, ProcessSpec
 
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
@@ -128,6 +130,7 @@ class HostTable(HostColumns):
         links: measured links between hosts, and the flows across them.
         claims: column of a host on which room is made for a process -> priority of the process.
         touched: columns that assignments and ends have changed since `version` grew.
+        devices: devices of each host, and the instances that hold them.
     """
 
     def __init__(self) -> None:
@@ -137,6 +140,7 @@ class HostTable(HostColumns):
         self.links = LinkTable()
         self.version = 0
         self.touched: list[int] = []
+        self.devices = DeviceTable()
         self.claims: dict[int, int] = {}
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}
         self._enforcing: dict[tuple[tuple[str, ...], tuple[int, ...]], BoolArray] = {}
@@ -150,6 +154,7 @@ class HostTable(HostColumns):
         """Add a host before its first contact, so that its number stays across restarts."""
         host = Host(self.add_column(), HostDescription(name, 0))
         self.hosts.append(host)
+        self.devices.add_column()
         self.by_name[name] = host
         self._listed = None
         self.last_contact[host.column] = now
@@ -188,7 +193,7 @@ class HostTable(HostColumns):
         self.links.forget(column)
         self._labelled.clear()
         self._enforcing.clear()
-        self.changed()
+        self.set_devices(host, description.devices)
         return host
 
     def redescribe(self, host: Host, description: HostDescription) -> tuple[str, ...]:
@@ -213,6 +218,7 @@ class HostTable(HostColumns):
         self.links.forget(host.column)
         self._labelled.clear()
         self._enforcing.clear()
+        self.set_devices(host, ())
         self.set_closed(host, cordoned=False, draining=False)
         self.set_condition(host, HostCondition.LEFT)
 
@@ -302,6 +308,23 @@ class HostTable(HostColumns):
         if int(self.bound[host.column]) != bound:
             self.bound[host.column] = bound
             self.touched.append(host.column)
+
+    def set_devices(self, host: Host, devices: tuple[Device, ...]) -> None:
+        """Replace the devices of a host; instances keep what they hold."""
+        if host.description.devices != devices:
+            host.description = replace(host.description, devices=devices)
+        self.devices[host.column] = replace(self.devices[host.column], devices=devices)
+        self.changed()
+
+    def hold(self, host: Host, instance: InstanceId, held: tuple[HeldDevice, ...]) -> None:
+        """Note that an instance holds these devices of a host and no others."""
+        before = self.devices[host.column]
+        if before.held.get(instance, ()) != held:
+            self.devices[host.column] = before.with_held(instance, held)
+
+    def touch(self, host: Host) -> None:
+        """Note that something else than the reservations of one host has changed."""
+        self.touched.append(host.column)
 
     def add_reservation(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
         """Add to the reservations and process count of one host; negative values release.

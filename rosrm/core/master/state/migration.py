@@ -11,6 +11,7 @@ from rosrm.core.master.events import OrderAnswered
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Plain
 from rosrm.model.codec import fields_from_plain, fields_to_plain
+from rosrm.model.devices import HeldDevice
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
 from rosrm.model.values import InstanceId, InstanceStatus
 from rosrm.wording import first_line
@@ -71,6 +72,8 @@ class Migration:
         handoff_reports: instance number to its reports on a handoff.
         taking_over: the destination was ordered to take over without its source.
         results: executor name to its result.
+        source_devices: devices that the source holds; they stay reserved until the commit or the
+            end of the undo, because the source may be started again.
         aim: purpose of the plan. Source and destination of a checkpoint or restore are on one host.
     """
 
@@ -105,6 +108,7 @@ class Migration:
     taking_over: bool = False
     results: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     aim: Aim = Aim.MOVE
+    source_devices: tuple[HeldDevice, ...] = ()
     plain_plan: Plain = field(init=False)
 
     def __post_init__(self) -> None:
@@ -181,6 +185,7 @@ def undo_steps(plan: Plan, turned_at: int) -> Sequence[Step]:
 JOURNALED: Final = (
     "strategy", "cause", "wall", "source_node", "destination_node", "index", "turned_at",
     "committed", "failure", "launched", "suspended", "results", "aim",
+    "source_devices",
 )  # fmt: skip
 _END: Final = ("ordered", "completed", "gone")
 _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")

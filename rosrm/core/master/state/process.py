@@ -13,6 +13,7 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Plain
+from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
 
@@ -77,6 +78,7 @@ class Instance:
         node_name: name of its node, if it differs from the name of the process.
         enforced: names of its limits and scheduling settings that hold, as its slave reports.
         ready_at: time at which the first report of its readiness arrived at this master.
+        devices: devices of its host that it holds.
     """
 
     id: InstanceId
@@ -101,6 +103,7 @@ class Instance:
     node_name: str = ""
     enforced: tuple[str, ...] = ()
     ready_at: float = inf
+    devices: tuple[HeldDevice, ...] = ()
 
     @property
     def is_running(self) -> bool:

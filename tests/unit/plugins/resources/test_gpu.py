@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from rosrm import Device
 from rosrm.errors import ConfigError, SkipPlugin
 from rosrm.testing import probe_context
 from rosrm_resources import gpu
@@ -25,6 +26,8 @@ class FakeNvml:
         self.computing = [{} for _ in devices]
         self.drawing = [{} for _ in devices]
         self.shut_down = 0
+        self.models = ["NVIDIA X"] * len(devices)
+        self.lost = set()
 
     def nvmlInit(self):  # noqa: N802 - the driver's name
         return None
@@ -37,6 +40,14 @@ class FakeNvml:
 
     def nvmlDeviceGetHandleByIndex(self, index):  # noqa: N802
         return index
+
+    def nvmlDeviceGetName(self, handle):  # noqa: N802
+        return self._told(self.models[handle])
+
+    def nvmlDeviceGetUUID(self, handle):  # noqa: N802
+        if handle in self.lost:
+            raise self.NVMLError("GPU is lost")
+        return f"GPU-{handle}"
 
     def nvmlDeviceGetUtilizationRates(self, handle):  # noqa: N802
         return SimpleNamespace(gpu=self._told(self.devices[handle][0]), memory=0)
@@ -110,6 +121,40 @@ def test_gpu_memory_is_shared_where_processes_cannot_be_told_apart(cause):
     probe = GpuProbe(GpuOptions(), nvml, same_pids=not seen)
     assert [one.accounting for one in probe.resources] == ["shared", "shared"]
     assert probe.by_process() == {}
+
+
+def test_each_gpu_is_a_device_by_its_index():
+    """The index is that by which CUDA_VISIBLE_DEVICES selects the GPU."""
+    probe = GpuProbe(GpuOptions(devices=(1, 2)), FakeNvml(*[(0, 0, 8 * GIB)] * 3))
+    about = "NVIDIA X, 8 GiB"
+    assert probe.devices() == [Device("gpu", "1", about=about), Device("gpu", "2", about=about)]
+
+
+def test_a_gpu_with_an_error_of_the_driver_is_missing_until_the_error_is_gone():
+    """The other GPUs are still offered."""
+    nvml = FakeNvml((0, 0, GIB), (0, 0, GIB))
+    probe = GpuProbe(GpuOptions(), nvml)
+    nvml.lost = {1}
+    assert [one.missing for one in probe.devices()] == ["", "NVML: GPU is lost"]
+    nvml.lost = set()
+    assert [one.missing for one in probe.devices()] == ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("models", "labels"),
+    [
+        (["X", "X"], {"gpu.model": "X", "gpu.memory": "8 GiB"}),
+        (["X", "Y"], {"gpu.memory": "8 GiB"}),
+        ([b"X", b"X"], {"gpu.model": "X", "gpu.memory": "8 GiB"}),
+        ([None, None], {"gpu.memory": "8 GiB"}),
+    ],
+    ids=["equal", "different", "an old driver", "not told"],
+)
+def test_labels_of_gpus(models, labels):
+    """Model and memory are labels if they are the same for all GPUs."""
+    nvml = FakeNvml((0, 0, 8 * GIB), (0, 0, 8 * GIB))
+    nvml.models = models
+    assert GpuProbe(GpuOptions(), nvml).labels == labels
 
 
 def test_unknown_device_is_refused():

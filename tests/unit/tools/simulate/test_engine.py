@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.state.process import ProcessPhase
+from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.values import InstanceState
 from rosrm_simulate.workload import Curve, SimulatedLink
 
@@ -161,6 +162,15 @@ def test_of_a_lost_host_the_processes_are_not_forgotten():
 def test_a_process_that_no_host_may_take_is_named_with_the_reason():
     outcome = run([host("a")], [plan("p", required_labels={"gpu": "yes"})], until=5.0)
     assert "gpu" in outcome.never_placed["p"]
+
+
+def test_processes_share_the_devices_of_a_host():
+    """The second job waits for the GPU of the first one."""
+    gpu = Device("gpu", "0")
+    plans = [plan(name, duration=5.0, devices=(DeviceNeed("gpu"),)) for name in ("p", "q")]
+    outcome = run([host("a", devices=(gpu,)), host("b")], plans)
+    assert outcome.finished == 2
+    assert outcome.ends["q"] >= outcome.ends["p"] + 5.0
 
 
 def test_a_cancelled_process_is_neither_finished_nor_waiting():

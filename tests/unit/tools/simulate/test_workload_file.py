@@ -12,6 +12,7 @@ import pytest
 from rosrm.config.kinds import SIMULATION_KEYS
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
+from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.values import Kind
 from rosrm_simulate import workload_file as in_file
 from rosrm_simulate.runs import run
@@ -48,10 +49,12 @@ def load(tmp_path, registry):
 def test_a_workload_says_all_that_is_simulated(load):
     made = load(
         "hosts: [{name: 'h{i}', foreach: {i: 'range(0, 2)'}, memory: 1GiB, cpu: 2, disk: 5GB,"
-        " limits: {memory: 0.5}, joins: 3s, leaves: 1min, lost: true, labels: {x: 1}}]\n"
+        " limits: {memory: 0.5}, joins: 3s, leaves: 1min, lost: true, labels: {x: 1},"
+        " devices: {gpu: [0]}}]\n"
         "processes:\n"
         "  - {name: j, memory: 10MB, growth: 1MB/s, most: 30MB, duration: 20s, cpu: 0.5,"
-        " declares: [memory], needs: {cpu: 0.1}, migration: relaunch, arrives: 2s}\n"
+        " declares: [memory], needs: {cpu: 0.1}, migration: relaunch, arrives: 2s,"
+        " devices: {gpu: 0.5}}\n"
         "  - {name: s, memory: 10MB}\n"
         "model: {start: 1s}\nuntil: 5min\nname: all of it\n"
     ).workload
@@ -64,6 +67,7 @@ def test_a_workload_says_all_that_is_simulated(load):
     assert (job.spec.kind, service.spec.kind) == (Kind.JOB, Kind.SERVICE)
     assert job.spec.needs == {"memory": 1e7, "cpu": 0.1}
     assert job.spec.migration.strategy == "relaunch"
+    assert (first.devices, job.spec.devices) == ((Device("gpu", "0"),), (DeviceNeed("gpu", 0.5),))
     assert [job.memory.at(age) for age in (0, 10, 25)] == [1e7, 2e7, 3e7]
     assert (service.duration, made.until, made.model.start) == (inf, 300.0, 1.0)
 

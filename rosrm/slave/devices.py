@@ -1,0 +1,101 @@
+"""Devices of this host: those of its settings and those that its probes find."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from rosrm.model.devices import MOST_DEVICES, Device
+from rosrm.wording import sanitized
+
+_log = logging.getLogger("rosrm.slave")
+
+#: Seconds between two looks at the devices.
+LOOK_PERIOD: Final = 1.0
+
+_Units = Mapping[str, Device]
+
+
+class DeviceWatch:
+    """Watch on the devices of this host.
+
+    Args:
+        configured: devices by kind; for these kinds they replace what the probes find.
+
+    Attributes:
+        configured: as the argument; a reload replaces them.
+        devices: all devices, as at the last look.
+        lost: kind and unit of each device that was missing in the last two looks, to the reason;
+            a device may be missing for a moment, such as while its driver starts again.
+    """
+
+    def __init__(self, configured: Mapping[str, tuple[Device, ...]]) -> None:
+        self.configured = configured
+        self.devices: tuple[Device, ...] = ()
+        self.lost: Mapping[tuple[str, str], str] = {}
+
+    def look(self, found: Mapping[str, tuple[Device, ...]]) -> bool:
+        """Look at each device once, and log changes; return True if there are any.
+
+        Args:
+            found: name of each probe to the devices that it found last.
+        """
+        before, self.devices = self.devices, tuple(self._all(found))[:MOST_DEVICES]
+        missing = {(one.kind, one.unit) for one in before if one.missing}
+        _log_changes(self.devices, missing)
+        self.lost = {
+            key: one.missing
+            for one in self.devices
+            if one.missing and (key := (one.kind, one.unit)) in missing
+        }
+        return self.devices != before
+
+    def _all(self, found: Mapping[str, tuple[Device, ...]]) -> Iterator[Device]:
+        by_kind: dict[str, dict[str, Device]] = {}
+        for devices in found.values():
+            for device in devices:
+                by_kind.setdefault(device.kind, {}).setdefault(device.unit, device)
+        for kind, configured in self.configured.items():
+            yield from _checked(_joined(one, by_kind.get(kind)) for one in configured)
+        for kind, units in by_kind.items():
+            if kind not in self.configured:
+                yield from _checked(units.values())
+
+
+def _log_changes(devices: Iterable[Device], missing: AbstractSet[tuple[str, str]]) -> None:
+    for one in devices:
+        was_missing = (one.kind, one.unit) in missing
+        if one.missing and not was_missing:
+            _log.info("%s is missing, so no process gets it: %s", one.title, one.missing)
+        elif was_missing and not one.missing:
+            _log.info("%s is there again", one.title)
+
+
+def _joined(device: Device, found: _Units | None) -> Device:
+    """Return a device of the settings with what a probe of its kind tells about it."""
+    if found is None:
+        return device
+    if device.unit not in found:
+        there = ", ".join(found) or "none"
+        return replace(device, missing=f"no probe finds it; found: {there}")
+    other = found[device.unit]
+    return replace(device, path=device.path or other.path, about=other.about, missing=other.missing)
+
+
+def _checked(devices: Iterable[Device]) -> Iterator[Device]:
+    """Yield the devices; one whose file is not there is missing."""
+    for device in devices:
+        fault = device.missing or (_file_fault(device.path) if device.path else "")
+        yield device if fault == device.missing else replace(device, missing=sanitized(fault))
+
+
+def _file_fault(path: str) -> str:
+    try:
+        Path(path).stat()
+    except OSError as error:
+        return f"{path}: {error.strerror or error}"
+    return ""

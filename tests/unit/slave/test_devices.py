@@ -1,0 +1,178 @@
+"""Devices of a slave: those of its settings and of its probes, and what a process gets of them."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from rosrm.core.slave.watches import Memo
+from rosrm.errors import LaunchError
+from rosrm.extensions.made import MadeProbe
+from rosrm.model.devices import Device, DeviceNeed, HeldDevice
+from rosrm.model.values import Assignment, InstanceId, ProcessSpec
+from rosrm.slave.devices import DeviceWatch
+from rosrm.slave.launch.command import launch_order
+from rosrm.slave.launch.environment import ProcessLocation
+from rosrm.slave.launch.launchers import Launchers
+from rosrm.slave.memos import from_memo, to_memo
+from rosrm.slave.sampler import Sampler
+from rosrm.testing import FakeProbe
+
+GPU = Device("gpu", "0", about="a model")
+
+
+# --- the devices of a host -----------------------------------------------------------------------
+
+
+def test_a_device_whose_file_is_gone_is_missing_until_the_file_is_back(tmp_path: Path) -> None:
+    """It is lost after two looks, so that a driver may start again."""
+    path = tmp_path / "video0"
+    watch = DeviceWatch({"camera": (Device("camera", "front", str(path)),)})
+    assert watch.look({})
+    gone = f"{path}: No such file or directory"
+    assert ([one.missing for one in watch.devices], watch.lost) == ([gone], {})
+    assert not watch.look({})
+    assert watch.lost == {("camera", "front"): gone}
+    path.touch()
+    assert watch.look({})
+    assert ([one.missing for one in watch.devices], watch.lost) == ([""], {})
+
+
+def test_the_devices_of_probes_are_those_of_the_host() -> None:
+    """As long as the settings name no unit of their kind."""
+    watch = DeviceWatch({"lidar": (Device("lidar", "lidar", shareable=4),)})
+    watch.look({"gpu": (GPU,), "usb": (Device("imu", "x"),)})
+    assert [one.title for one in watch.devices] == ["lidar", "gpu 0", "imu x"]
+
+
+def test_the_settings_choose_the_units_of_a_kind() -> None:
+    """The probe says which of them are there; without a probe of the kind they are taken as is."""
+    configured = {"gpu": (Device("gpu", "0"), Device("gpu", "7")), "tpu": ()}
+    watch = DeviceWatch(configured)
+    watch.look({"gpu": (GPU, Device("gpu", "1")), "tpu": (Device("tpu", "0"),)})
+    assert watch.devices == (
+        GPU, Device("gpu", "7", missing="no probe finds it; found: 0, 1"),
+    )  # fmt: skip
+    watch.look({})
+    assert watch.devices == configured["gpu"]
+
+
+class Finder(FakeProbe):
+    """A probe that finds devices, or answers something else."""
+
+    def __init__(self, found: object) -> None:
+        super().__init__(cpu=0.5)
+        self.found = found
+
+    def devices(self) -> object:
+        if isinstance(self.found, Exception):
+            raise self.found
+        return self.found
+
+
+def sampled(probe: FakeProbe) -> Sampler:
+    sampler = Sampler([MadeProbe("finder", probe, tuple(probe.resources), 0.1, 1.0)])
+    sampler.first()
+    return sampler
+
+
+def test_a_probe_that_cannot_read_still_says_which_devices_are_there() -> None:
+    """The driver may refuse a reading because of the device that is missing."""
+    probe = Finder([GPU])
+    probe.fault = OSError("no answer")
+    sampler = sampled(probe)
+    assert sampler.devices == {"finder": (GPU,)}
+    sampler.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (OSError("no bus"), "devices() raised OSError: no bus"),
+        (7, "devices() answered a int; a list of Devices is required"),
+        (["gpu"], "Device is required"),
+        ([GPU, GPU], "devices(): gpu 0 is given twice"),
+        ([Device("gpu", "../x")], "devices(): gpu: '../x' cannot be a unit"),
+    ],
+)
+def test_a_probe_that_answers_no_devices_is_stale_with_the_reason(answer, reason) -> None:
+    """Its readings are used no longer, and the devices that it found before stay."""
+    probe = Finder([GPU])
+    sampler = sampled(probe)
+    probe.found = answer
+    later = time.monotonic() + 1.0
+    sampler.latest(later)
+    assert sampler.settle(5.0)
+    (report,) = sampler.latest(later).reports
+    assert reason in str(report)
+    assert sampler.devices == {"finder": (GPU,)}
+    sampler.close()
+
+
+# --- what a process gets -------------------------------------------------------------------------
+
+
+def order(tmp_path: Path, held: tuple[HeldDevice, ...], *there: Device, base=None, **fields):
+    """Return the order to start a process that holds devices."""
+    fields = {"command": ("x",), "devices": tuple(DeviceNeed(one.kind) for one in held), **fields}
+    spec, instance = ProcessSpec("p", **fields), InstanceId("p", 1)
+    where = ProcessLocation("h", "c", "/s", devices=there)
+    return launch_order(
+        Assignment(instance, spec, 1, "p", devices=held), base or {}, "python", where=where,
+        state_directory=tmp_path, launchers=Launchers(),
+    )  # fmt: skip
+
+
+def test_environment_of_a_process_with_devices(tmp_path: Path) -> None:
+    """Paths, or names of units without a path; CUDA sees the units by the driver's index."""
+    held = (HeldDevice("gpu", "1"), HeldDevice("gpu", "0", 0.5), HeldDevice("usb-cam", "top"))
+    camera = Device("usb-cam", "top", "/dev/video0")
+    base = {"ROSRM_DEVICE_OLD": "x", "CUDA_VISIBLE_DEVICES": "3"}
+    environment = order(
+        tmp_path, held, Device("gpu", "0"), Device("gpu", "1"), camera, base=base,
+        devices=(), environment={"CUDA_VISIBLE_DEVICES": "5"},
+    ).environment  # fmt: skip
+    assert {name: value for name, value in environment.items() if "DEVICE" in name} == {
+        "ROSRM_DEVICE_GPU": "1,0", "ROSRM_DEVICE_USB_CAM": "/dev/video0",
+        "CUDA_VISIBLE_DEVICES": "1,0", "CUDA_DEVICE_ORDER": "PCI_BUS_ID",
+    }  # fmt: skip
+
+
+def test_a_process_without_devices_keeps_the_variables_of_its_slave(tmp_path: Path) -> None:
+    """It may use a GPU without asking for one, as before."""
+    environment = order(tmp_path, (), base={"CUDA_VISIBLE_DEVICES": "3"}).environment
+    assert environment["CUDA_VISIBLE_DEVICES"] == "3"
+
+
+def test_devices_in_arguments_and_parameters(tmp_path: Path) -> None:
+    """Other braces stay as they are."""
+    launched = order(
+        tmp_path, (HeldDevice("camera", "front"),), Device("camera", "front", "/dev/video0"),
+        arguments=("--source={device.camera}", "{device.gpu}{x}"), ros=True,
+        parameters={"source": "{device.camera}", "all": ["{device.camera}"], "rate": 5},
+    )  # fmt: skip
+    assert launched.argv[1:3] == ("--source=/dev/video0", "{device.gpu}{x}")
+    file = launched.argv[launched.argv.index("--params-file") + 1]
+    (parameters,) = yaml.safe_load(Path(file).read_text()).values()
+    assert parameters["ros__parameters"] == {
+        "source": "/dev/video0", "all": ["/dev/video0"], "rate": 5,
+    }  # fmt: skip
+
+
+def test_an_assignment_without_its_device_is_refused(tmp_path: Path) -> None:
+    """The process would use a device that another process holds."""
+    with pytest.raises(LaunchError, match="p#1: it was assigned without a camera"):
+        order(tmp_path, (), devices=(DeviceNeed("camera"),))
+    with pytest.raises(LaunchError, match="p#1: camera front is no device of this host now"):
+        order(tmp_path, (HeldDevice("camera", "front"),), Device("camera", "rear"))
+
+
+def test_a_later_run_of_the_slave_knows_the_devices_of_an_instance() -> None:
+    """The supervisor stores them; a memo of an earlier version has none."""
+    memo = Memo(devices=(HeldDevice("gpu", "0", 0.5),))
+    assert from_memo(to_memo(memo)) == memo
+    assert from_memo(json.dumps({"awaited": None, "watch": None})) == Memo()
