@@ -109,11 +109,15 @@ def main() -> None:
 def _with_flow(folder: Path, seconds: float, *, learn: bool) -> tuple[float, float]:
     """Return the cores that a slave uses beside two nodes, and the learned rate of their flow."""
     nodes = [
-        ProcessSpec(name, command=(sys.executable, "-c", _NODE, name), ros=True)
+        ProcessSpec(
+            name, command=(sys.executable, "-c", _NODE, name), ros=True, needs={"memory": _MIB}
+        )
         for name in ("camera", "viewer")
     ]
+    # Without a reading of the CPU, so that the load of the machine does not keep the nodes away.
+    host = HostConfig(host="host0", probes={"memory": {}})
     settings = ClusterConfig(network=NetworkSettings(period=2.0, learn=learn))
-    with LocalCluster(folder, settings, [HostConfig(host="host0")]) as cluster:
+    with LocalCluster(folder, settings, [host]) as cluster:
         slave = psutil.Process(cluster.slaves["host0"].process.pid)
         cluster.client.submit(nodes)
         while any(row.state != "running" for row in cluster.client.list(processes=True).processes):
