@@ -71,6 +71,9 @@ _ELSEWHERE: Final = {
 #: Similarity from which a key counts as misspelt, not as a key of another tool.
 _MISSPELT: Final = 0.8
 
+#: Allowed values that are written otherwise in YAML.
+_IN_YAML: Final = {"": '""', "True": "true", "False": "false"}
+
 #: Wording of each bound of annotated_types.
 _BOUNDS: Final = {
     "greater_than": "greater than",
@@ -213,7 +216,7 @@ def _cause(error: ValueError, path: tuple[str | int, ...]) -> str:
 
 def _not_one_of(given: Any, expected: str) -> str:
     words = [word.strip().strip("'") for word in expected.replace(" or ", ", ").split(",")]
-    allowed = [word or '""' for word in words]
+    allowed = [_IN_YAML.get(word, word) for word in words]
     return f"{described(given)} is unknown{near(str(given), allowed)}"
 
 

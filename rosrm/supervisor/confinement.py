@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
@@ -72,7 +73,7 @@ class Confinement:
             pid, late = self._spawn(key, limits, spawn, realtime)
         own.update(late)
         if limits.nice and "nice" not in faults:
-            own.update(_set_nice(pid, limits.nice))
+            own.update(_nice_fault(pid, limits))
         enforced = tuple(name for name in wanted if name not in faults and name not in own)
         return Confined(pid, enforced, by_reason(own.items()))
 
@@ -155,12 +156,20 @@ def _on_cpus(cpus: tuple[int, ...], own: set[int]) -> Iterator[None]:
             os.sched_setaffinity(0, own)
 
 
-def _set_nice(leader: int, nice: int) -> dict[str, str]:
-    """Set the niceness of a process group that has just begun; return the fault, if any."""
+def _nice_fault(pid: int, limits: LimitRule) -> dict[str, str]:
+    """Return why a process that was just started has another niceness, if it has.
+
+    Raises:
+        SpawnError: the niceness is required; the process is killed.
+    """
     try:
-        os.setpriority(os.PRIO_PGRP, leader, nice)
-    except ProcessLookupError:
+        actual = os.getpriority(os.PRIO_PROCESS, pid)
+    except ProcessLookupError:  # it has ended
         return {}
-    except OSError as error:
-        return {"nice": f"niceness {nice} cannot be set: {error.strerror}"}
-    return {}
+    if actual == limits.nice:
+        return {}
+    if limits.required:
+        os.kill(pid, signal.SIGKILL)
+    fault = {"nice": f"it is {actual}, because CAP_SYS_NICE is required for {limits.nice}"}
+    _check_required(limits, fault)
+    return fault

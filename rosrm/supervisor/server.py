@@ -234,7 +234,7 @@ class Server:
             def start(group: int, scheduler: spawn.Scheduler | None) -> int:
                 return spawn.spawn(
                     launch.argv, environment, directory, self._null, log, group=group,
-                    scheduler=scheduler,
+                    scheduler=scheduler, nice=launch.limits.nice,
                 )  # fmt: skip
 
             with score_of_children(), descriptors.limited(self._files):

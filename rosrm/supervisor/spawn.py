@@ -46,7 +46,7 @@ Scheduler = tuple[int, os.sched_param]
 
 def spawn(
     argv: tuple[str, ...], environment: Mapping[str, str], directory: str, null: int, log: int, *,
-    group: int = -1, scheduler: Scheduler | None = None,
+    group: int = -1, scheduler: Scheduler | None = None, nice: int = 0,
 ) -> int:  # fmt: skip
     """Start a process and return its pid. Raises SpawnError.
 
@@ -57,15 +57,16 @@ def spawn(
         log: descriptor that becomes its standard output and error.
         group: descriptor of its control group of version 2; -1: that of this process.
         scheduler: None: that of this process.
+        nice: niceness; 0: that of this process. Without the right to it, that of this process.
     """
     _enter(directory)
     path = find_executable(argv[0], environment)
     try:
-        if group >= 0:
+        if group >= 0 or nice:  # `posix_spawn` can set neither
             from rosrm.supervisor.spawn_into import spawn_into  # noqa: PLC0415 - loads 400 KiB
 
             program = (path, argv, environment)
-            return spawn_into(group, program, null=null, log=log, scheduler=scheduler)
+            return spawn_into(group, program, null=null, log=log, scheduler=scheduler, nice=nice)
         return os.posix_spawn(
             path,
             argv,

@@ -1,4 +1,4 @@
-"""Start of a process in a control group of version 2: clone3 with CLONE_INTO_CGROUP.
+"""Start of a process in a control group of version 2 (clone3 with CLONE_INTO_CGROUP), or niced.
 
 Neither Python nor `posix_spawn` of older C libraries can do that, so this module calls the kernel.
 The child shares no memory with the supervisor, unlike one of `posix_spawn`, and executes this
@@ -8,6 +8,7 @@ the group itself, which takes some 10 ms from Linux 6.0 on.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -36,14 +37,14 @@ _libc.syscall.restype = ctypes.c_long
 
 def spawn_into(
     group: int, program: tuple[str, Sequence[str], Mapping[str, str]], *, null: int, log: int,
-    scheduler: tuple[int, os.sched_param] | None,
+    scheduler: tuple[int, os.sched_param] | None, nice: int = 0,
 ) -> int:  # fmt: skip
     """Start a session leader in a group, and return its pid.
 
     Args:
-        group: descriptor of the group's directory.
+        group: descriptor of the group's directory; -1: the group of this process.
         program: its path, arguments and environment.
-        null, log, scheduler: as in `spawn.spawn`.
+        null, log, scheduler, nice: as in `spawn.spawn`.
 
     Raises:
         OSError: the group is gone, the scheduling is not permitted (EPERM), or the program cannot
@@ -57,6 +58,9 @@ def spawn_into(
         try:
             if not inside:
                 os.write(os.open("cgroup.procs", os.O_WRONLY, dir_fd=group), b"0")
+            if nice:
+                with contextlib.suppress(OSError):  # the caller compares the result
+                    os.setpriority(os.PRIO_PROCESS, 0, nice)
             _become(encoded, null, log, scheduler)
         except OSError as error:
             os.write(told, str(error.errno).encode())
@@ -88,6 +92,8 @@ def _encoded(path: str, argv: Sequence[str], environment: Mapping[str, str]) -> 
 
 def _fork(group: int) -> tuple[int, bool]:
     """Return the pid, 0 in the child, and True if the child is in the group already."""
+    if group < 0:
+        return os.fork(), True
     wanted = _CloneArguments(
         flags=_CLONE_INTO_CGROUP, exit_signal=signal.SIGCHLD.value, cgroup=group
     )

@@ -60,6 +60,10 @@ def answered(environment: Environment, line: str):
     return json.loads(result.stdout) if result.returncode == 0 else None
 
 
+def labels_of(environment: Environment, host: str) -> dict[str, str]:
+    return {row["name"]: row["labels"] for row in answered(environment, "hosts")}[host]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_new_plugins_of_all_kinds_work_on_a_live_cluster(environment):
@@ -98,8 +102,12 @@ def test_new_plugins_of_all_kinds_work_on_a_live_cluster(environment):
         assert {
             kind.value: states[kind.value, f"my-{kind.value}"] for kind in Kind
         } == dict.fromkeys([kind.value for kind in Kind], "selected")
-        labels = answered(environment, "hosts")[0]["labels"]
+        labels = labels_of(environment, "a")
         assert list(labels) == ["my-probe.kernel"]
+        with (settings / "a.yaml").open("a", encoding="utf-8") as file:
+            file.write('labels: {floor: "2"}\n')
+        done(environment, "rosrm reload")
+        assert labels_of(environment, "a") == {**labels, "floor": "2"}
 
         submit = "rosrm submit --wait --timeout 60s rosrm-my-migration/work.yaml"
         done(environment, f"{submit} || {{ rosrm explain sleeper; false; }}")

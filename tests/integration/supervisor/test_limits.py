@@ -110,8 +110,10 @@ def test_cpus_scheduling_and_niceness_are_set_before_the_program_runs(host, clie
         assert (status.enforced, status.message) == (("realtime",), "")
         assert host.log("quick").read_text().endswith(f" {os.SCHED_RR} 7\n")
 
-    pid = host.sleeper(client, "kind", limits=LimitRule(nice=5))
-    assert os.getpriority(os.PRIO_PROCESS, pid) == 5
+    nice = os.nice(0) + 3
+    polite = host.python("polite", "import os; print(os.nice(0))", limits=LimitRule(nice=nice))
+    assert host.run(client, polite).enforced == ("nice",)
+    assert host.log("polite").read_text() == f"{nice}\n"
 
 
 @pytest.mark.parametrize("required", [True, False])

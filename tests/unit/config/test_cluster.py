@@ -405,3 +405,20 @@ def test_without_defaults_of_processes_there_are_none(file, text):
 )
 def test_wrong_defaults_of_processes_have_their_place(refusal, process, fault):
     assert fault in refusal(load_cluster, f"defaults: {{process: {process}}}")
+
+
+@pytest.mark.parametrize("given", ["maybe", "true"])
+def test_the_allowed_kinds_of_preemption_are_named_as_a_file_has_them(refusal, given):
+    """One of them is a boolean."""
+    said = refusal(load_cluster, f"queue: {{preemption: {given}}}")
+    assert "1:21: queue.preemption: " in said
+    assert said.rstrip().endswith("is unknown. Allowed: move, requeue, false")
+
+
+def test_preemption_can_be_switched_off(tmp_path):
+    """A boolean, and not the text."""
+    path = tmp_path / "c.yaml"
+    path.write_text("queue: {preemption: false}\n")
+    config = load_cluster(path)
+    assert config.core().preemption is False
+    assert ClusterConfig.from_json(config.to_json()).queue.preemption is False

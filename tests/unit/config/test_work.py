@@ -346,6 +346,8 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
         ("command: x, module: y, prioritty: 1", "module and command are given; give one of"),
         ("command: x, health: {topic: /scan}, prioritty: 1", "health.topic and health.rate"),
         ("command: x, isolation: {after: 1s}, priority: high", "isolation.after requires"),
+        ("command: x, time_limit: 1s, prioritty: 1", "time_limit: only a job has one"),
+        ("command: x, reschedule: {delay: 1s}, prioritty: 1", "reschedule.delay requires"),
         ("command: x, migration: relunch, prioritty: 1", "unknown migration strategy 'relunch'"),
         ("command: x, migration: {strategy: relunch, overlapp: true}, prioritty: 1",
          "unknown migration strategy 'relunch'"),

@@ -221,6 +221,8 @@ NONSENSE_IN_SPECS = {
     "readiness": lambda m: setattr(m.readiness, "kind", "soon"),
     "a readiness without end": lambda m: setattr(m.readiness, "timeout", NAN),
     "a grace without end": lambda m: setattr(m.stop, "interrupt_grace", INF),
+    "a time limit without end": lambda m: setattr(m, "time_limit", NAN),
+    "a delay before another host": lambda m: setattr(m.reschedule, "delay", -1.0),
     "a loss of centuries": lambda m: setattr(m.host_loss, "delay", 1e9),
     "an isolation of centuries": lambda m: setattr(m.isolation, "after", 1e9),
     "a rate without end": lambda m: setattr(m.health, "rate", INF),

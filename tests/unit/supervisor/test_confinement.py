@@ -6,6 +6,8 @@ import contextlib
 import errno
 import os
 import shutil
+import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from rosrm.supervisor.confinement import Confinement
 from rosrm.supervisor.group_trees import Tree
 from rosrm.supervisor.instance_groups import InstanceGroups, limit_files
 from rosrm.supervisor.spawn import ScheduleRefused, SpawnError
+from tests.waiting import PATIENCE
 
 KEY = ("camera", 1)
 
@@ -68,6 +71,29 @@ def test_a_higher_niceness_needs_no_rights(confinement) -> None:
     confinement.missing = {"nice": "no rights"}
     assert confinement.start(KEY, LimitRule(nice=5, required=True), started)[1] == ("nice",)
     assert confinement.start(KEY, LimitRule(nice=-5), started)[1] == ()
+
+
+@pytest.mark.parametrize("required", [True, False])
+def test_a_niceness_that_the_kernel_refuses(confinement, required: bool) -> None:
+    """A process that requires it is killed, because it runs with another one."""
+    processes = []
+
+    def start(_group: int, _scheduler: object) -> int:
+        processes.append(subprocess.Popen(["sleep", "1000"]))
+        return processes[0].pid
+
+    limits = LimitRule(nice=-17, required=required)
+    note = f"nice: it is {os.nice(0)}, because CAP_SYS_NICE is required for -17"
+    try:
+        if required:
+            with pytest.raises(SpawnError, match=note):
+                confinement.start(KEY, limits, start)
+            assert processes[0].wait(PATIENCE) == -signal.SIGKILL
+        else:
+            assert confinement.start(KEY, limits, start)[1:] == ((), note)
+    finally:
+        processes[0].kill()
+        processes[0].wait()
 
 
 @pytest.fixture
