@@ -270,12 +270,8 @@ class ProcessSpec:
         time_limit: seconds from the first start of a job on a host until the job has failed, with
             restarts and moves; its return to the queue begins them again. 0: no limit.
         cpus: numbers of the CPUs that it may use; (): all.
-<<<<<<< HEAD
-        nice: its niceness, -20..19.
-        devices: devices that it holds while it runs, each kind once.
-=======
         nice: its niceness, -20..19; 0: that of the slave.
->>>>>>> limits
+        devices: devices that it holds while it runs, each kind once.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
