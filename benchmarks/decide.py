@@ -14,8 +14,10 @@ master's runtime, without the transport and the journal:
 - `constrained`: 1,000 processes submitted at once to 1,000 hosts. `plain`: ten different demands by
   turns; `applications`: the same demands with labels and neighbours, in applications of ten
   processes that belong together; `spread`: the same demands, in groups of 150 processes that keep
-  apart; `devices`: the same demands, half of them with a camera or a share of a GPU. Assignments a
-  second, and how many times as long as `plain` each takes.
+  apart; `devices`: the same demands, half of them with a camera or a share of a GPU; `links`:
+  `applications` with a flow from each member to its driver, on hosts with measured links;
+  `network`: the same with the policy `network` in the chain. Assignments a second, and how many
+  times as long as `plain` each takes.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.placement import PlacementPlugins, ScoringLink
 from rosrm.model.devices import Device, DeviceNeed
+from rosrm.model.links import Interface
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
@@ -45,6 +48,7 @@ from rosrm.model.values import (
     ProcessSpec,
     ResourceDescription,
 )
+from rosrm_scoring.network import Network, NetworkOptions
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 
 _HOSTS = (10, 100, 1_000, 10_000)
@@ -67,15 +71,18 @@ class Bench:
 
     Args:
         hosts: how many.
+        links: True: the links of all hosts are measured.
+        network: True: the policy `network` is in the chain.
     """
 
-    def __init__(self, hosts: int) -> None:
+    def __init__(self, hosts: int, *, links: bool = False, network: bool = False) -> None:
         self.now = 0.0
         self._sequence = 0
         self._hosts = hosts
         self._random = np.random.default_rng(hosts)
         policy = ScoringLink("weighted", Weighted(WeightedOptions()))
-        placement = PlacementPlugins((policy,))
+        further = ScoringLink("network", Network(NetworkOptions()), 0.5, ("talks_to",))
+        placement = PlacementPlugins((policy, further) if network else (policy,))
         self.state = MasterState(CoreSettings(), placement, {}, epoch=1)
         described = tuple(
             ResourceDescription(name, unit, capacity)
@@ -89,6 +96,9 @@ class Bench:
                 f"h{number}", number + 1, labels=labels, resources=described, devices=_DEVICES
             )
             self.step(happened.HostRegistered(number, description))
+        for number in range(hosts) if links else ():
+            peers = {(number + step) % hosts: (0, 0.001) for step in range(1, _RACKS)}
+            self.state.hosts.links.store(number, [Interface(125e6)], 0.9, peers)
         self.read()
         for number in range(hosts):
             self.step(happened.ProcessRequested(number, number + 1, number + 1))
@@ -141,8 +151,8 @@ def rate(hosts: int, runs: int, spec_of: SpecOf, count: int = _AT_ONCE) -> float
     return median(rate_once(hosts, spec_of, count) for _ in range(runs))
 
 
-def rate_once(hosts: int, spec_of: SpecOf, count: int) -> float:
-    bench = Bench(hosts)
+def rate_once(hosts: int, spec_of: SpecOf, count: int, **bench_options: bool) -> float:
+    bench = Bench(hosts, **bench_options)
     bench.submit([ProcessSpec("first", needs={"memory": 2.0**26})])
     gc.collect()
     took, assigned = bench.submit([spec_of(number) for number in range(count)])
@@ -151,11 +161,16 @@ def rate_once(hosts: int, spec_of: SpecOf, count: int) -> float:
 
 
 def constrained(runs: int) -> dict[str, dict[str, float]]:
-    """Return the rates with labels, neighbours and devices, by turns with the plain one."""
-    rates: dict[str, list[float]] = {"plain": [], "applications": [], "spread": [], "devices": []}
+    """Return the rates with labels, neighbours, devices and links, by turns with the plain one."""
+    cases: dict[str, tuple[SpecOf, dict[str, bool]]] = {
+        "plain": (mixed, {}), "applications": (of_application, {}), "spread": (spread, {}),
+        "devices": (on_device, {}), "links": (with_flow, {"links": True}),
+        "network": (with_flow, {"links": True, "network": True}),
+    }  # fmt: skip
+    rates: dict[str, list[float]] = {name: [] for name in cases}
     for _ in range(runs):
-        for name, spec_of in zip(rates, (mixed, of_application, spread, on_device), strict=True):
-            rates[name].append(rate_once(_CONSTRAINED, spec_of, _CONSTRAINED))
+        for name, (spec_of, options) in cases.items():
+            rates[name].append(rate_once(_CONSTRAINED, spec_of, _CONSTRAINED, **options))
     plain = median(rates["plain"])
     return {
         name: {"assignments_per_s": round(median(found)), "times": round(plain / median(found), 2)}
@@ -189,6 +204,13 @@ def of_application(number: int) -> ProcessSpec:
     else:
         rule = NeighbourRule("apart", group=f"workers {first}", by="rack")
     return replace(spec, neighbours=(rule,))
+
+
+def with_flow(number: int) -> ProcessSpec:
+    """Return a member of an application that exchanges 1 kB/s with its driver."""
+    driver = number - number % _APPLICATION
+    flow = {} if number == driver else {f"p{driver}": 1e3}
+    return replace(of_application(number), talks_to=flow)
 
 
 def spread(number: int) -> ProcessSpec:

@@ -3,6 +3,9 @@
 A registered slave at 10 Hz without processes, with its supervisor, and in the same run a bare rclpy
 node that publishes the same message at 10 Hz from a timer. CPU time covers all threads over the
 measured time. Memory is PSS, so that pages shared by several processes count once.
+
+Then a slave with two nodes between which 30 MB/s flow, with and without `network.learn`: the CPU
+time of the slave alone. The first sample of the flow is within the measured time.
 """
 
 from __future__ import annotations
@@ -18,7 +21,8 @@ import psutil
 
 from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
-from rosrm.config.settings import HostConfig
+from rosrm.config.settings import ClusterConfig, HostConfig, NetworkSettings
+from rosrm.model.values import ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
 
 _BARE = """
@@ -33,6 +37,24 @@ message = SealedReading(format=1)
 node.create_timer(0.1, lambda: publisher.publish(message))
 print("ready", flush=True)
 rclpy.spin(node)
+"""
+_NODE = """
+import sys, rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+
+rclpy.init()
+node = Node("unnamed")
+if sys.argv[1] == "camera":
+    publisher = node.create_publisher(String, "image", 1)
+    image = String(data="x" * 1_000_000)
+    node.create_timer(1 / 30, lambda: publisher.publish(image))
+else:
+    node.create_subscription(String, "image", lambda _: None, 1)
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
 """
 _MIB = 2.0**20
 
@@ -76,7 +98,31 @@ def main() -> None:
         finally:
             bare.terminate()
             bare.wait(10.0)
+    for learn in (False, True):
+        with tempfile.TemporaryDirectory(prefix="rosrm-slave-cost-") as folder:
+            used, rate = _with_flow(Path(folder), seconds, learn=learn)
+        result[f"slave_cpu_beside_a_flow{'_learned' if learn else ''}"] = used
+        result["learned_rate"] = rate
     print_report("slave_cost", result, runs=1)
+
+
+def _with_flow(folder: Path, seconds: float, *, learn: bool) -> tuple[float, float]:
+    """Return the cores that a slave uses beside two nodes, and the learned rate of their flow."""
+    nodes = [
+        ProcessSpec(name, command=(sys.executable, "-c", _NODE, name), ros=True)
+        for name in ("camera", "viewer")
+    ]
+    settings = ClusterConfig(network=NetworkSettings(period=2.0, learn=learn))
+    with LocalCluster(folder, settings, [HostConfig(host="host0")]) as cluster:
+        slave = psutil.Process(cluster.slaves["host0"].process.pid)
+        cluster.client.submit(nodes)
+        while any(row.state != "running" for row in cluster.client.list(processes=True).processes):
+            cluster.client.spin(0.2)
+        before, begun = cpu_seconds([slave]), time.monotonic()
+        while time.monotonic() - begun < seconds:
+            cluster.client.spin(0.5)
+        used = (cpu_seconds([slave]) - before) / (time.monotonic() - begun)
+        return used, sum(one["rate"] for one in cluster.client.explain("viewer")["flows"])
 
 
 def _measure(

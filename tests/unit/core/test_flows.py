@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from rosrm.core.master.scheduling.traffic import flow_view, keeping_limits
+from rosrm.core.master.state.demand import Flow, Traffic
+from rosrm.core.master.state.links import Crossing, LinkTable
 from rosrm.model.links import Interface
 from rosrm.model.values import ProcessSpec
 from rosrm_scoring.network import Network, NetworkOptions
@@ -264,3 +269,36 @@ def test_the_load_of_links_equals_the_sum_over_all_flows() -> None:
         assert crossing.rate == cluster.state.flows.between(one, two).rate
         expected += 2 * crossing.rate
     assert links.flowing.sum() == pytest.approx(expected)
+
+
+@given(st.data())
+def test_mask_and_view_agree_on_the_hosts_within_limits(data: st.DataObject) -> None:
+    """The fast mask over all hosts is what the view says of each host."""
+    hosts = data.draw(st.integers(2, 6))
+    links, number = LinkTable(), st.integers(0, hosts - 1)
+    for column in data.draw(st.lists(number, unique=True)):
+        peers = data.draw(st.dictionaries(number.filter(lambda one, own=column: one != own),
+                                          st.tuples(st.integers(0, 1), st.just(0.01))))  # fmt: skip
+        rates = data.draw(
+            st.lists(st.sampled_from([2.0, 5.0, float("nan")]), min_size=2, max_size=2)
+        )
+        carried = [Interface(rate, data.draw(st.sampled_from([0.0, 1.0]))) for rate in rates]
+        links.store(column, carried, data.draw(st.sampled_from([0.5, 1.0])), peers)
+    rate = st.sampled_from([0.5, 1.0, 3.0])
+    flow = st.builds(
+        lambda at, much, learned: Flow("q", f"h{at}", at, much, True, learned),
+        number, rate, st.booleans(),
+    )  # fmt: skip
+    flows = tuple(data.draw(st.lists(flow, min_size=1, max_size=4)))
+    counted = []
+    for pair in range(data.draw(st.integers(0, 3))):
+        here, there = data.draw(st.tuples(number, number).filter(lambda two: two[0] != two[1]))
+        links.note(pair, Crossing(here, there, data.draw(rate)))
+        counted += [links.crossings[pair]] * data.draw(st.booleans())
+    traffic, empty = Traffic(flows, tuple(counted)), data.draw(st.booleans())
+    mask = keeping_limits(links, traffic, hosts, empty=empty)
+    view = flow_view(links, traffic, np.arange(hosts), empty=empty)
+    expected = ~view.is_over().any(axis=1)
+    assert expected.tolist() == ([True] * hosts if mask is None else mask.tolist())
+    for row, over in zip(*np.nonzero(view.is_over()), strict=True):
+        assert "would cross" in view.describe(int(row), int(over))

@@ -16,7 +16,7 @@ from rosrm.core.master.state.links import MOST_HOSTS, Crossing, LinkTable
 from rosrm.model.links import Interface, LinkReport, report_from_json
 from rosrm.model.orders import MeasureLinks
 from tests.drawing import drawn
-from tests.unit.core.cluster import Cluster, Machine, node, process
+from tests.unit.core.cluster import Cluster, Machine, movable, node, process
 
 MB = 1e6
 SETTINGS = {"link_period": 1.0, "learn_flows": True}
@@ -246,3 +246,18 @@ def test_a_learned_flow_survives_a_restart_and_ends_with_its_process() -> None:
     cluster.cancel("camera")
     cluster.wait(2.0)
     assert learned(cluster, "viewer") == {}
+
+
+def test_a_learned_flow_counts_as_at_most_half_a_link() -> None:
+    """Two nodes that exchange more in the memory of one host can leave it one after the other."""
+    flows: dict[int, dict[str, float]] = {}
+    cluster = Cluster(measuring("a", flows), measuring("b", flows), **SETTINGS)
+    cluster.set_host("b", "cordon")
+    cluster.submit(movable("camera", ros=True), movable("viewer", ros=True))
+    for name in ("camera", "viewer"):
+        cluster.discover(name, on="a")
+    flows[cluster["viewer"].owner] = {"/camera": 500 * MB}
+    cluster.wait(4.0)
+    assert learned(cluster, "viewer") == {"camera": 500 * MB}
+    cluster.set_host("b", "uncordon")
+    assert cluster.migrate("viewer", "b").accepted

@@ -159,7 +159,7 @@ def cut(host: Host, direction: Direction = Way.BOTH, name: Named = "lab") -> Non
 
 @lab.command()
 def heal(host: Host, name: Named = "lab") -> None:
-    """End the cut, the loss and the delay of a host."""
+    """End the cut, the loss, the delay and the rate of a host."""
     opened(name).heal(host)
     _say_link(name, host)
 
@@ -189,6 +189,20 @@ def delay(
 ) -> None:
     """Delay packets to and from a host; 0 ends it. Needs a kernel with netem."""
     opened(name).delay(host, _quantity("duration", time, "TIME"), direction.value)
+    _say_link(name, host)
+
+
+@lab.command()
+def rate(
+    host: Host,
+    limit: Annotated[
+        str, typer.Argument(metavar="RATE", help="Bytes a second that pass, such as 5MB/s.")
+    ],
+    direction: Direction = Way.BOTH,
+    name: Named = "lab",
+) -> None:
+    """Drop the packets to and from a host beyond a rate; 0 ends it."""
+    opened(name).rate(host, _quantity("rate", limit, "RATE"), direction.value)
     _say_link(name, host)
 
 

@@ -20,7 +20,7 @@ from rosrm_lab.host import DATA, entrance
 from rosrm_lab.plan import HostPlan, LabPlan, check_name, check_usable, switch_namespace
 from rosrm_lab.status import HostStatus, host_status
 from rosrm_lab.store import Birth, LabRecord
-from rosrm_lab.wires import Direction, check_delay, check_loss
+from rosrm_lab.wires import Direction, check_delay, check_loss, check_rate
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -299,9 +299,14 @@ class Lab:
         check_delay(seconds)
         self._change_link(host, direction, delay=seconds)
 
+    def rate(self, host: str, rate: float, direction: Direction = "both") -> None:
+        """Drop the packets to and from a host beyond a rate, bytes a second; 0 ends it."""
+        check_rate(rate)
+        self._change_link(host, direction, rate=rate)
+
     def heal(self, host: str) -> None:
-        """End cuts, losses and delays of a host."""
-        self._change_link(host, "both", cut=False, loss=0.0, delay=0.0)
+        """End cuts, losses, delays and rates of a host."""
+        self._change_link(host, "both", cut=False, loss=0.0, delay=0.0, rate=0.0)
 
     def kill(self, host: str) -> None:
         """Cut a host's power: all its processes end at once, and send nothing more.

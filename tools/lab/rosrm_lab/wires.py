@@ -7,6 +7,7 @@ from dataclasses import astuple, dataclass, field, replace
 from typing import Any, Final, Literal
 
 from rosrm.errors import ConfigError
+from rosrm.wording import amount
 
 #: "in": packets to the host; "out": packets from the host.
 Direction = Literal["in", "out", "both"]
@@ -17,6 +18,12 @@ _TABLE: Final = "rosrm_lab"
 _DICE: Final = 1_000_000
 #: Seconds; netem keeps microseconds in 32 bits.
 _MOST_DELAY: Final = 60.0
+#: Bytes a second.
+_LEAST_RATE: Final = 1e3
+_MOST_RATE: Final = 1e11
+#: Seconds of the rate that may pass at once, and bytes at least: a large message is one burst.
+_BURST: Final = 0.1
+_LEAST_BURST: Final = 65_536
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +34,13 @@ class Wire:
         cut: nothing passes.
         loss: fraction of the packets that are lost, each by chance.
         delay: seconds by which each packet is late.
+        rate: bytes a second that pass, and packets beyond are lost; 0: no limit.
     """
 
     cut: bool = False
     loss: float = 0.0
     delay: float = 0.0
+    rate: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +96,13 @@ def check_delay(seconds: float) -> None:
         raise ConfigError(f"delay {seconds:g} s is not within 0..{_MOST_DELAY:g} s")
 
 
+def check_rate(rate: float) -> None:
+    """Raise `ConfigError` for an impossible rate."""
+    if rate and not _LEAST_RATE <= rate <= _MOST_RATE:
+        allowed = f"{_LEAST_RATE / 1e3:g} kB/s to {_MOST_RATE / 1e9:g} GB/s, and 0 for no limit"
+        raise ConfigError(f"rate {rate:g} B/s; allowed: {allowed}")
+
+
 def ruleset(links: Mapping[str, Link]) -> str:
     """Return the whole firewall of the switch, for `nft -f`, which applies it atomically.
 
@@ -117,6 +133,10 @@ def _rules(port: str, link: Link) -> Iterator[str]:
             yield f"{match} drop"
         elif lost:
             yield f"{match} numgen random mod {_DICE} < {lost} drop"
+        if wire.rate and not wire.cut:
+            burst = max(_LEAST_BURST, round(_BURST * wire.rate))
+            over = f"limit rate over {round(wire.rate)} bytes/second burst {burst} bytes"
+            yield f"{match} {over} drop"
 
 
 def _words(wire: Wire) -> str:
@@ -125,6 +145,8 @@ def _words(wire: Wire) -> str:
         parts.append(f"loss {wire.loss * 100:g} %")
     if wire.delay:
         parts.append(f"delay {wire.delay * 1000:g} ms")
+    if wire.rate:
+        parts.append(f"rate {amount(wire.rate, 'B/s')}")
     return ", ".join(parts)
 
 

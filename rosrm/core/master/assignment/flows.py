@@ -47,7 +47,7 @@ def _flows(state: MasterState, name: str, together: AbstractSet[str]) -> Iterato
     for other in state.flows.partners[name]:
         host, flow = _host(state, other), state.flows.between(name, other)
         if host is not None and other not in together and flow.rate > 0.0:
-            yield Flow(other, host.name, host.column, flow.rate, flow.incoming)
+            yield Flow(other, host.name, host.column, flow.rate, flow.incoming, flow.learned)
 
 
 def count_flows(state: MasterState) -> None:

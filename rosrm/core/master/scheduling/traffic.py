@@ -6,13 +6,16 @@ from typing import Final
 
 import numpy as np
 
-from rosrm.core.master.state.demand import Traffic
+from rosrm.core.master.state.demand import Flow, Traffic
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.links import LinkTable
 from rosrm.extensions.link_views import FlowView
 
 #: Tolerance in comparisons of sums of rates.
 _CLOSE: Final = 1.0 - 1e-9
+#: A learned flow counts as at most this share of what flows may use of a link. Otherwise two nodes
+#: that exchange more in the memory of one host could never leave it.
+_MOST_LEARNED: Final = 0.5
 
 
 def keeping_limits(
@@ -32,27 +35,37 @@ def keeping_limits(
     if traffic.counted and not empty:
         room = links.usable - links.load_without(traffic.counted)
     known = min(hosts, links.size)
-    rates: dict[int, float] = {}
+    by_host: dict[int, list[Flow]] = {}
     for flow in traffic.flows:
-        rates[flow.column] = rates.get(flow.column, 0.0) + flow.rate
-    first = links.cells[:known]
-    near = {column: links.facing[links.row(column), :known] for column in rates}
+        by_host.setdefault(flow.column, []).append(flow)
+    first, usable = links.cells[:known], links.usable.ravel()
+    near = {column: links.facing[links.row(column), :known] for column in by_host}
     kept = np.ones(hosts, np.bool_)
-    for column, rate in rates.items():
-        added: float | FloatArray = rate
-        for other, more in rates.items():
+    for column, flows in by_host.items():
+        cell = first + near[column]
+        added = sum(_counts_as(flow, usable, cell) for flow in flows)
+        for other, more in by_host.items():
             if other != column:  # both may cross the same interface
-                also = more * (near[other] == near[column])
+                also = sum(_counts_as(flow, usable, cell) for flow in more)
+                also = also * (near[other] == near[column])
                 if other < known:
                     also[other] = 0.0
                 added = added + also
-        far = links.interface[links.row(column), :known]
-        crosses = room.ravel().take(first + near[column]) >= added * _CLOSE
-        crosses &= room[links.row(column)].take(far) >= rate * _CLOSE
+        far = links.cells[links.row(column)] + links.interface[links.row(column), :known]
+        received = sum(_counts_as(flow, usable, far) for flow in flows)
+        crosses = room.ravel().take(cell) >= added * _CLOSE
+        crosses &= room.ravel().take(far) >= received * _CLOSE
         if column < known:
             crosses[column] = True
         kept[:known] &= crosses
     return kept
+
+
+def _counts_as(flow: Flow, usable: FloatArray, cells: IntArray) -> float | FloatArray:
+    """Return the bytes a second as which a flow counts on interfaces, given by their cells."""
+    if not flow.learned:
+        return flow.rate
+    return np.minimum(flow.rate, _MOST_LEARNED * usable.take(cells))
 
 
 def flow_view(
@@ -69,15 +82,18 @@ def flow_view(
     is_local = columns[:, None] == np.array([flow.column for flow in flows], np.int64)
     there = [links.row(flow.column) for flow in flows]
     near = links.interface[here[:, None], there]
-    added = np.zeros((len(columns), load.shape[1]))
-    to_host: dict[int, float] = {}
-    for at, flow in enumerate(flows):
-        added[every, near[:, at]] += np.where(is_local[:, at], 0.0, flow.rate)
-        to_host[flow.column] = to_host.get(flow.column, 0.0) + flow.rate
     far = links.interface[there, here[:, None]]
+    added, usable = np.zeros((len(columns), load.shape[1])), links.usable.ravel()
+    to_host: dict[int, float | FloatArray] = {}
+    for at, flow in enumerate(flows):
+        sent = _counts_as(flow, usable, links.cells[here] + near[:, at])
+        added[every, near[:, at]] += np.where(is_local[:, at], 0.0, sent)
+        received = _counts_as(flow, usable, links.cells[there[at]] + far[:, at])
+        to_host[flow.column] = to_host.get(flow.column, 0.0) + received
+    arriving = [np.broadcast_to(to_host[flow.column], len(columns)) for flow in flows]
     ends = (
         (here[:, None], near, added[every[:, None], near]),
-        (np.array(there, np.int64), far, np.array([to_host[flow.column] for flow in flows])),
+        (np.array(there, np.int64), far, np.stack(arriving, axis=1)),
     )
     rooms = [links.usable[row, at] - load[row, at] - more for row, at, more in ends]
     is_near = rooms[0] <= rooms[1]
@@ -99,7 +115,7 @@ def flow_view(
         tuple(flow.process for flow in flows), tuple(flow.host for flow in flows),
         np.array([flow.rate for flow in flows]),
         np.array([flow.incoming for flow in flows], np.bool_), is_local, rate, limit, used,
-        chosen(ends[0][2], np.asarray(ends[1][2]), 0.0),
+        chosen(ends[0][2], ends[1][2], 0.0),
         np.where(is_local, 0.0, links.round_trip[here[:, None], there]),
     )  # fmt: skip
 

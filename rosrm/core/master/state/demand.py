@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rosrm.core.master.state.links import Crossing
 from rosrm.extensions.declared_fields import FLOWS_FIELD, STANDARD_FIELDS
@@ -36,8 +36,7 @@ class Neighbour:
     absent: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Flow:
+class Flow(NamedTuple):
     """A flow between the process and another one, which has a host.
 
     Attributes:
@@ -45,6 +44,7 @@ class Flow:
         host, column: of the other process.
         rate: bytes a second.
         incoming: the process receives it from the other one, or declares it.
+        learned: it was measured, not declared.
     """
 
     process: str
@@ -52,10 +52,10 @@ class Flow:
     column: int
     rate: float
     incoming: bool
+    learned: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Traffic:
+class Traffic(NamedTuple):
     """The flows of a process, and their part in the load of the links.
 
     Attributes:
