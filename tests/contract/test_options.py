@@ -13,15 +13,19 @@ from rosrm_migration.plugin import register_migration_strategies
 from rosrm_resources.plugin import register_probes
 from rosrm_scoring.plugin import register_scoring_policies
 
+#: By name; a scoring policy with the name of a probe has another key.
 OFFERS = {
-    offer.name: offer
-    for offer in [
-        *register_probes(),
-        *register_scoring_policies(),
-        *register_migration_strategies(),
-        *register_criu(),
-        *register_checkpoint_policies(),
-    ]
+    **{f"{offer.name} (scoring)": offer for offer in register_scoring_policies()},
+    **{
+        offer.name: offer
+        for offer in [
+            *register_scoring_policies(),
+            *register_probes(),
+            *register_migration_strategies(),
+            *register_criu(),
+            *register_checkpoint_policies(),
+        ]
+    },
 }
 
 
