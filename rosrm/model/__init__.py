@@ -11,6 +11,7 @@ requester.py            sender of a request, and its rights on processes
 ros_settings.py         ROS settings of a part: domain, discovery, transports, interface
 codec.py                conversion of values to JSON and back
 durations.py            bound of all times
+links.py                measurements of links between hosts
 limits.py               rules for limits and scheduling of a process
 links.py                measurements of links between hosts, as slaves report them
 description_checks.py   checks of the description of a host

@@ -13,9 +13,9 @@ from rosrm_migration.plugin import register_migration_strategies
 from rosrm_resources.plugin import register_probes
 from rosrm_scoring.plugin import register_scoring_policies
 
-#: By name; the scoring policy `network` has the name of a probe.
+#: By name; a scoring policy with the name of a probe has another key.
 OFFERS = {
-    **{f"{offer.name} policy": offer for offer in register_scoring_policies()},
+    **{f"{offer.name} (scoring)": offer for offer in register_scoring_policies()},
     **{
         offer.name: offer
         for offer in [
@@ -48,8 +48,8 @@ def test_defaults_survive_the_way_to_the_slave(name):
         ("gpu", {"devices": [-1]}, "greater than or equal to 0"),
         ("gpu", {"combine": "sum"}, "'max' or 'mean'"),
         ("network", {"capacity": 0}, "greater than 0"),
-        ("network policy", {"round_trip": 0}, "greater than 0"),
-        ("network policy", {"local": 2.0}, "less than or equal to 1"),
+        ("network (scoring)", {"round_trip": 0}, "greater than 0"),
+        ("network (scoring)", {"local": 2.0}, "less than or equal to 1"),
         ("weighted", {"weights": {"cpu": 1.5}}, "less than or equal to 1"),
         ("handoff", {"ready_timeout": 0}, "greater than 0"),
         ("handoff", {"protocol": "mine"}, "'rosrm' or 'paper'"),

@@ -163,14 +163,14 @@ def test_a_process_whose_device_no_host_has_does_not_block_the_queue() -> None:
 
 
 def test_more_units_than_any_host_has_are_set_aside() -> None:
-    """The reason is that of an empty host, whoever holds the units now."""
+    """The reason is that against an empty host, also while the units are held."""
     cluster = Cluster(host("a", *GPUS)).with_processes(on_gpu("p", 1.0), on_gpu("q", 3.0))
     assert cluster.phase("q") == "set_aside"
     assert "gpu: needs 3; it has 2" in cluster["q"].reason
 
 
 def test_a_missing_device_is_not_given_and_one_that_returns_is() -> None:
-    """The process is set aside meanwhile, and does not block the queue."""
+    """Until then the process is set aside, and does not block the queue."""
     cluster = Cluster(host("a", replace(FRONT, missing="/dev/video0: gone")))
     cluster.with_processes(cam("p"), process("q"))
     assert (cluster.phase("p"), cluster.phase("q")) == ("set_aside", "running")
@@ -181,7 +181,7 @@ def test_a_missing_device_is_not_given_and_one_that_returns_is() -> None:
 
 
 def test_a_device_that_goes_missing_stays_held() -> None:
-    """The record names the holder; the device is its own again when it returns."""
+    """The record names the holder; when the device returns, no other process gets it."""
     cluster = Cluster(host("a", FRONT)).with_processes(cam("p"), cam("q"))
     set_devices(cluster, "a", replace(FRONT, missing="gone"))
     assert cluster.recorded("device_missing") == [
@@ -237,7 +237,7 @@ def test_the_source_gets_its_device_back_if_the_move_fails(restarted: bool) -> N
 
 
 def test_a_standby_holds_devices_of_its_own_host() -> None:
-    """The standby is a process of its own there."""
+    """No other process gets the unit of a standby."""
     spec = node("p", migration=MigrationPolicy("handoff"), standby=StandbyPolicy(wanted=True))
     cluster = Cluster(host("a", FRONT), host("b"), host("c", FRONT))
     cluster.with_processes(asks(spec))
