@@ -2,7 +2,6 @@
 
 hookspecs.py         every hook, in one list
 contracts.py         protocols of probes, policies, filters, strategies, launchers; their offers
-link_views.py        links and flows, as policies read them
 options.py           options of a process, merged over those of the cluster
 units.py             numbers with units in options
 installed.py         addresses of the installed plugins (entry points)
@@ -10,7 +9,6 @@ discovery.py         import of the installed plugins, call of their hooks
 registry.py          selection of plugins by name, creation of their objects
 made.py              created objects, and checks of them
 declared_fields.py   fields of a spec that an offer declares to read
-link_views.py        links and flows as policies read them
 placement.py         selected policies and filters, for the core
 link_views.py        links and flows as scoring policies read them
 plugin_calls.py      guard of every call of a plugin

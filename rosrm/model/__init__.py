@@ -13,6 +13,5 @@ codec.py                conversion of values to JSON and back
 durations.py            bound of all times
 links.py                measurements of links between hosts
 limits.py               rules for limits and scheduling of a process
-links.py                measurements of links between hosts, as slaves report them
 description_checks.py   checks of the description of a host
 """
