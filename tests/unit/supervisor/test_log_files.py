@@ -28,11 +28,12 @@ def test_an_old_log_that_cannot_be_removed_prevents_no_start(state, monkeypatch,
         raise PermissionError(errno.EPERM, "Operation not permitted", path)
 
     monkeypatch.setattr(logs.os, "unlink", refuse)
-    before = len(list(Path("/proc/self/fd").iterdir()))
+    before = set(Path("/proc/self/fd").iterdir())
     log = keeper.open(("talker", 2), ())
     assert os.write(log, b"hello\n") == 6
     os.close(log)
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    left = set(Path("/proc/self/fd").iterdir())
+    assert left <= before  # a descriptor of something else may have been closed
     assert "talker.1" in capfd.readouterr().err
 
 
