@@ -2,7 +2,6 @@
 
 hookspecs.py         every hook, in one list
 contracts.py         protocols of probes, policies, filters, strategies, launchers; their offers
-link_views.py        links and flows, as policies read them
 options.py           options of a process, merged over those of the cluster
 units.py             numbers with units in options
 installed.py         addresses of the installed plugins (entry points)

@@ -5,7 +5,6 @@ The page "Keys" of the reference documents the format.
 roles.py        principals, their roles, and the requests that each role may send
 derivation.py   derivation of all keys from the cluster's secret
 sealing.py      encryption and authentication of the messages of one channel
-link_packets.py packets by which slaves measure the round trip of a link
 links.py        both ends of the messages under one key
 link_packets.py packets that measure the link between two slaves
 tickets.py      permission to send requests to a slave

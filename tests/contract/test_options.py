@@ -48,6 +48,8 @@ def test_defaults_survive_the_way_to_the_slave(name):
         ("gpu", {"devices": [-1]}, "greater than or equal to 0"),
         ("gpu", {"combine": "sum"}, "'max' or 'mean'"),
         ("network", {"capacity": 0}, "greater than 0"),
+        ("network (scoring)", {"round_trip": 0}, "greater than 0"),
+        ("network (scoring)", {"local": 2.0}, "less than or equal to 1"),
         ("weighted", {"weights": {"cpu": 1.5}}, "less than or equal to 1"),
         ("handoff", {"ready_timeout": 0}, "greater than 0"),
         ("handoff", {"protocol": "mine"}, "'rosrm' or 'paper'"),

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
-from rosrm import FloatArray, FlowView, HostView, ProcessView, Scores, Seconds
+from rosrm import FloatArray, FlowView, HostView, PositiveSeconds, ProcessView, Scores
 
 Weight = Annotated[float, Ge(0), Le(1)]
 Missing = Literal["worst", "ignore"]
@@ -47,7 +47,7 @@ class NetworkOptions:
     local: Weight = 1.0
     load: Weight = 0.5
     latency: Weight = 0.5
-    round_trip: Annotated[Seconds, Gt(0)] = 0.1
+    round_trip: PositiveSeconds = 0.1
     missing: Missing = "worst"
 
 

@@ -152,7 +152,16 @@ def _words(wire: Wire) -> str:
 
 def to_plain(links: Mapping[str, Link]) -> dict[str, Any]:
     """Return the content of the lab's state file."""
-    return {name: astuple(link) for name, link in links.items()}
+    return {
+        name: tuple(_fields(wire) for wire in (link.incoming, link.outgoing))
+        for name, link in links.items()
+    }
+
+
+def _fields(wire: Wire) -> tuple[Any, ...]:
+    """Return the fields of a direction; without a rate, as versions without rates read them."""
+    fields = astuple(wire)
+    return fields if wire.rate else fields[:-1]
 
 
 def from_plain(plain: Mapping[str, Any]) -> dict[str, Link]:
