@@ -26,6 +26,7 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import NoReturn
 
 import numpy as np
@@ -121,7 +122,7 @@ class SimulatedSlave:
             pid=os.getpid(), resources=resources, period=period,
         )  # fmt: skip
         self.endpoint = SlaveEndpoint(endpoints, description, self._state, take=self.take)
-        duties = Duties(self.take, *[self._refuse] * 5)
+        duties = Duties(self.take, *[self._refuse] * (len(fields(Duties)) - 1))
         SlaveServices(endpoints, duties, name, 5.0, lambda: self.endpoint.epoch)
 
     @property
