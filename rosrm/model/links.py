@@ -62,7 +62,7 @@ class LinkPeer:
 
 @dataclass(frozen=True, slots=True)
 class LinkReport:
-    """What a slave has measured.
+    """Measurements of a slave.
 
     Attributes:
         addresses: IPv4 addresses of the host.

@@ -42,7 +42,7 @@ class Tree(NamedTuple):
 
 
 class Enforcement(NamedTuple):
-    """What a supervisor can enforce.
+    """Limits that a supervisor can enforce.
 
     Attributes:
         trees: where it makes groups.

@@ -209,7 +209,7 @@ def pids(group: str) -> list[int]:
 
 
 def kill(path: str) -> None:
-    """Send SIGKILL to all processes of a group, also to those that are forked meanwhile."""
+    """Send SIGKILL to all processes of a group, including those forked during the call."""
     try:
         cgroups.write(os.path.join(path, "cgroup.kill"), "1")
     except OSError:  # version 1, or a kernel before 5.14

@@ -38,7 +38,7 @@ def cluster(make_shared):
 
 
 def test_a_leak_is_reported_as_what_it_is(cluster) -> None:
-    """It is restarted by its policy, then it has failed; `explain` shows the limits that held."""
+    """The process restarts, then it has failed; `explain` shows the limits that held."""
     restart = RestartPolicy("on-failure", delay=0.05, attempts=1)
     limits = Limits(memory=40 * MB, enforce="required")
     cluster.submit(python("leak", LEAK.format(400 * MB), limits=limits, restart=restart))

@@ -19,7 +19,7 @@ def sized(name: str, memory: float, **fields):
 
 
 def test_a_process_of_a_lower_priority_makes_room(make_cluster) -> None:
-    """It moves to another host; `explain` names it in the history of both."""
+    """The process moves to another host; `explain` shows the move in the history of both."""
     cluster = make_cluster(host("a", memory=1000 * MIB), host("b", memory=500 * MIB))
     cluster.client.set_host_state("b", "cordon")
     cluster.submit(sized("low", 300, migration=RELAUNCH))

@@ -166,6 +166,6 @@ class FlowSampler:
             assert self._node is not None
             self._node.destroy_subscription(sample.subscription)
             self._sample = None
-            if sample.key in self._sampled_at:  # the instance has not ended meanwhile
+            if sample.key in self._sampled_at:  # the instance has not ended since
                 self._rates[sample.key] = (sample.publisher, sample.rate(now))
             self._wait(sample.cpu)

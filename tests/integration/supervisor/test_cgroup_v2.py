@@ -135,7 +135,7 @@ def test_an_agent_moves_out_of_the_way_of_its_groups(group: str, tmp_path: Path)
 
 
 def test_an_agent_beside_other_processes_stays_and_says_why(group: str, tmp_path: Path) -> None:
-    """It moves no process of others."""
+    """The agent moves no process of others."""
     other = subprocess.Popen(["sleep", "1000"])
     try:
         cgroups.write(f"{group}/cgroup.procs", str(other.pid))

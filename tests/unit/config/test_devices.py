@@ -91,7 +91,7 @@ def test_devices_that_no_process_can_ask_for_are_refused(refusal, section, said)
 
 
 def test_a_placeholder_of_a_device_that_the_process_does_not_ask_for_is_refused(refusal):
-    """It would reach the program as it is."""
+    """Otherwise the placeholder would reach the program as text."""
     text = """
         processes:
           - {name: a, command: x, arguments: ["{device.gpu}"], devices: {camera: 1}}

@@ -149,7 +149,7 @@ def test_a_share_does_not_fit_where_less_is_left() -> None:
 
 
 def test_a_process_whose_device_no_host_has_does_not_block_the_queue() -> None:
-    """It is set aside, with the kinds that there are, and queued when a host brings the device."""
+    """The process is set aside, with the known kinds, and queued when a host brings the device."""
     cluster = Cluster(host("a", FRONT))
     cluster.with_processes(asks(process("p"), DeviceNeed("camra")), process("q"))
     assert (cluster.phase("p"), cluster.phase("q")) == ("set_aside", "running")

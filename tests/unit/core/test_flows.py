@@ -178,7 +178,7 @@ def test_a_flow_to_a_process_that_does_not_exist_does_not_count_until_both_run()
 
 
 def test_an_ended_process_takes_no_room_of_a_link() -> None:
-    """What a spec that has ended declares is forgotten, too."""
+    """The flows that an ended process declares do not count, either."""
     cluster = cluster_of({"a": 5, "b": 100}, on("a", "camera"))
     cluster.submit(on("b", "first", talks_to={"camera": 4 * MB}))
     cluster.cancel("first")
@@ -211,7 +211,7 @@ def test_the_policy_network_places_a_process_where_its_flow_comes_from() -> None
 
 
 def test_the_policy_network_prefers_the_emptier_link() -> None:
-    """Where no host keeps the flow local, the link with more room is taken."""
+    """If no host keeps the flow local, the policy prefers the link with more room."""
     cluster = networked({"robot": 100, "slow": 20, "fast": 90}, on("robot", "camera"))
     cluster.set_host("robot", "cordon")
     cluster.submit(process("detector", talks_to={"camera": 10 * MB}))

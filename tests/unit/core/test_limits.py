@@ -59,7 +59,7 @@ def test_limits_that_are_not_required_select_no_host() -> None:
 
 
 def test_required_limits_that_no_host_can_enforce_set_a_process_aside() -> None:
-    """It is placed as soon as a host registers that can."""
+    """The process is placed as soon as a host registers that can enforce them."""
     required = Limits(memory=5e8, cpu=1.5, enforce="required")
     cluster = Cluster(Partial("a", unenforced=NO_GROUPS))
     cluster.submit(process("p", limits=required), process("q"))

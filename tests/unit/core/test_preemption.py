@@ -113,7 +113,7 @@ def test_by_default_no_process_is_stopped_for_another() -> None:
 
 
 def test_with_requeue_a_process_that_cannot_move_waits_in_the_queue_again() -> None:
-    """It runs again as soon as there is room."""
+    """The process runs again as soon as there is room."""
     cluster = cluster_of(machine("a", 600), preemption="requeue")
     filled(cluster, "a", process("x", memory=400))
     cluster.submit(job("p", memory=500, priority=5))

@@ -111,7 +111,7 @@ def test_a_plan_moves_nothing() -> None:
 
 
 def test_a_plan_leaves_no_trace_in_the_reservations() -> None:
-    """It reserves the room of its moves only while it is made."""
+    """A plan reserves the room of its moves only while the master makes the plan."""
     cluster = on_a(*four())
     before = cluster.state.hosts.cells.copy()
     rebalance(cluster, plan_only=True)

@@ -62,7 +62,7 @@ def test_a_broken_file_changes_nothing_and_no_slave_reads_its_own() -> None:
 
 
 def test_the_reply_has_a_line_for_each_part() -> None:
-    """It follows the last answer; a refusal of one slave refuses the request as a whole."""
+    """The reply follows the last answer; a refusal of one slave refuses the request as a whole."""
     cluster = Cluster("a", "b", "c")
     cluster.cut("c", seconds=15.0)
     request = ask(cluster)

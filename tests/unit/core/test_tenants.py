@@ -1,4 +1,4 @@
-"""What runs where, as scoring policies and filters see it."""
+"""Tenants of hosts, as scoring policies and filters see them."""
 
 from __future__ import annotations
 

@@ -271,7 +271,7 @@ def test_a_ticket_is_valid_for_a_minute(master: MasterSecurity, until: float) ->
 
 
 def test_tickets_do_not_expire_while_the_master_is_away(monkeypatch) -> None:
-    """Nobody could get another ticket, and slaves would send no replicas."""
+    """No client could get another ticket, and slaves would send no replicas."""
     now = 0
     monkeypatch.setattr(security, "time", SimpleNamespace(monotonic_ns=lambda: now))
     robot = member(ROBOT)

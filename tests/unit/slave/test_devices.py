@@ -29,7 +29,7 @@ GPU = Device("gpu", "0", about="a model")
 
 
 def test_a_device_whose_file_is_gone_is_missing_until_the_file_is_back(tmp_path: Path) -> None:
-    """It is lost after two looks, so that a driver may start again."""
+    """The device is lost after two looks, so that a driver may start again."""
     path = tmp_path / "video0"
     watch = DeviceWatch({"camera": (Device("camera", "front", str(path)),)})
     assert watch.look({})
@@ -143,7 +143,7 @@ def test_environment_of_a_process_with_devices(tmp_path: Path) -> None:
 
 
 def test_a_process_without_devices_keeps_the_variables_of_its_slave(tmp_path: Path) -> None:
-    """It may use a GPU without asking for one, as before."""
+    """The process may use a GPU without asking for one, as before."""
     environment = order(tmp_path, (), base={"CUDA_VISIBLE_DEVICES": "3"}).environment
     assert environment["CUDA_VISIBLE_DEVICES"] == "3"
 

@@ -67,7 +67,7 @@ def test_required_limits_that_cannot_be_enforced_refuse_the_start(confinement) -
 
 
 def test_a_higher_niceness_needs_no_rights(confinement) -> None:
-    """It is set even where a lower one cannot be."""
+    """A higher niceness is set even where a lower one cannot be."""
     confinement.missing = {"nice": "no rights"}
     assert confinement.start(KEY, LimitRule(nice=5, required=True), started)[1] == ("nice",)
     assert confinement.start(KEY, LimitRule(nice=-5), started)[1] == ()

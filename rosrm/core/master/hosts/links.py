@@ -10,7 +10,7 @@ no answer in time               the order is repeated after `link_period`
 the slave refuses the order     the host is asked again when it registers
 ==============================  =============================================================
 
-Nothing is persisted: slaves measure anew.
+Nothing is persisted: slaves measure again.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class _Search:
     """The search for room for one process.
 
     Attributes:
-        tried: names of hosts on which room was made in vain.
+        tried: names of hosts where the process did not fit in spite of the room.
         against: reasons why processes of lower priorities cannot make room.
         stuck: names of processes that cannot leave their host, whichever others do.
     """

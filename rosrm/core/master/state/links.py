@@ -148,7 +148,7 @@ class LinkTable:
         self.version += 1
 
     def _count_again(self) -> None:
-        """Add up all flows anew, because rates or the interfaces between hosts have changed."""
+        """Add up all flows again, because rates or the interfaces between hosts have changed."""
         self.usable = np.where(np.isnan(self.rate), np.inf, self.rate * self.limit[:, None])
         self.facing = self.interface.T.copy()
         self.flowing[:] = 0.0

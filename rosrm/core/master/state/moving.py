@@ -18,8 +18,8 @@ class RoomMade:
         until: time until which the host is reserved, although nothing leaves it any more; without a
             host, time before which the master does not look for a set again.
         partial: True: more processes must leave, whose moves had to wait for others.
-        tried: names of hosts on which room was made in vain, because a policy or a reading excludes
-            them for another reason. They are not tried again while the process waits.
+        tried: names of hosts where room was made, but which a policy or a reading excludes for
+            another reason. They are not tried again while the process waits.
     """
 
     host: Host | None

@@ -330,7 +330,7 @@ def test_the_load_is_evened_out_on_virtual_time():
 
 
 def test_a_job_is_stopped_after_its_time_limit_on_virtual_time():
-    """It has not finished; nothing else happens for much longer than the other times last."""
+    """The job has not finished; nothing else happens for much longer than the other times last."""
     plans = [plan("p", duration=900.0, time_limit=90.0), plan("q", duration=5.0, time_limit=90.0)]
     outcome = run([host("a")], plans)
     assert (outcome.finished, outcome.ended_otherwise) == (1, 1)
