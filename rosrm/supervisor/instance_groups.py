@@ -76,6 +76,7 @@ class InstanceGroups:
             if realtime and tree.version == 1 and "cpu" in tree.controllers:
                 continue
             path = _path(tree, key)
+            self._emptied.pop(path, None)  # otherwise the new run would be killed
             try:
                 _make(path, tree)
                 made.append(tree)

@@ -53,7 +53,12 @@ def spawn_into(
     """
     encoded = _encoded(*program)  # before the fork
     report, told = os.pipe2(os.O_CLOEXEC)
-    pid, inside = _fork(group)
+    try:
+        pid, inside = _fork(group)
+    except OSError:
+        os.close(report)
+        os.close(told)
+        raise
     if pid == 0:
         try:
             if not inside:

@@ -126,6 +126,21 @@ def test_a_group_in_use_is_removed_later(groups) -> None:
     wait_until(lambda: (groups.look(11.0), groups.deadline() is None)[1], "the removal")
 
 
+def test_a_run_that_begins_before_the_removal_lives(groups) -> None:
+    """A group that is made again is no longer to be removed."""
+    groups.make(KEY, LimitRule(), realtime=False)
+    former = start(groups, "sleep", "1000")
+    groups.remove(KEY, now=10.0)
+    assert os.waitpid(former, 0) == (former, 9)
+    groups.make(KEY, LimitRule(), realtime=False)
+    pid = start(groups, "sleep", "1000")
+    groups.look(11.0)
+    assert groups.members(KEY) == [pid]
+    groups.remove(KEY, now=12.0)
+    assert os.waitpid(pid, 0) == (pid, 9)
+    wait_until(lambda: (groups.look(13.0), groups.deadline() is None)[1], "the removal")
+
+
 def test_an_agent_moves_out_of_the_way_of_its_groups(group: str, tmp_path: Path) -> None:
     """Version 2 gives controllers to no group below one with processes in it."""
     own, enabled, found = delegated(group, tmp_path)

@@ -49,6 +49,8 @@ _MOST_HOSTS: Final = 32
 _MOST_SETS: Final = 64
 #: Most combinations of one size that a review looks at on one host.
 _MOST_COMBINATIONS: Final = 5_000
+#: Most combinations of all sizes.
+_MOST_TRIED: Final = 20_000
 #: Most sets whose moves a review plans for one process.
 _MOST_TRIALS: Final = 20
 #: Most reasons against processes in one answer.
@@ -302,14 +304,18 @@ def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tupl
     """Yield the sets of groups that free what is missing, the smallest first.
 
     A set with a superfluous group is left out. Of many groups only the first combinations of each
-    size are tried, with the groups that free most of what is missing.
+    size are tried, with the groups that free most of what is missing, and few combinations in all.
     """
     wanted = np.maximum(missing, _CLOSE)
     ordered = sorted(groups, key=lambda one: -float((one.share / wanted)[missing > 0].sum()))
     shares = np.array([one.share for one in ordered]).reshape(len(ordered), len(missing))
     found: list[tuple[Group, ...]] = []
-    for size in range(1, len(ordered) + 1):
+    tried = 0
+    for size in range(_fewest(shares, missing), len(ordered) + 1):
+        if tried >= _MOST_TRIED:
+            break
         rows = np.array(list(islice(combinations(range(len(ordered)), size), _MOST_COMBINATIONS)))
+        tried += len(rows)
         freed = shares[rows].sum(axis=1)
         covers = (freed >= missing - _CLOSE).all(axis=1)
         without_one = freed[:, None, :] - shares[rows]
@@ -319,6 +325,15 @@ def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tupl
         while found and rank(found[0])[0] <= size:  # no set of more groups has fewer processes
             yield found.pop(0)
     yield from found
+
+
+def _fewest(shares: FloatArray, missing: FloatArray) -> int:
+    """Return the least number of groups that may free what is missing; too many: none can."""
+    freed = np.sort(shares, axis=0)[::-1].cumsum(axis=0)  # (n, R): highest sums of 1..n groups
+    enough = freed >= missing - _CLOSE
+    if not len(shares) or not enough[-1].all():
+        return len(shares) + 1
+    return int(enough.argmax(axis=0).max()) + 1
 
 
 # --- departures -------------------------------------------------------------------------------
