@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 DEFAULT_LOG_LIMITS: Final = LogLimits()
 _CHUNK: Final = 1 << 16
+#: Seconds for the start of a supervisor; a host that boots is busy.
+_TIMEOUT: Final = 15.0
 #: Answer of a supervisor of an earlier version, which knows no limits.
 _NOTHING_ENFORCED: Final = dict.fromkeys(
     ("limits.memory", "limits.memory_high", "limits.cpu", "realtime", "nice"),
@@ -100,7 +102,7 @@ class SupervisorClient:
     @classmethod
     def connect(
         cls, state_directory: Path, *, start: bool = True, log: LogLimits = DEFAULT_LOG_LIMITS,
-        timeout: float = 5.0,
+        timeout: float = _TIMEOUT,
     ) -> SupervisorClient:  # fmt: skip
         """Connect to the supervisor of a state directory, and start one where none listens.
 

@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 from std_msgs.msg import Int64, String
@@ -68,6 +69,8 @@ except BaseException:
     pass
 """
 
+#: Seconds without a core that a healthy node survives on a busy machine.
+STARVED = 10.0
 SCAN = Health("~/scan", 2.0, "active", SOON)
 
 
@@ -75,7 +78,8 @@ SCAN = Health("~/scan", 2.0, "active", SOON)
 def cluster(make_shared):
     """Yield a cluster with a node that stays healthy."""
     cluster = make_shared(host("h0"))
-    cluster.submit(node("healthy", TALKER, namespace="/robot", health=SCAN, restart=AGAIN))
+    health = replace(SCAN, timeout=STARVED)
+    cluster.submit(node("healthy", TALKER, namespace="/robot", health=health, restart=AGAIN))
     cluster.wait("healthy", "running")
     return cluster
 
