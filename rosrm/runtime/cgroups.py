@@ -15,6 +15,8 @@ from typing import Final, NamedTuple
 AGENTS: Final = "rosrm-agent"
 #: Controllers that limit memory and CPU.
 LIMITING: Final = ("memory", "cpu")
+#: Files that a kernel without swap, or without accounting of it, lacks.
+ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
 #: Seconds. Shorter than the kernel's 100 ms: a process that has used up its share is paused so
 #: shortly that ROS does not notice.
 _PERIOD: Final = 0.02
@@ -76,10 +78,20 @@ def own_group(mount: Mount, root: str = "/") -> str | None:
     return None
 
 
-def cpu_quota(cores: float) -> tuple[int, int]:
-    """Return the quota and the period of a limit, both in microseconds."""
-    period = _PERIOD if cores >= _SHORT_ENOUGH else _LONG_PERIOD
-    return round(cores * period * 1e6), round(period * 1e6)
+def memory_files(version: int, size: int) -> list[tuple[str, str]]:
+    """Return the control files of a limit of memory in bytes, in order, with their content."""
+    if version == 1:
+        return [("memory.limit_in_bytes", str(size)), ("memory.memsw.limit_in_bytes", str(size))]
+    return [("memory.max", str(size)), ("memory.swap.max", "0")]
+
+
+def cpu_files(version: int, cores: float) -> list[tuple[str, str]]:
+    """Return the control files of a limit of CPU time, in order, with their content."""
+    seconds = _PERIOD if cores >= _SHORT_ENOUGH else _LONG_PERIOD
+    quota, period = round(cores * seconds * 1e6), round(seconds * 1e6)
+    if version == 1:
+        return [("cpu.cfs_period_us", str(period)), ("cpu.cfs_quota_us", str(quota))]
+    return [("cpu.max", f"{quota} {period}")]
 
 
 def enable(group: str, controllers: tuple[str, ...]) -> None:

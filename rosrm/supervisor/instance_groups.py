@@ -231,33 +231,20 @@ _CONTROLLER: Final = {
 }  # fmt: skip
 _MEMORY: Final = {1: "memory.limit_in_bytes", 2: "memory.max"}
 _PEAK: Final = {1: "memory.max_usage_in_bytes", 2: "memory.peak"}
-#: Files that a kernel without swap, or without accounting of it, lacks.
-_ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
 
 
 def limit_files(version: int, limits: LimitRule) -> Iterator[tuple[str, str, str]]:
     """Yield name of the limit, control file and content, in the order of writing."""
-    memory = str(int(limits.memory))
-    if limits.memory and version == 1:
-        yield "limits.memory", _MEMORY[1], memory
-        yield "limits.memory", _ABOUT_SWAP[0], memory
-    elif limits.memory:
-        yield "limits.memory", _MEMORY[2], memory
-        yield "limits.memory", _ABOUT_SWAP[1], "0"
-        yield (
-            "limits.memory",
-            "memory.oom.group",
-            "1",
-        )  # the instance ends as a whole, and is reported
+    if limits.memory:
+        for file, content in cgroups.memory_files(version, int(limits.memory)):
+            yield "limits.memory", file, content
+    if limits.memory and version == 2:  # the instance ends as a whole, and is reported
+        yield "limits.memory", "memory.oom.group", "1"
     if limits.memory_high and version == 2:
         yield "limits.memory_high", "memory.high", str(int(limits.memory_high))
     if limits.cpu:
-        quota, period = cgroups.cpu_quota(limits.cpu)
-        if version == 1:
-            yield "limits.cpu", "cpu.cfs_period_us", str(period)
-            yield "limits.cpu", "cpu.cfs_quota_us", str(quota)
-        else:
-            yield "limits.cpu", "cpu.max", f"{quota} {period}"
+        for file, content in cgroups.cpu_files(version, limits.cpu):
+            yield "limits.cpu", file, content
 
 
 def _set_limits(path: str, tree: Tree, limits: LimitRule) -> dict[str, str]:
@@ -268,7 +255,7 @@ def _set_limits(path: str, tree: Tree, limits: LimitRule) -> dict[str, str]:
         try:
             cgroups.write(os.path.join(path, file), content)
         except OSError as error:
-            if error.errno == errno.ENOENT and file in _ABOUT_SWAP:
+            if error.errno == errno.ENOENT and file in cgroups.ABOUT_SWAP:
                 continue
             # Version 1 refuses a share above that of a group above, which then is the limit.
             if error.errno == errno.EINVAL and file == "cpu.cfs_quota_us":

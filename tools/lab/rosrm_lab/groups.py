@@ -28,8 +28,6 @@ LEAVES: Final[tuple[Leaf, ...]] = ("limited", "free", "own")
 
 #: cpuacct: version 1 keeps the CPU time of a group there.
 _NEEDED: Final = ("memory", "cpu", "cpuacct")
-#: Files that a kernel without swap, or without swap accounting, lacks.
-_ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
 #: Seconds for killed processes to leave their group, and for the kernel to release the group.
 _GONE: Final = 10.0
 _LOOK: Final = 0.01
@@ -97,7 +95,7 @@ def make(hierarchies: Iterable[Hierarchy], lab: str, host: HostPlan) -> None:
                 _make_group(hierarchy, _entered(hierarchy, lab, host.name, leaf))
             limited = hierarchy.group(lab, host.name, "limited")
             for name, value in limits(hierarchy, host):
-                if name not in _ABOUT_SWAP or (limited / name).exists():
+                if name not in cgroups.ABOUT_SWAP or (limited / name).exists():
                     (limited / name).write_text(value)
         except OSError as error:
             raise LabError(_cannot(hierarchy, error)) from None
@@ -106,19 +104,9 @@ def make(hierarchies: Iterable[Hierarchy], lab: str, host: HostPlan) -> None:
 def limits(hierarchy: Hierarchy, host: HostPlan) -> Iterator[tuple[str, str]]:
     """Yield the control files of a host's limits, in this order, with their content."""
     if "memory" in hierarchy.controllers and host.memory is not None:
-        if hierarchy.version == 1:
-            yield "memory.limit_in_bytes", str(host.memory)
-            yield "memory.memsw.limit_in_bytes", str(host.memory)
-        else:
-            yield "memory.max", str(host.memory)
-            yield "memory.swap.max", "0"
+        yield from cgroups.memory_files(hierarchy.version, host.memory)
     if "cpu" in hierarchy.controllers and host.cpu is not None:
-        quota, period_us = cgroups.cpu_quota(host.cpu)
-        if hierarchy.version == 1:
-            yield "cpu.cfs_period_us", str(period_us)
-            yield "cpu.cfs_quota_us", str(quota)
-        else:
-            yield "cpu.max", f"{quota} {period_us}"
+        yield from cgroups.cpu_files(hierarchy.version, host.cpu)
 
 
 def doors(hierarchies: Iterable[Hierarchy], lab: str, host: str, leaf: Leaf) -> list[Path]:
