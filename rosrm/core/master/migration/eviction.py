@@ -28,6 +28,7 @@ from rosrm.core.master.migration.start import (
     moves_under_way,
     plan_move,
     why_busy,
+    why_cooling_down,
     why_immovable,
     why_never_movable,
     why_no_executor,
@@ -166,9 +167,9 @@ def _why_not_now(
         if not _accounts_for(instance, resource):
             return f"{process.name} declares no need of {resource}, {_UNMEASURED}"
         return f"{process.name} uses no {resource}"
-    since_move, cooldown = now - process.moved_at, state.settings.cooldown
-    if since_move < cooldown:
-        return f"{process.name} is in its cool-down of {cooldown:g} s after a move"
+    cooling_down = why_cooling_down(state, process, now)
+    if cooling_down:
+        return cooling_down
     if instance.state is not InstanceState.READY:
         return f"{process.name} is not ready"
     return ""

@@ -23,8 +23,14 @@ from rosrm.core.master.assignment.assign import demand_of, ranking_of
 from rosrm.core.master.assignment.neighbours import awaited_neighbour, running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
-from rosrm.core.master.migration.room import is_leaving, share_of, trial, why_no_room
-from rosrm.core.master.migration.start import moves_under_way, why_immovable
+from rosrm.core.master.migration.room import (
+    CLOSE,
+    is_leaving,
+    share_of,
+    trial,
+    why_it_cannot_move,
+)
+from rosrm.core.master.migration.start import moves_under_way
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.recovery.journal_gap import why_no_work
 from rosrm.core.master.scheduling.candidates import candidates
@@ -55,8 +61,6 @@ _MOST_TRIED: Final = 20_000
 _MOST_TRIALS: Final = 20
 #: Most reasons against processes in one answer.
 _MOST_REASONS: Final = 3
-#: Tolerance in comparisons of sums of fractions.
-_CLOSE: Final = 1e-9
 
 _OTHERS: Final = tuple(one for one in FILTERS if one.name not in OF_ROOM)
 
@@ -138,7 +142,7 @@ def _review(state: MasterState, process: Process, now: float) -> RoomMade | None
     if before is not None and before.host is not None:
         return _continue(state, search, before.host, before, now)
     for host, missing in _hosts_in_question(state, search):
-        if (missing - _leaving(state, host) <= _CLOSE).all():  # also after a restart of the master
+        if (missing - _leaving(state, host) <= CLOSE).all():  # also after a restart of the master
             return _wait_for_room(state, search, host, now)
     return _make_room(state, search, _hosts_in_question(state, search), now)
 
@@ -154,7 +158,7 @@ def _continue(
         return _in_vain(state, search, host, now)
     for one, missing in _hosts_in_question(state, search):
         if one is host:
-            if (missing - leaving <= _CLOSE).all():
+            if (missing - leaving <= CLOSE).all():
                 return _wait_for_room(state, search, host, now)
             if before.partial and leaving.any():
                 return replace(before, until=now + _GRACE)
@@ -193,7 +197,7 @@ def _hosts_in_question(state: MasterState, search: _Search) -> list[tuple[Host, 
     order = np.argsort(np.maximum(missing, 0.0).sum(axis=0), kind="stable")
     found = [(table.hosts[columns[at]], missing[:, at]) for at in order]
     # Nothing is missing where a policy has a veto.
-    return [one for one in found if (one[1] > _CLOSE).any() and one[0].name not in search.tried]
+    return [one for one in found if (one[1] > CLOSE).any() and one[0].name not in search.tried]
 
 
 def _leaving(state: MasterState, host: Host) -> FloatArray:
@@ -291,13 +295,7 @@ def _why_it_stays(state: MasterState, search: _Search, process: Process, now: fl
         return f"{process.name} is being moved or stopped"
     if state.settings.preemption == "requeue":
         return ""
-    return _why_it_cannot_move(state, process, now)
-
-
-def _why_it_cannot_move(state: MasterState, process: Process, now: float) -> str:
-    if now - process.moved_at < state.settings.cooldown:
-        return f"{process.name} is in its cool-down of {state.settings.cooldown:g} s after a move"
-    return why_immovable(state, process) or why_no_room(state, process)
+    return why_it_cannot_move(state, process, now)
 
 
 def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tuple[Group, ...]]:
@@ -306,7 +304,7 @@ def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tupl
     A set with a superfluous group is left out. Of many groups only the first combinations of each
     size are tried, with the groups that free most of what is missing, and few combinations in all.
     """
-    wanted = np.maximum(missing, _CLOSE)
+    wanted = np.maximum(missing, CLOSE)
     ordered = sorted(groups, key=lambda one: -float((one.share / wanted)[missing > 0].sum()))
     shares = np.array([one.share for one in ordered]).reshape(len(ordered), len(missing))
     found: list[tuple[Group, ...]] = []
@@ -317,9 +315,9 @@ def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tupl
         rows = np.array(list(islice(combinations(range(len(ordered)), size), _MOST_COMBINATIONS)))
         tried += len(rows)
         freed = shares[rows].sum(axis=1)
-        covers = (freed >= missing - _CLOSE).all(axis=1)
+        covers = (freed >= missing - CLOSE).all(axis=1)
         without_one = freed[:, None, :] - shares[rows]
-        spare = (without_one >= missing - _CLOSE).all(axis=2).any(axis=1)
+        spare = (without_one >= missing - CLOSE).all(axis=2).any(axis=1)
         found += [tuple(ordered[at] for at in row) for row in rows[covers & ~spare]]
         found.sort(key=rank)
         while found and rank(found[0])[0] <= size:  # no set of more groups has fewer processes
@@ -330,7 +328,7 @@ def covering_sets(groups: Sequence[Group], missing: FloatArray) -> Iterator[tupl
 def _fewest(shares: FloatArray, missing: FloatArray) -> int:
     """Return the least number of groups that may free what is missing; too many: none can."""
     freed = np.sort(shares, axis=0)[::-1].cumsum(axis=0)  # (n, R): highest sums of 1..n groups
-    enough = freed >= missing - _CLOSE
+    enough = freed >= missing - CLOSE
     if not len(shares) or not enough[-1].all():
         return len(shares) + 1
     return int(enough.argmax(axis=0).max()) + 1
@@ -374,7 +372,7 @@ def _planned(
 def _plan(
     state: MasterState, preemptor: Process, process: Process, now: float
 ) -> PlannedMoves | Rejected:
-    why = _why_it_cannot_move(state, process, now)
+    why = why_it_cannot_move(state, process, now)
     if why:
         return Rejected(why)
     cause = (

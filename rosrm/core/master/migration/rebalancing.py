@@ -17,8 +17,8 @@ import numpy as np
 from rosrm.core.master.assignment.neighbours import running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, plan_moves, try_move
-from rosrm.core.master.migration.room import is_leaving, share_of, trial, why_no_room
-from rosrm.core.master.migration.start import moves_under_way, why_immovable
+from rosrm.core.master.migration.room import is_leaving, share_of, trial, why_it_cannot_move
+from rosrm.core.master.migration.start import moves_under_way
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -232,6 +232,4 @@ def _shift(state: MasterState, planned: PlannedMoves, source: Host, freed: Float
 def _why_it_stays(state: MasterState, process: Process, now: float) -> str:
     if process.spec.protect:
         return f"{process.name} is protected"
-    if now - process.moved_at < state.settings.cooldown:
-        return f"{process.name} is in its cool-down of {state.settings.cooldown:g} s after a move"
-    return why_immovable(state, process) or why_no_room(state, process)
+    return why_it_cannot_move(state, process, now)

@@ -11,6 +11,7 @@ import numpy as np
 from rosrm.core.master.assignment.assign import demand_amounts, measured_need
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves
+from rosrm.core.master.migration.start import why_cooling_down, why_immovable
 from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
 from rosrm.core.master.state.process import Instance, Process
@@ -18,7 +19,7 @@ from rosrm.model.plan import Aim
 from rosrm.model.values import InstanceId
 
 #: Tolerance in comparisons of sums of fractions.
-_CLOSE: Final = 1e-9
+CLOSE: Final = 1e-9
 
 
 def share_of(state: MasterState, instance: Instance) -> FloatArray:
@@ -48,14 +49,23 @@ def is_leaving(state: MasterState, instance: Instance) -> bool:
     return moves or instance.stopping
 
 
-def why_no_room(state: MasterState, process: Process) -> str:
+def why_it_cannot_move(state: MasterState, process: Process, now: float) -> str:
+    """Return why a running process cannot move to make the load of hosts better; "": it may."""
+    return (
+        why_cooling_down(state, process, now)
+        or why_immovable(state, process)
+        or _why_no_room(state, process)
+    )
+
+
+def _why_no_room(state: MasterState, process: Process) -> str:
     """Return why no other host has room for a running process; "": one may have.
 
     It is a quick check of the largest part of all refusals, before a move is planned.
     """
     table, owner = state.hosts, state.instances[process.owner]
     need = table.fractions(*demand_amounts(state, process, measured_need(state, owner.measured)))
-    limit = table.limit - state.settings.headroom + _CLOSE
+    limit = table.limit - state.settings.headroom + CLOSE
     full: BoolArray = np.logical_or.reduce(table.busy + need > limit)
     full[owner.host.column] = True
     return f"no host has room for {process.name}" if full.all() else ""

@@ -102,6 +102,14 @@ def why_busy(migration: Migration) -> str:
     return f"{migration.process} is busy: {migration.progress_text}"
 
 
+def why_cooling_down(state: MasterState, process: Process, now: float) -> str:
+    """Return why a process must not move so soon after its last move; "" if it may."""
+    cooldown = state.settings.cooldown
+    if now - process.moved_at >= cooldown:
+        return ""
+    return f"{process.name} is in its cool-down of {cooldown:g} s after a move"
+
+
 def why_immovable(state: MasterState, process: Process) -> str:
     """Return why a process cannot be moved now; "" if it can."""
     if process.name in state.migrations:
