@@ -33,7 +33,7 @@ from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.extensions.contracts import MigrationStrategy
-from rosrm.extensions.declared_fields import SPEC_FIELDS, Declared, declared_spec
+from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import ChainOf, PlacementPlugins
 from rosrm.model.codec import to_plain
 from rosrm.model.devices import HeldDevice
@@ -434,7 +434,7 @@ class MasterState:
         self.instances[instance.number] = added
         process = self.processes.get(instance.process)
         spec = process.spec if process is not None else ProcessSpec(instance.process)
-        host.instances[instance.number] = instance.process, declared_spec(spec, SPEC_FIELDS)
+        host.instances[instance.number] = instance.process, spec
         self._numbers_of(instance.process).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
         self.note_change(instance.process)

@@ -15,7 +15,7 @@ from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, Floa
 from rosrm.core.master.state.links import LinkTable
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
-from rosrm.extensions.declared_fields import FLOWS_FIELD, declared_spec
+from rosrm.extensions.declared_fields import FLOWS_FIELD, SPEC_FIELDS, declared_spec
 from rosrm.extensions.link_views import NO_FLOWS
 from rosrm.extensions.plugin_calls import given, required
 from rosrm.model.values import ProcessSpec
@@ -98,7 +98,8 @@ class _Tenants(_PerHost[Mapping[str, ProcessSpec]]):
 
     def _of(self, row: int) -> Mapping[str, ProcessSpec]:
         self._hosts.tenants_read = True
-        return MappingProxyType(self._hosts.tenants_of(row))
+        tenants = self._hosts.tenants_of(row).items()
+        return MappingProxyType({name: declared_spec(spec, SPEC_FIELDS) for name, spec in tenants})
 
 
 class _FreeDevices(_PerHost[Mapping[str, float]]):

@@ -71,7 +71,7 @@ class Host:
         column: column of this host in the arrays of `HostTable`.
         attributed, shared: resources with this accounting on the host.
         instances: number of each instance that runs on the host or is assigned to it, to the name
-            and the read-only spec of its process.
+            and the spec of its process.
         over_since: resource name to the time since when the host is over this limit.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
