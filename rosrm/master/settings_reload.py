@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 from rosrm.config.placement import settings_of_chain
 from rosrm.config.reloading import OF_CLUSTER, reloaded
@@ -20,28 +20,24 @@ class SettingsReload:
         config: the settings at the start.
         source: their origin.
         chain_of: creates the scoring policies with other weights and options.
+
+    Attributes:
+        hang_up: handler of SIGHUP.
     """
 
     def __init__(self, config: ClusterConfig, source: SettingsSource, chain_of: ChainOf) -> None:
         self.chain_of = chain_of
         self._config = config
-        self._check = SettingsCheck(source)
-        self._hung_up = False
+        self._check = SettingsCheck(source, partial(self._take, 0))
+        self.hang_up = self._check.hang_up
         self._read: list[SettingsRead] = []
-
-    def hang_up(self, _number: int, _frame: Any) -> None:
-        """Handle a SIGHUP."""
-        self._hung_up = True
 
     def start(self, request: int) -> None:
         """Begin to read the file; `request` is the number of a request, 0: of none."""
-        self._check.start(lambda text, fault: self._read.append(self._event(request, text, fault)))
+        self._check.start(partial(self._take, request))
 
     def poll(self) -> list[SettingsRead]:
         """Return the outcomes of files that were read since the last call."""
-        if self._hung_up:
-            self._hung_up = False
-            self.start(0)
         self._check.poll()
         read, self._read = self._read, []
         return read
@@ -49,6 +45,9 @@ class SettingsReload:
     def close(self) -> None:
         """End a check that runs."""
         self._check.close()
+
+    def _take(self, request: int, text: str, fault: str) -> None:
+        self._read.append(self._event(request, text, fault))
 
     def _event(self, request: int, text: str, fault: str) -> SettingsRead:
         if fault:

@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import IO, Final
+from typing import IO, Any, Final
 
 from rosrm.model.orders import CHECK_TIMEOUT
 
@@ -38,10 +38,16 @@ class SettingsSource:
 
 
 class SettingsCheck:
-    """Reads a settings file again; the runtime calls `poll` until the check has ended."""
+    """Reads a settings file again; the runtime calls `poll` until the check has ended.
 
-    def __init__(self, source: SettingsSource) -> None:
-        self._source = source
+    Args:
+        source: origin of the settings.
+        after_signal: gets the outcome of a check that a signal has requested.
+    """
+
+    def __init__(self, source: SettingsSource, after_signal: Checked) -> None:
+        self._source, self._after_signal = source, after_signal
+        self._hung_up = False
         self._process: subprocess.Popen[bytes] | None = None
         self._waiting: list[Checked] = []
         self._deadline = 0.0
@@ -55,6 +61,10 @@ class SettingsCheck:
         self._waiting.append(done)
         if self._process is None:
             self._begin()
+
+    def hang_up(self, _number: int, _frame: Any) -> None:
+        """Handle a SIGHUP: let the next `poll` begin a check."""
+        self._hung_up = True
 
     def _begin(self) -> None:
         source = self._source
@@ -72,6 +82,9 @@ class SettingsCheck:
 
     def poll(self) -> None:
         """Report the outcome of a check that has ended, or took too long."""
+        if self._hung_up:
+            self._hung_up = False
+            self.start(self._after_signal)
         process = self._process
         if process is None:
             return

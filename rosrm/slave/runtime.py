@@ -104,8 +104,7 @@ class SlaveRuntime:
         self, config: HostConfig, registry: Registry, security: Member, source: SettingsSource
     ) -> None:
         self._config = config
-        self._settings_check = SettingsCheck(source)
-        self._hung_up = False
+        self._settings_check = SettingsCheck(source, self._applying(_log_reload))
         self._security = security
         self._incarnation = _random_number()
         self._stopping = ""
@@ -140,7 +139,7 @@ class SlaveRuntime:
             self._devices = DeviceWatch(config.devices)
             self._devices.look(self._sampler.devices)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
-            handle_signals(self._stop, self._hang_up)
+            handle_signals(self._stop, self._settings_check.hang_up)
             opened.callback(self._settings_check.close)
             self._open_supervisor(opened)
             graph = self._join_ros(opened)
@@ -365,18 +364,17 @@ class SlaveRuntime:
             self._from_threads.append(lambda: self._ending.log_progress())  # noqa: PLW0108 - as above
         self._stopping = self._stopping or signal.Signals(number).name
 
-    def _hang_up(self, _number: int, _frame: Any) -> None:
-        self._hung_up = True
-
     # --- reload --------------------------------------------------------------------------
 
     def _reload(self, done: Checked) -> None:
         """Read the file of this host again; call `done` with what has changed, or the fault."""
+        self._settings_check.start(self._applying(done))
 
-        def checked(text: str, fault: str) -> None:
-            done("" if fault else self._apply(HostConfig.from_json(text)), fault)
-
-        self._settings_check.start(checked)
+    def _applying(self, done: Checked) -> Checked:
+        """Return a function that applies checked settings, and calls `done` as in `_reload`."""
+        return lambda text, fault: done(
+            "" if fault else self._apply(HostConfig.from_json(text)), fault
+        )
 
     def _apply(self, new: HostConfig) -> str:
         """Apply the settings that need no restart, and return a summary."""
@@ -390,17 +388,9 @@ class SlaveRuntime:
             self._endpoint.describe_again(description)
         return reload_summary(read.changed, read.kept)
 
-    def _review_reload(self) -> None:
-        if self._hung_up:
-            self._hung_up = False
-            self._reload(
-                lambda summary, fault: _log.info("SIGHUP: %s", summary or f"not reloaded: {fault}")
-            )
-        self._settings_check.poll()
-
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
-        self._review_reload()
+        self._settings_check.poll()
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
@@ -577,3 +567,7 @@ class SlaveRuntime:
 def _random_number() -> int:
     """Return a random number other than 0; unlike `secrets`, this loads no MiB of modules."""
     return int.from_bytes(os.urandom(7), "big") | 1
+
+
+def _log_reload(summary: str, fault: str) -> None:
+    _log.info("SIGHUP: %s", summary or f"not reloaded: {fault}")

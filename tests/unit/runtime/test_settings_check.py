@@ -18,7 +18,7 @@ from tests.waiting import wait_until
 def outcome(source: SettingsSource) -> tuple[str, str]:
     """Return the settings and the fault of one check."""
     found: list[tuple[str, str]] = []
-    check = SettingsCheck(source)
+    check = SettingsCheck(source, lambda *_: None)
     check.start(lambda text, fault: found.append((text, fault)))
 
     def is_done() -> bool:
