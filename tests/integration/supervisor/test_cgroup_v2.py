@@ -83,7 +83,7 @@ def way(request, monkeypatch) -> None:
 
 
 def test_a_process_starts_in_its_group_and_is_killed_with_it(groups, way) -> None:
-    """It leads a session of its own, and all its descendants are in the group."""
+    """The process leads a session of its own, and all its descendants are in the group."""
     groups.make(KEY, LimitRule(), realtime=False)
     pid = start(groups, "sh", "-c", "setsid sleep 1000 & sleep 1000")
     assert os.getsid(pid) == pid

@@ -34,14 +34,14 @@ def port_of(one: LinkProber) -> int:
 
 
 def measured(
-    one: LinkProber, order: MeasureLinks, meanwhile: Callable[[], object] = lambda: None
+    one: LinkProber, order: MeasureLinks, each_turn: Callable[[], object] = lambda: None
 ) -> LinkReport:
     """Return the report of a measurement."""
     reports: list[LinkReport] = []
     one.measure(order, reports.append)
 
     def done() -> bool:
-        meanwhile()
+        each_turn()
         one.turn(time.monotonic())
         return bool(reports)
 

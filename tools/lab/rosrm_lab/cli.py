@@ -217,7 +217,7 @@ def kill(host: Host, name: Named = "lab") -> None:
 def boot(host: Host, name: Named = "lab") -> None:
     """Switch a host on again after `kill`.
 
-    Its disk and its network faults (cut, loss, delay) are kept. No process runs on it yet.
+    Its disk and its network faults (cut, loss, delay, rate) are kept. No process runs on it yet.
     """
     opened(name).boot(host)
     network = _network(name, host)
