@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Final
@@ -244,17 +245,14 @@ class ScoringContract:
         """The policy returns the same scores for the same arguments, and does not change them."""
         policy, twin = self.make(), self.make()
         for hosts, process in self.cases():
-            arrays = (hosts.usage, hosts.limit, hosts.capacity, hosts.processes, process.need)
-            before = [array.copy() for array in arrays]
-            first = self._scores(policy, hosts, process)
-            kept = np.array(first.value)
-            self._scores(policy, *one_row(hosts, process, len(hosts.names) - 1))
-            assert _same(first.value, kept), "an answer changed after it was given"
-            for one, whose in ((policy, "the same object"), (twin, "another object")):
-                again = self._scores(one, hosts, process).value
-                assert _same(again, kept), f"{whose} gave other scores for the same arguments"
-            for array, copy in zip(arrays, before, strict=True):
-                assert _same(array, copy), "an argument was changed"
+            with unchanged(hosts, process):
+                first = self._scores(policy, hosts, process)
+                kept = np.array(first.value)
+                self._scores(policy, *one_row(hosts, process, len(hosts.names) - 1))
+                assert _same(first.value, kept), "an answer changed after it was given"
+                for one, whose in ((policy, "the same object"), (twin, "another object")):
+                    again = self._scores(one, hosts, process).value
+                    assert _same(again, kept), f"{whose} gave other scores for the same arguments"
 
     def test_gives_reasons(self) -> None:
         """The policy gives a text for every score and a reason for every veto."""
@@ -274,6 +272,16 @@ class ScoringContract:
         hosts = host_view({"memory": [], "cpu": []})
         process = process_view(hosts, reads=tuple(self.offer.reads))
         self._scores(self.make(), hosts, process)
+
+
+@contextmanager
+def unchanged(hosts: HostView, process: ProcessView) -> Iterator[None]:
+    """Return a context in which the arrays of both views must not change."""
+    arrays = (hosts.usage, hosts.limit, hosts.capacity, hosts.processes, process.need)
+    before = [array.copy() for array in arrays]
+    yield
+    for array, copy in zip(arrays, before, strict=True):
+        assert _same(array, copy), "an argument was changed"
 
 
 def _same(array: npt.ArrayLike, other: npt.ArrayLike) -> bool:
