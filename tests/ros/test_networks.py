@@ -32,11 +32,14 @@ def test_links_are_measured_and_their_limits_hold(make_cluster) -> None:
     )
     cluster.wait("viewer", "running")
     cluster.wait("camera", "running")
+
+    def measured() -> Mapping[str, Any] | None:
+        found = flow_of(cluster, "viewer")
+        return None if None in (found["round_trip"], found["link_rate"]) else found
+
     flow = wait_until(
-        lambda: (
-            found if (found := flow_of(cluster, "viewer"))["round_trip"] is not None else None
-        ),
-        "a measured round trip", seen=lambda: flow_of(cluster, "viewer"), pause=cluster.client.spin,
+        measured, "round trip and rate of the link", seen=lambda: flow_of(cluster, "viewer"),
+        pause=cluster.client.spin,
     )  # fmt: skip
     assert 0.0 < flow["round_trip"] < 1.0
     assert flow["link_rate"] == 5 * MB

@@ -25,6 +25,8 @@ SHARE: Final = 0.01
 _WINDOW: Final = 3.0
 _PAUSE: Final = 5.0
 _RENEWED: Final = 300.0
+#: Seconds until a topic without a publisher is looked at again: its discovery may take a while.
+_DISCOVERY: Final = 10.0
 #: Messages that DDS keeps between two looks: their number bounds the memory of a sample.
 _DEPTH: Final = 2
 #: Significant digits of a rate, so that a steady flow stays the same.
@@ -134,6 +136,8 @@ class FlowSampler:
         key = (number, topic)
         self._sampled_at[key] = now
         publishers = self._node.get_publishers_info_by_topic(topic)
+        if not publishers:
+            self._sampled_at[key] = now - _RENEWED + _DISCOVERY
         if len(publishers) != 1:
             self._rates.pop(key, None)
             return
